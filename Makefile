@@ -1,0 +1,41 @@
+# Two commands set everything up: `make demo` and `make test`.  Both build .venv.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: demo test test-slow lint docs bench clean
+
+demo: $(VENV)/view.stamp
+	$(BIN)/pdcorrect compare examples/twisted_cross.toml -o demo
+
+test: $(VENV)/dev.stamp lint
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: $(VENV)/dev.stamp
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/dev.stamp
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+docs: $(VENV)/dev.stamp
+	$(BIN)/python -m sphinx -W -b html docs docs/_build/html
+
+bench: $(VENV)/dev.stamp
+	$(BIN)/python benchmarks/run.py
+
+clean:
+	rm -rf $(VENV) demo docs/_build
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/view.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) -e ".[view]"
+	@touch $@
+
+$(VENV)/dev.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) -e ".[view,dev]"
+	@touch $(VENV)/view.stamp $@

@@ -1,0 +1,67 @@
+"""Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.
+
+    import pdcorrect as pc
+
+    scene = pc.Scene.load("torsion.toml")
+    problem = pc.discretise(scene, refine=4)
+    run = pc.rollout(pc.ProjectiveDynamics(problem), frames=60)
+
+Everything below is loaded when first used, so importing the package is quick and
+brings in neither torch, pyvista, h5py nor meshio.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Scene": "pdcorrect.scene",
+    "State": "pdcorrect.state",
+    "Status": "pdcorrect.state",
+    "StepResult": "pdcorrect.state",
+    "Stepper": "pdcorrect.state",
+    "Trajectory": "pdcorrect.state",
+    "Problem": "pdcorrect.fem.problem",
+    "discretise": "pdcorrect.fem.problem",
+    "ProjectiveDynamics": "pdcorrect.solvers.projective",
+    "Newton": "pdcorrect.solvers.newton",
+    "rollout": "pdcorrect.solvers.rollout",
+    "restrict": "pdcorrect.solvers.rollout",
+    "load_trajectory": "pdcorrect.io.trajectory",
+    "save_trajectory": "pdcorrect.io.trajectory",
+    "TrajectoryWriter": "pdcorrect.io.trajectory",
+    "write_vtu_series": "pdcorrect.io.vtk",
+    "render": "pdcorrect.figures",
+    "compare": "pdcorrect.evaluate",
+}
+_MODULES = ("metrics", "errors", "figures", "evaluate", "report")
+
+__all__ = [*_HOME, *_MODULES, "__version__"]
+
+if TYPE_CHECKING:
+    from pdcorrect import errors, evaluate, figures, metrics, report
+    from pdcorrect.evaluate import compare
+    from pdcorrect.fem.problem import Problem, discretise
+    from pdcorrect.figures import render
+    from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
+    from pdcorrect.io.vtk import write_vtu_series
+    from pdcorrect.scene import Scene
+    from pdcorrect.solvers.newton import Newton
+    from pdcorrect.solvers.projective import ProjectiveDynamics
+    from pdcorrect.solvers.rollout import restrict, rollout
+    from pdcorrect.state import State, Status, Stepper, StepResult, Trajectory
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"pdcorrect.{name}")
+    raise AttributeError(f"module 'pdcorrect' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,244 @@
+"""The program ``pdcorrect``.  Each command imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
+
+if TYPE_CHECKING:
+    from pdcorrect.scene import Scene
+    from pdcorrect.state import Stepper, StepResult, Trajectory
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
+)
+
+FAILED, BAD_INPUT = 1, 2
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=False)]
+Frames = Annotated[Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)]
+
+
+@app.command()
+def simulate(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
+    refine: Annotated[int, typer.Option(help="Cut each coarse cell into K^3.", min=1)] = 1,
+    solver: Annotated[str, typer.Option(help="pd or newton.")] = "pd",
+    frames: Frames = None,
+    vtu: Annotated[
+        Optional[Path], typer.Option(help="Also write VTU files and a PVD into this folder.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
+) -> None:
+    """Run one scene and write its trajectory, frame by frame."""
+    from pdcorrect.io.trajectory import TrajectoryWriter
+    from pdcorrect.scene import Scene
+    from pdcorrect.solvers.rollout import rollout, run_attributes
+
+    loaded = Scene.load(scene)
+    stepper = _make_stepper(loaded, solver, refine)
+    count = frames or loaded.time.frames
+    start = stepper.problem.rest_state()
+    writer = TrajectoryWriter(
+        output, stepper.problem.positions, stepper.problem.cells, start,
+        scene_toml=loaded.to_toml(), attributes=run_attributes(stepper), overwrite=overwrite,
+    )  # fmt: skip
+    with writer, _progress() as progress:
+        task = progress.add_task(f"{loaded.name}", total=count)
+
+        def on_step(result: StepResult, seconds: float) -> None:
+            writer.append(result, seconds)
+            progress.advance(task)
+
+        run = rollout(stepper, count, on_step=on_step)
+    _summary(run, stepper)
+    _say(f"wrote {output}")
+    if vtu:
+        from pdcorrect.io.vtk import write_vtu_series
+
+        _say(f"wrote {write_vtu_series(run, vtu)}")
+
+
+@app.command()
+def compare(
+    scene: SceneFile,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for the report.")
+    ] = Path("comparison"),
+    frames: Frames = None,
+    figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
+) -> None:
+    """Run coarse, intermediate and fine PD and Newton; report error and run time."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdcorrect import evaluate
+    from pdcorrect.errors import require_extra
+    from pdcorrect.scene import Scene
+
+    if figures:
+        require_extra("pyvista", "view")
+        require_extra("matplotlib", "view")
+    loaded = Scene.load(scene)
+    count = frames or loaded.time.frames
+    with _progress() as progress:
+        tasks = {
+            c.label: progress.add_task(c.label, total=count, start=False) for c in evaluate.CASES
+        }
+
+        def on_step(label: str, frame: int, result: StepResult) -> None:
+            if frame == 1:
+                progress.start_task(tasks[label])
+            progress.update(tasks[label], completed=frame)
+
+        comparison = evaluate.compare(loaded, count, on_step=on_step)
+
+    from pdcorrect import report
+
+    table = Table(title=loaded.name)
+    for heading in report.HEADINGS:
+        table.add_column(heading, justify="left" if heading == "solver" else "right")
+    for row in report.table(comparison):
+        table.add_row(*row)
+    _say("drawing the figures ..." if figures else "")
+    path = report.write_report(comparison, output, draw=figures)
+    Console().print(table)
+    for note in report.notes(comparison):
+        _say("- " + note)
+    _say(f"report: {path}")
+
+
+@app.command()
+def render(
+    runs: Annotated[list[Path], typer.Argument(help="Trajectory files.", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Picture: .png, .gif or .mp4.")],
+    label: Annotated[
+        Optional[list[str]], typer.Option(help="Title of each run, in order.")
+    ] = None,
+    colour: Annotated[str, typer.Option(help="displacement, error or none.")] = "displacement",
+    frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
+    fps: Annotated[float, typer.Option(help="Frames a second of a .gif or .mp4.")] = 25.0,
+) -> None:
+    """Draw one run or several side by side; errors are against the last run given."""
+    from pdcorrect import figures
+    from pdcorrect.io.trajectory import load_trajectory
+
+    if colour not in ("displacement", "error", "none"):
+        raise InputError(f"--colour {colour}: expected displacement, error or none.")
+    loaded = [load_trajectory(path) for path in runs]
+    still = output.suffix.lower() == ".png"
+    figures.render(
+        loaded,
+        output,
+        labels=label or [path.stem for path in runs],
+        colour=None if colour == "none" else colour,
+        reference=loaded[-1] if colour == "error" else None,
+        frame=(-1 if frame is None else frame) if still else None,
+        fps=fps,
+    )
+    _say(f"wrote {output}")
+
+
+@app.command()
+def doctor() -> None:
+    """Show versions, threads, factorisations, GPU and whether rendering works."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdcorrect import environment
+
+    checks = environment.doctor()
+    table = Table("what", "found", "")
+    for check in checks:
+        table.add_row(check.name, check.found, "ok" if check.ok else "PROBLEM")
+    Console().print(table)
+    if not all(check.ok for check in checks):
+        raise typer.Exit(FAILED)
+
+
+def _make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
+    from pdcorrect.evaluate import make_stepper
+
+    if solver not in ("pd", "newton"):
+        raise InputError(f"--solver {solver}: expected pd or newton.")
+    return make_stepper(scene, solver, refine)
+
+
+def _summary(run: Trajectory, stepper: Stepper) -> None:
+    """Frames, time, iterations, residual, energy, and what solved them."""
+    stats = run.stats
+    seconds = stats["seconds"].sum()
+    trouble = [s for s in stats["status"].tolist() if s != "CONVERGED"]
+    problem = stepper.problem
+    _say(
+        f"{len(run)} frames of {stepper.describe()['time_step']} s on {len(run.points)} nodes and "
+        f"{len(run.cells)} cells ({problem.element}, {problem.mass_rule} mass) in {seconds:.2f} s: "
+        f"{1e3 * seconds / max(len(run), 1):.3g} ms a frame"
+    )
+    _say(", ".join(f"{k}: {v}" for k, v in stepper.describe().items()))
+    _say(
+        f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
+        f"{stats['iterations'].max()}; recovered frames: {len(trouble)}"
+    )
+    _say(
+        f"worst residual {stats['residual'].max():.2g} N, worst estimated distance from the step's "
+        f"solution {stats['error_estimate'].max():.2g} m"
+    )
+    _say(
+        f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
+        f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
+        f"{stats['external_work'].sum():.4g} J"
+    )
+
+
+def _progress() -> Any:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+
+
+def _say(text: str) -> None:
+    if text:
+        typer.echo(text)
+
+
+def main() -> None:
+    """Entry point: one paragraph and an exit status instead of a traceback."""
+    try:
+        app()
+    except ConvergenceError as error:
+        _stop(str(error), FAILED)
+    except OutputError as error:
+        _stop(str(error), FAILED)
+    except PdcorrectError as error:
+        _stop(str(error), BAD_INPUT)
+    except MemoryError:
+        _stop("not enough memory: use a smaller --refine.", FAILED)
+
+
+def _stop(message: str, status: int) -> None:
+    typer.echo(f"error: {message}", err=True)
+    sys.exit(status)
+
+
+if __name__ == "__main__":
+    main()

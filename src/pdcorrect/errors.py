@@ -1,0 +1,80 @@
+"""Typed exceptions, and the check for optional dependencies.
+
+Every error that a user can cause derives from `PdcorrectError`; the command
+line turns those into one paragraph and exit status 2 (bad input) or 1 (the
+computation failed).
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+
+class PdcorrectError(Exception):
+    """Base class of everything this package raises on purpose."""
+
+
+class InputError(PdcorrectError, ValueError):
+    """An argument, array or file content is not acceptable."""
+
+
+class SceneError(InputError):
+    """A scene is malformed or contradicts itself."""
+
+
+class MeshError(InputError):
+    """A mesh cannot be used: inverted cells, wrong cell type, bad indices."""
+
+
+class FileFormatError(InputError):
+    """A file is damaged or is not what it was taken for."""
+
+
+class OutputError(PdcorrectError, OSError):
+    """A result could not be written."""
+
+
+class ConvergenceError(PdcorrectError, RuntimeError):
+    """A step failed after every fallback.
+
+    Attributes
+    ----------
+    trajectory : Trajectory or None
+        The frames computed before the failing step, when a rollout was running.
+    result : StepResult or None
+        The failing step.
+    """
+
+    def __init__(self, message: str, trajectory: object = None, result: object = None) -> None:
+        super().__init__(message)
+        self.trajectory = trajectory
+        self.result = result
+
+
+class MissingExtraError(PdcorrectError, ImportError):
+    """An optional dependency is not installed."""
+
+
+def require_extra(module: str, extra: str) -> ModuleType:
+    """Import an optional dependency, or say how to install it.
+
+    Parameters
+    ----------
+    module : str
+        Dotted module name, such as ``"pyvista"``.
+    extra : str
+        The extra of this package that contains it, such as ``"view"``.
+
+    Raises
+    ------
+    MissingExtraError
+        If the import fails.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{module} is needed for this and could not be imported ({error}). "
+            f"Install it with: pip install 'pdcorrect[{extra}]'"
+        ) from error

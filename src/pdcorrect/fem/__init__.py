@@ -1,0 +1,1 @@
+"""Meshes, operators, energies, kernels, factorisations and the discrete problem."""

@@ -1,0 +1,212 @@
+"""The corotated energy with a volume term: density, stress and tangent.
+
+    Psi(F) = mu |F - R|^2 + omega/2 |F - V|^2
+
+R is the nearest rotation and V the nearest matrix of unit determinant.  Both
+are projections, so by the envelope theorem (thesis, below eq. 3-25)
+
+    P = dPsi/dF = 2 mu (F - R) + omega (F - V).
+
+In the frame of the signed SVD, F = U diag(s) V^T, everything depends on s
+alone.  With k the multiplier of `nearest_volume_lanes` and v_i - s_i = k / v_i:
+
+    dPsi/ds_i = 2 mu (s_i - 1) - omega k / v_i
+
+and the tangent splits into one 3x3 block for the diagonal of U^T dF V and, for
+each pair i < j, a symmetric and an antisymmetric mode.  Their closed forms below
+stay finite for repeated singular values and for det F < 0.
+
+Kinks, where a branch is taken: s2 + s3 = 0 (R not unique) and large expansion
+where V is not unique (it flattens one direction, the third of the sorted SVD).
+There the infinite or undefined modes of the tangent are set to zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, scratch, signed_svd_lanes
+
+Array = NDArray[np.float64]
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+_KINK = 1e-9
+"""Relative distance from a kink below which its tangent mode is set to zero."""
+
+
+@njit(**OPTIONS)
+def density_and_stress_lanes(U, s, V, v, k, mu, omega, density, P):  # type: ignore[no-untyped-def]
+    """Energy density (L,) and first Piola-Kirchhoff stress P (9, L) from the decompositions.
+
+    With ``omega = 0`` the arrays v and k are not read.
+    """
+    for l in range(s.shape[1]):
+        e0, e1, e2 = s[0, l] - 1.0, s[1, l] - 1.0, s[2, l] - 1.0
+        density[l] = mu * (e0 * e0 + e1 * e1 + e2 * e2)
+        t0, t1, t2 = 2.0 * mu * e0, 2.0 * mu * e1, 2.0 * mu * e2
+        if omega > 0.0:
+            g0, g1, g2 = k[l] / v[0, l], k[l] / v[1, l], k[l] / v[2, l]
+            density[l] += 0.5 * omega * (g0 * g0 + g1 * g1 + g2 * g2)
+            t0, t1, t2 = t0 - omega * g0, t1 - omega * g1, t2 - omega * g2
+        for i in range(3):
+            x, y, z = U[3 * i, l] * t0, U[3 * i + 1, l] * t1, U[3 * i + 2, l] * t2
+            for j in range(3):
+                P[3 * i + j, l] = x * V[3 * j, l] + y * V[3 * j + 1, l] + z * V[3 * j + 2, l]
+
+
+@njit(**OPTIONS)
+def tangent_lanes(s, v, k, mu, omega, project, T):  # type: ignore[no-untyped-def]
+    """Tangent in the frame of the SVD, T (12, L).
+
+    Rows 0-5: the diagonal block 00 11 22 01 02 12; rows 6-8 and 9-11: for the
+    pairs 01 02 12 the factors p, m of P_ij = p F_ij + m F_ji.  ``project``
+    raises negative eigenvalues to zero.
+    """
+    for l in range(s.shape[1]):
+        for i in range(3):
+            T[i, l] = 2.0 * mu
+            T[3 + i, l] = 0.0
+        if omega > 0.0:
+            _volume_diagonal(s, v, l, omega, T)
+        for pair in range(3):
+            i, j = pair // 2, 1 + (pair + 1) // 2
+            total = s[i, l] + s[j, l]
+            symmetric, antisymmetric = 2.0 * mu, 0.0
+            if total > _KINK * (s[0, l] + 1e-300):
+                antisymmetric = 2.0 * mu * (total - 2.0) / total
+                if omega > 0.0:
+                    vv = v[i, l] * v[j, l]
+                    antisymmetric -= omega * k[l] / (vv - k[l])
+            if omega > 0.0:
+                vv = v[i, l] * v[j, l]
+                if abs(vv + k[l]) > _KINK * vv:
+                    symmetric += omega * k[l] / (vv + k[l])
+            if project:
+                symmetric, antisymmetric = max(symmetric, 0.0), max(antisymmetric, 0.0)
+            T[6 + pair, l] = 0.5 * (symmetric + antisymmetric)
+            T[9 + pair, l] = 0.5 * (symmetric - antisymmetric)
+        if project:
+            _project_diagonal(T, l)
+
+
+@njit(**OPTIONS)
+def _volume_diagonal(s, v, l, omega, T):  # type: ignore[no-untyped-def]
+    """Add omega (I - dv/ds), with d_i = 2 v_i - s_i and dv/ds free of 0/0 at d_i = 0."""
+    v0, v1, v2 = v[0, l], v[1, l], v[2, l]
+    d0, d1, d2 = 2.0 * v0 - s[0, l], 2.0 * v1 - s[1, l], 2.0 * v2 - s[2, l]
+    total = d1 * d2 / v0 + d0 * d2 / v1 + d0 * d1 / v2
+    if abs(total) > _KINK * (v0 + v1 + v2):
+        scale = omega / total
+        T[0, l] += omega - scale * v0 * (d1 / v2 + d2 / v1)
+        T[1, l] += omega - scale * v1 * (d0 / v2 + d2 / v0)
+        T[2, l] += omega - scale * v2 * (d0 / v1 + d1 / v0)
+        T[3, l] += scale * d2
+        T[4, l] += scale * d1
+        T[5, l] += scale * d0
+
+
+@njit(**OPTIONS)
+def _project_diagonal(T, l):  # type: ignore[no-untyped-def]
+    """Raise the negative eigenvalues of the diagonal block to zero."""
+    block = np.empty((3, 3))
+    for i in range(3):
+        block[i, i] = T[i, l]
+    block[0, 1] = block[1, 0] = T[3, l]
+    block[0, 2] = block[2, 0] = T[4, l]
+    block[1, 2] = block[2, 1] = T[5, l]
+    values, vectors = np.linalg.eigh(block)
+    if values[0] >= 0.0:
+        return
+    block[:] = 0.0
+    for i in range(3):
+        if values[i] > 0.0:
+            for a in range(3):
+                for b in range(3):
+                    block[a, b] += values[i] * vectors[a, i] * vectors[b, i]
+    for i in range(3):
+        T[i, l] = block[i, i]
+    T[3, l], T[4, l], T[5, l] = block[0, 1], block[0, 2], block[1, 2]
+
+
+# --- pointwise functions on NumPy arrays, any leading shape --------------------
+
+
+def signed_svd(F: Array) -> tuple[Array, Array, Array]:
+    """U (..., 3, 3), s (..., 3), V (..., 3, 3) with F = U diag(s) V^T, both rotations proper."""
+    flat, shape = _to_lanes(F)
+    U, s, V, *_ = _decompose(flat)
+    return _from_lanes(U, shape), s.T.reshape(*shape, 3).copy(), _from_lanes(V, shape)
+
+
+def nearest_rotation(F: Array) -> Array:
+    """The rotation R (..., 3, 3) with det R = +1 that minimises |F - R|."""
+    U, _, V = signed_svd(F)
+    return U @ np.swapaxes(V, -1, -2)
+
+
+def nearest_unit_determinant(F: Array) -> Array:
+    """The matrix V (..., 3, 3) with det V = 1 that minimises |F - V|."""
+    flat, shape = _to_lanes(F)
+    U, _, V, _, _, v, _ = _decompose(flat)
+    scaled = _from_lanes(U, shape) * v.T.reshape(*shape, 1, 3)
+    return scaled @ np.swapaxes(_from_lanes(V, shape), -1, -2)
+
+
+def energy_density(F: Array, mu: float, omega: float) -> Array:
+    """Psi(F), (...), J/m3, for F (..., 3, 3) and weights in Pa."""
+    return _density_and_stress(F, mu, omega)[0]
+
+
+def first_piola(F: Array, mu: float, omega: float) -> Array:
+    """P = dPsi/dF, (..., 3, 3), Pa."""
+    return _density_and_stress(F, mu, omega)[1]
+
+
+def elasticity(F: Array, mu: float, omega: float, project: bool = False) -> Array:
+    """dP/dF, (..., 3, 3, 3, 3), Pa; ``project`` makes it positive semi-definite."""
+    flat, shape = _to_lanes(F)
+    U, s, V, _, _, v, k = _decompose(flat)
+    T = np.empty((12, flat.shape[1]))
+    tangent_lanes(s, v, k, float(mu), float(omega), project, T)
+    C = np.zeros((flat.shape[1], 3, 3, 3, 3))  # in the frame of the SVD
+    for i in range(3):
+        C[:, i, i, i, i] = T[i]
+    for pair, (i, j) in enumerate(_PAIRS):
+        C[:, i, i, j, j] = C[:, j, j, i, i] = T[3 + pair]
+        C[:, i, j, i, j] = C[:, j, i, j, i] = T[6 + pair]
+        C[:, i, j, j, i] = C[:, j, i, i, j] = T[9 + pair]
+    u, w = U.T.reshape(-1, 3, 3), V.T.reshape(-1, 3, 3)
+    out = np.einsum("nia,njb,nabcd,nkc,nld->nijkl", u, w, C, u, w, optimize=True)
+    return out.reshape(*shape, 3, 3, 3, 3)
+
+
+def _density_and_stress(F: Array, mu: float, omega: float) -> tuple[Array, Array]:
+    flat, shape = _to_lanes(F)
+    U, s, V, _, _, v, k = _decompose(flat)
+    density, P = np.empty(flat.shape[1]), np.empty_like(flat)
+    density_and_stress_lanes(U, s, V, v, k, float(mu), float(omega), density, P)
+    return density.reshape(shape), _from_lanes(P, shape)
+
+
+def _decompose(flat: Array) -> tuple[Array, ...]:
+    work = scratch(flat.shape[1])
+    U, s, V, B, S, v, k = work
+    signed_svd_lanes(flat, U, s, V, B, S)
+    nearest_volume_lanes(s, v, k)
+    return work
+
+
+def _to_lanes(F: Array) -> tuple[Array, tuple[int, ...]]:
+    F = np.asarray(F, dtype=np.float64)
+    if F.shape[-2:] != (3, 3):
+        raise InputError(f"F has shape {F.shape}: expected (..., 3, 3).")
+    if not np.isfinite(F).all():
+        raise InputError("F contains NaN or infinite entries.")
+    return np.ascontiguousarray(F.reshape(-1, 9).T), F.shape[:-2]
+
+
+def _from_lanes(A: Array, shape: tuple[int, ...]) -> Array:
+    return A.T.reshape(*shape, 3, 3).copy()

@@ -1,0 +1,266 @@
+"""Loops over cells: elastic energy, forces, linearisation and tangent blocks.
+
+Threads share the cells in fixed contiguous chunks and every result is stored by
+cell, then summed node by node in a fixed order; so results do not depend on the
+number of threads.  Work arrays are made once a chunk.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_svd_lanes
+from pdcorrect.fem.energies import density_and_stress_lanes, tangent_lanes
+
+PARALLEL = {**OPTIONS, "parallel": True}
+_REDUCE = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
+_CHUNK = 16
+"""Cells that one thread takes at a time."""
+
+
+@njit(**OPTIONS)
+def _deformation_gradient(u, nodes, gradients, F):  # type: ignore[no-untyped-def]
+    """F = I + sum_k u_k grad N_k, (9, Q), from nodal displacements u (N, 3)."""
+    for i in range(3):
+        for j in range(3):
+            for q in range(F.shape[1]):
+                F[3 * i + j, q] = 1.0 if i == j else 0.0
+    for k in range(nodes.shape[0]):
+        node = nodes[k]
+        for i in range(3):
+            value = u[node, i]
+            for j in range(3):
+                for q in range(F.shape[1]):
+                    F[3 * i + j, q] += value * gradients[k, j, q]
+
+
+@njit(**_REDUCE)
+def _nodal_forces(P, weights, gradients, out):  # type: ignore[no-untyped-def]
+    """out[k, i] = -sum_q w_q P_ij dN_k/dx_j for P (9, Q)."""
+    for row in range(9):
+        for q in range(P.shape[1]):
+            P[row, q] *= weights[q]
+    for k in range(out.shape[0]):
+        for i in range(3):
+            total = 0.0
+            for q in range(P.shape[1]):
+                total += (
+                    P[3 * i, q] * gradients[k, 0, q]
+                    + P[3 * i + 1, q] * gradients[k, 1, q]
+                    + P[3 * i + 2, q] * gradients[k, 2, q]
+                )
+            out[k, i] = -total
+
+
+@njit(**OPTIONS)
+def _dot(a, b):  # type: ignore[no-untyped-def]
+    total = 0.0
+    for i in range(a.shape[0]):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(**PARALLEL)
+def cell_energy_and_forces(u, cells, gradients, weights, mu, omega, energy, forces):  # type: ignore[no-untyped-def]
+    """Elastic energy (C,), J, and nodal forces (C, K, 3), N, of each cell.
+
+    Parameters
+    ----------
+    u : (N, 3)
+        Displacements, m.
+    cells : (C, K), gradients : (C, K, 3, Q), weights : (C, Q)
+    mu, omega : (C,)
+        Weights of the two terms, Pa; where omega is zero no volume projection
+        is computed.
+    """
+    count, lanes = cells.shape[0], weights.shape[1]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+        U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
+        s, v = np.empty((3, lanes)), np.empty((3, lanes))
+        k, density = np.empty(lanes), np.empty(lanes)
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            _deformation_gradient(u, cells[c], gradients[c], F)
+            signed_svd_lanes(F, U, s, V, B, S)
+            if omega[c] > 0.0:
+                nearest_volume_lanes(s, v, k)
+            density_and_stress_lanes(U, s, V, v, k, mu[c], omega[c], density, P)
+            energy[c] = _dot(density, weights[c])
+            _nodal_forces(P, weights[c], gradients[c], forces[c])
+
+
+@njit(**PARALLEL)
+def linearise_cells(  # type: ignore[no-untyped-def]
+    u, cells, gradients, weights, mu, omega, project, left, right, tangent
+):
+    """Everything the tangent needs at displacements u, for each cell.
+
+    Writes ``left`` and ``right`` (C, 9, Q), the factors U and V of the signed
+    SVD, and ``tangent`` (C, 12, Q), `tangent_lanes` times the weights.
+    """
+    count, lanes = cells.shape[0], weights.shape[1]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
+        s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            _deformation_gradient(u, cells[c], gradients[c], F)
+            signed_svd_lanes(F, left[c], s, right[c], B, S)
+            if omega[c] > 0.0:
+                nearest_volume_lanes(s, v, k)
+            tangent_lanes(s, v, k, mu[c], omega[c], project, tangent[c])
+            for row in range(12):
+                for q in range(lanes):
+                    tangent[c, row, q] *= weights[c, q]
+
+
+@njit(**PARALLEL)
+def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
+    """Tangent times x (N, 3), written by cell to ``out`` (C, K, 3)."""
+    count, lanes = cells.shape[0], tangent.shape[2]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        D, A, one = np.empty((9, lanes)), np.empty((9, lanes)), np.ones(lanes)
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            _deformation_gradient(x, cells[c], gradients[c], D)
+            for i in range(3):
+                for q in range(lanes):
+                    D[4 * i, q] -= 1.0  # the gradient of x, without the identity
+            _transform(left[c], D, right[c], A, True)
+            _tangent_product(tangent[c], A)
+            _transform(left[c], A, right[c], D, False)
+            _nodal_forces(D, one, gradients[c], out[c])
+            for k in range(out.shape[1]):
+                for i in range(3):
+                    out[c, k, i] = -out[c, k, i]
+
+
+@njit(**OPTIONS)
+def _transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
+    """out = U^T A V (forward) or U A V^T, all (9, Q)."""
+    for i in range(3):
+        for j in range(3):
+            for q in range(A.shape[1]):
+                total = 0.0
+                for a in range(3):
+                    left = U[3 * a + i, q] if forward else U[3 * i + a, q]
+                    for b in range(3):
+                        right = V[3 * b + j, q] if forward else V[3 * j + b, q]
+                        total += left * A[3 * a + b, q] * right
+                out[3 * i + j, q] = total
+
+
+@njit(**OPTIONS)
+def _tangent_product(T, A):  # type: ignore[no-untyped-def]
+    """A <- tangent : A in the frame of the SVD, in place."""
+    for q in range(A.shape[1]):
+        x, y, z = A[0, q], A[4, q], A[8, q]
+        A[0, q] = T[0, q] * x + T[3, q] * y + T[4, q] * z
+        A[4, q] = T[3, q] * x + T[1, q] * y + T[5, q] * z
+        A[8, q] = T[4, q] * x + T[5, q] * y + T[2, q] * z
+        for pair in range(3):
+            i, j = pair // 2, 1 + (pair + 1) // 2
+            x, y = A[3 * i + j, q], A[3 * j + i, q]
+            A[3 * i + j, q] = T[6 + pair, q] * x + T[9 + pair, q] * y
+            A[3 * j + i, q] = T[6 + pair, q] * y + T[9 + pair, q] * x
+
+
+@njit(**PARALLEL)
+def cell_stiffness(cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
+    """Tangent stiffness of each cell as node blocks, out (C, K, K, 3, 3), N/m.
+
+    In the frame of the SVD, with g_k = V^T grad N_k, the block of nodes k, l is
+
+        K_ab = A_ab g_ka g_lb + [a = b] sum_c p_ac g_kc g_lc + [a != b] m_ab g_kb g_la
+
+    and U K U^T is added to the result.
+    """
+    count, nodes, lanes = cells.shape[0], cells.shape[1], tangent.shape[2]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        g = np.empty((nodes, 3))
+        A, p, m = np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+        block, half = np.empty((3, 3)), np.empty((3, 3))
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            out[c] = 0.0
+            for q in range(lanes):
+                _unpack(tangent[c], q, A, p, m)
+                for k in range(nodes):
+                    for a in range(3):
+                        g[k, a] = (
+                            right[c, a, q] * gradients[c, k, 0, q]
+                            + right[c, 3 + a, q] * gradients[c, k, 1, q]
+                            + right[c, 6 + a, q] * gradients[c, k, 2, q]
+                        )
+                for k in range(nodes):
+                    for l in range(k + 1):
+                        _node_block(g[k], g[l], A, p, m, block)
+                        _add_rotated(left[c], q, block, half, out[c, k, l])
+            for k in range(nodes):
+                for l in range(k):
+                    for a in range(3):
+                        for b in range(3):
+                            out[c, l, k, a, b] = out[c, k, l, b, a]
+
+
+@njit(**OPTIONS)
+def _unpack(T, q, A, p, m):  # type: ignore[no-untyped-def]
+    for i in range(3):
+        A[i, i] = T[i, q]
+    for pair in range(3):
+        i, j = pair // 2, 1 + (pair + 1) // 2
+        A[i, j] = A[j, i] = T[3 + pair, q]
+        p[i, j] = p[j, i] = T[6 + pair, q]
+        m[i, j] = m[j, i] = T[9 + pair, q]
+
+
+@njit(**OPTIONS)
+def _node_block(x, y, A, p, m, block):  # type: ignore[no-untyped-def]
+    for a in range(3):
+        for b in range(3):
+            block[a, b] = A[a, b] * x[a] * y[b] + m[a, b] * x[b] * y[a]
+        block[a, a] += p[a, 0] * x[0] * y[0] + p[a, 1] * x[1] * y[1] + p[a, 2] * x[2] * y[2]
+
+
+@njit(**OPTIONS)
+def _add_rotated(U, q, block, half, out):  # type: ignore[no-untyped-def]
+    """out += U block U^T for the U of quadrature point q."""
+    for i in range(3):
+        for b in range(3):
+            half[i, b] = (
+                U[3 * i, q] * block[0, b]
+                + U[3 * i + 1, q] * block[1, b]
+                + U[3 * i + 2, q] * block[2, b]
+            )
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += (
+                half[i, 0] * U[3 * j, q] + half[i, 1] * U[3 * j + 1, q] + half[i, 2] * U[3 * j + 2, q]
+            )
+
+
+@njit(**PARALLEL)
+def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
+    """out[n] = sum of values[slot] over the (cell, local node) slots of node n.
+
+    Parameters
+    ----------
+    start : (N + 1,), slots : (C K,)
+        Slots of each node, compressed rows.
+    values : (C K, 3), out : (N, 3)
+    """
+    for n in prange(len(start) - 1):
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(start[n], start[n + 1]):
+            slot = slots[i]
+            x += values[slot, 0]
+            y += values[slot, 1]
+            z += values[slot, 2]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+
+
+@njit(**OPTIONS)
+def add_blocks(target, blocks, data):  # type: ignore[no-untyped-def]
+    """data[target[i]] += blocks[i] for node blocks (n, 3, 3)."""
+    for i in range(len(target)):
+        for a in range(3):
+            for b in range(3):
+                data[target[i], a, b] += blocks[i, a, b]

@@ -1,0 +1,248 @@
+"""Loads of a scene as nodal force vectors with an amplitude over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import SceneError
+from pdcorrect.fem.operators import Space, scatter
+from pdcorrect.fem.selection import Selector
+from pdcorrect.scene import (
+    BodyForce,
+    Force,
+    Gravity,
+    Load,
+    Pressure,
+    Scene,
+    Torsion,
+    Traction,
+)
+
+Array = NDArray[np.float64]
+
+
+class Amplitude:
+    """Piecewise linear factor over time, with jumps at the ends of a window.
+
+    Parameters
+    ----------
+    load : Load
+        Its ``window``, ``ramp`` and ``table`` are read.
+    """
+
+    def __init__(self, load: Load) -> None:
+        if load.table is not None:
+            self._times, self._values = (np.array(column) for column in zip(*load.table))
+            self._outside = (self._values[0], self._values[-1])
+            return
+        start, end = load.window or (0.0, np.inf)
+        ramp = min(load.ramp, end - start)
+        self._times = np.array([start, start + ramp, end])
+        self._values = np.array([0.0 if ramp else 1.0, 1.0, 1.0])
+        if ramp and ramp < load.ramp:
+            self._values[1:] = ramp / load.ramp
+        self._outside = (0.0, 0.0)
+
+    @property
+    def constant(self) -> bool:
+        """Whether the amplitude is 1 at all times from zero on."""
+        return self._outside == (0.0, 0.0) and bool(
+            self._times[0] == self._times[1] == 0.0 and np.isinf(self._times[-1])
+        )
+
+    def mean(self, start: float, end: float) -> float:
+        """Mean over [start, end] in seconds; the value where they are equal."""
+        if self.constant:
+            return 1.0
+        if end <= start:
+            return self._value(end)
+        inner = self._times[(self._times > start) & (self._times < end)]
+        ends = np.concatenate([[start], inner, [end]])
+        middles = 0.5 * (ends[1:] + ends[:-1])  # the amplitude is linear in between
+        values = np.array([self._value(t) for t in middles])
+        return float(values @ np.diff(ends) / (end - start))
+
+    def _value(self, time: float) -> float:
+        if time < self._times[0]:
+            return float(self._outside[0])
+        if time > self._times[-1]:
+            return float(self._outside[1])
+        if np.isinf(self._times[-1]) and time >= self._times[-2]:
+            return float(self._values[-1])
+        finite = np.isfinite(self._times)
+        return float(np.interp(time, self._times[finite], self._values[finite]))
+
+
+@dataclass(frozen=True, eq=False)
+class NodalLoad:
+    """One load on a mesh: ``amplitude(t) * field``.
+
+    Attributes
+    ----------
+    amplitude : Amplitude
+    pattern : (N, 3)
+        Nodal forces at amplitude 1 on the body at rest, N.
+    sample : callable or None
+        For follower loads: nodal forces at given positions.
+    """
+
+    amplitude: Amplitude
+    pattern: Array
+    sample: Callable[[Array], Array] | None = None
+
+    def forces(self, start: float, end: float, positions: Array | None) -> Array:
+        """Nodal forces (N, 3), N, for the step from ``start`` to ``end`` (s)."""
+        factor = self.amplitude.mean(start, end)
+        if self.sample is None or positions is None or factor == 0.0:
+            return factor * self.pattern
+        return factor * self.sample(positions)
+
+
+def assemble_loads(
+    scene: Scene, space: Space, selector: Selector, nodal_mass: Array, free: NDArray[np.bool_]
+) -> tuple[NodalLoad, ...]:
+    """All loads of a scene on one mesh.
+
+    Raises
+    ------
+    SceneError
+        If a region selects nothing, or a load acts on held components only.
+    """
+    loads = []
+    for i, load in enumerate(scene.loads):
+        key = f"loads[{i}]"
+        sample = _SAMPLERS[type(load)](load, space, selector, nodal_mass, f"{key}.region")
+        pattern = sample(space.positions)
+        if pattern.any() and not pattern[free].any():
+            raise SceneError(
+                f"{key} (kind = {load.kind!r}) acts only on components that clamps hold: "
+                "expected at least one free component. Change its region, its direction or the "
+                "clamps."
+            )
+        follower = getattr(load, "follower", False)
+        loads.append(NodalLoad(Amplitude(load), pattern, sample if follower else None))
+    return tuple(loads)
+
+
+Sampler = Callable[[Array], Array]
+
+
+def _gravity(
+    load: Gravity, space: Space, selector: Selector, nodal_mass: Array, key: str
+) -> Sampler:
+    pattern = nodal_mass[:, None] * np.array(load.acceleration)
+    return lambda positions: pattern
+
+
+def _body_force(load: BodyForce, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    pattern = _in_cells(space, selector.cells(load.region, key), np.array(load.density))
+    return lambda positions: pattern
+
+
+def _force(load: Force, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    total = np.array(load.force)
+    if load.distribution == "nodal":
+        nodes = selector.coarse_nodes(load.region, key)
+        pattern = np.zeros_like(space.positions)
+        pattern[nodes] = total / len(nodes)
+    elif load.region.nodes is not None:
+        raise SceneError(
+            f"{key} = {load.region.describe()} with distribution = 'consistent': a list of nodes "
+            "has no area or volume to spread the force over. Use distribution = 'nodal', or a "
+            "plane, box or sphere."
+        )
+    elif load.region.plane is not None:
+        face = space.face_quadrature(selector.faces(load.region, key))
+        traction = total / face.weights.sum()
+        values = np.einsum("nq,nqk,i->nki", face.weights, face.values, traction)
+        pattern = scatter(space.cells[face.cells], values, len(space.positions))
+    else:
+        cells = selector.cells(load.region, key)
+        pattern = _in_cells(space, cells, total / space.volumes()[cells].sum())
+    return lambda positions: pattern
+
+
+def _traction(load: Traction, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    face = space.face_quadrature(selector.faces(load.region, key))
+    values = np.einsum("nq,nqk,i->nki", face.weights, face.values, np.array(load.traction))
+    pattern = scatter(space.cells[face.cells], values, len(space.positions))
+    return lambda positions: pattern
+
+
+def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    """Nanson's formula: n da = cof(F) N dA."""
+    face = space.face_quadrature(selector.faces(load.region, key))
+    nodes = space.cells[face.cells]
+
+    def sample(positions: Array) -> Array:
+        F = np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
+        area = np.einsum("nqij,nqj->nqi", cofactor(F), face.normals)
+        values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -load.pressure * area)
+        return scatter(nodes, values, len(positions))
+
+    return sample
+
+
+def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    rest = space.positions
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    centre = middle if load.centre is None else np.array(load.centre)
+
+    def field(points: Array) -> Array:
+        return load.strength * torsion_field(points - centre, load.attraction, load.stretch)
+
+    if load.distribution == "nodal":
+        nodes = selector.coarse_nodes(load.region, key)
+
+        def sample(positions: Array) -> Array:
+            out = np.zeros_like(positions)
+            out[nodes] = field(positions[nodes])
+            return out
+
+        return sample
+
+    inside = np.zeros(len(space.cells))
+    inside[selector.cells(load.region, key)] = 1.0
+    return lambda positions: space.body_load(
+        field(space.interpolate(positions)) * inside[:, None, None]
+    )
+
+
+_SAMPLERS: dict[type, Callable[..., Sampler]] = {
+    Gravity: _gravity,
+    BodyForce: _body_force,
+    Force: _force,
+    Traction: _traction,
+    Pressure: _pressure,
+    Torsion: _torsion,
+}
+
+
+def torsion_field(points: Array, attraction: float, stretch: float) -> Array:
+    """Unit rotational field of the thesis, eq. 6-1 to 6-3, at ``points`` (..., 3).
+
+    f = (stretch, -z - attraction y, y - attraction z) / |...|, and 0 where the
+    numerator vanishes (on the axis with no stretch).
+    """
+    y, z = points[..., 1], points[..., 2]
+    f = np.stack([np.full_like(y, stretch), -z - attraction * y, y - attraction * z], axis=-1)
+    length = np.linalg.norm(f, axis=-1, keepdims=True)
+    return np.divide(f, length, out=np.zeros_like(f), where=length > 0)
+
+
+def cofactor(F: Array) -> Array:
+    """Cofactor matrix det(F) F^-T of (..., 3, 3), also for singular F."""
+    rows = [np.cross(F[..., (i + 1) % 3, :], F[..., (i + 2) % 3, :]) for i in range(3)]
+    return np.stack(rows, axis=-2)
+
+
+def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:
+    inside = np.zeros(len(space.cells))
+    inside[cells] = 1.0
+    shape = (*space.interpolate(space.positions).shape[:2], 3)
+    return space.body_load(np.broadcast_to(density, shape) * inside[:, None, None])
+

@@ -1,0 +1,237 @@
+"""Hexahedral meshes as arrays: construction, exact refinement, quality.
+
+All cells are in VTK order (bottom face 0-1-2-3 counter-clockwise seen from
+above, then the top face 4-5-6-7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pdcorrect.errors import MeshError
+
+VTK_CORNERS = np.array(
+    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+)
+"""Corners of the unit cell in VTK order, (8, 3)."""
+
+VTK_FACES = np.array(
+    [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
+)
+"""Corners of the six faces, counter-clockwise seen from outside, (6, 4)."""
+
+VTK_EDGES = np.array(
+    [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
+)
+"""Corners of the twelve edges, (12, 2)."""
+
+
+@dataclass(frozen=True, eq=False)
+class HexMesh:
+    """Nodes (N, 3) in metres and cells (C, 8) in VTK order.
+
+    Attributes
+    ----------
+    coarse_nodes : (Nc,) int
+        For each node of the unrefined mesh, the node at the same place here.
+    coarse_cells : (C,) int
+        For each cell, the unrefined cell that it is a part of.
+    """
+
+    positions: NDArray[np.float64]
+    cells: NDArray[np.int64]
+    coarse_nodes: NDArray[np.int64]
+    coarse_cells: NDArray[np.int64]
+
+    @classmethod
+    def create(cls, positions: NDArray[np.float64], cells: NDArray[np.int64]) -> HexMesh:
+        """Check the arrays and build an unrefined mesh.
+
+        Raises
+        ------
+        MeshError
+            If shapes, indices or corner Jacobians are wrong; names the cell.
+        """
+        positions = np.ascontiguousarray(positions, dtype=np.float64)
+        cells = np.ascontiguousarray(cells, dtype=np.int64)
+        if positions.ndim != 2 or positions.shape[1] != 3 or cells.ndim != 2 or cells.shape[1] != 8:
+            raise MeshError(
+                f"nodes {positions.shape} and cells {cells.shape}: expected (N, 3) and (C, 8)."
+            )
+        if not len(cells):
+            raise MeshError("the mesh has no cells: expected at least one hexahedron.")
+        if not np.isfinite(positions).all():
+            node = int(np.argmin(np.isfinite(positions).all(axis=1)))
+            raise MeshError(f"node {node} is at {positions[node]}: expected finite coordinates.")
+        if cells.min() < 0 or cells.max() >= len(positions):
+            raise MeshError(
+                f"cells refer to nodes {cells.min()} to {cells.max()}: expected 0 to "
+                f"{len(positions) - 1}."
+            )
+        unused = np.flatnonzero(np.bincount(cells.ravel(), minlength=len(positions)) == 0)
+        if len(unused):
+            raise MeshError(
+                f"node {unused[0]} at {positions[unused[0]]} belongs to no cell: expected every "
+                "node to be used."
+            )
+        jacobian = corner_jacobians(positions, cells).min(axis=1)
+        if jacobian.min() <= 0:
+            cell = int(np.argmin(jacobian))
+            raise MeshError(
+                f"cell {cell} around {positions[cells[cell]].mean(axis=0)} is inverted or flat "
+                f"(smallest corner Jacobian {jacobian[cell]:.3g} m3): expected VTK node order and "
+                "a convex cell."
+            )
+        return cls(positions, cells, np.arange(len(positions)), np.arange(len(cells)))
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """Mean of each cell's corners, (C, 3)."""
+        return self.positions[self.cells].mean(axis=1)
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest coordinates, (2, 3)."""
+        return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
+
+
+def corner_jacobians(
+    positions: NDArray[np.float64], cells: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Determinant of the trilinear map at the corners, (C, 8), m3.
+
+    For cubes it is the cell volume; it is positive at all corners of a usable
+    cell.
+    """
+    corners = positions[cells]  # (C, 8, 3)
+    jacobian = np.empty((len(cells), 8))
+    for k, corner in enumerate(VTK_CORNERS):
+        edges = []
+        for axis in range(3):
+            other = corner.copy()
+            other[axis] = 1 - other[axis]
+            neighbour = int(np.flatnonzero((other == VTK_CORNERS).all(axis=1))[0])
+            sign = 1 - 2 * corner[axis]
+            edges.append(sign * (corners[:, neighbour] - corners[:, k]))
+        jacobian[:, k] = np.einsum("ci,ci->c", edges[0], np.cross(edges[1], edges[2]))
+    return jacobian
+
+
+def voxel_mesh(
+    solid: NDArray[np.bool_],
+    origin_index: tuple[int, int, int],
+    cell_size: float,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> HexMesh:
+    """Mesh of the solid cells of a regular grid.
+
+    Parameters
+    ----------
+    solid : (nx, ny, nz) bool
+    origin_index : tuple of int
+        Grid node that is placed at ``origin``.
+    cell_size : float
+        m.
+    origin : tuple of float
+        m.
+
+    Nodes are numbered by x, then y, then z (z fastest), unused ones left out.
+    """
+    index = np.argwhere(solid)  # (C, 3)
+    grid = np.array(solid.shape) + 1
+    corners = index[:, None, :] + VTK_CORNERS  # (C, 8, 3)
+    flat = np.ravel_multi_index(tuple(np.moveaxis(corners, -1, 0)), tuple(grid))
+    used, cells = np.unique(flat, return_inverse=True)
+    nodes = np.stack(np.unravel_index(used, tuple(grid)), axis=1) - np.array(origin_index)
+    positions = nodes * float(cell_size) + np.array(origin)
+    return HexMesh.create(positions, cells.reshape(-1, 8))
+
+
+def refine(mesh: HexMesh, k: int) -> HexMesh:
+    """Cut each cell into k x k x k by its trilinear map.
+
+    Coincident new nodes of neighbouring cells are recognised by their exact
+    integer weights on the cells' corners, never by distance, so any conforming
+    hexahedral mesh refines exactly.
+    """
+    if k == 1:
+        return mesh
+    steps = np.arange(k + 1)
+    lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    factors = np.where(VTK_CORNERS[None] == 1, lattice[:, None], k - lattice[:, None])
+    weights = factors.prod(axis=-1)  # (L, 8), summing to k^3
+    count = len(mesh.cells)
+
+    # A point's key: its corners with non-zero weight, sorted, each with the weight.
+    corner = np.where(weights[None] > 0, mesh.cells[:, None, :], -1)  # (C, L, 8)
+    weight = np.broadcast_to(weights, corner.shape)
+    order = np.argsort(corner, axis=-1)
+    corner = np.take_along_axis(corner, order, axis=-1).reshape(-1, 8)
+    weight = np.take_along_axis(weight, order, axis=-1).reshape(-1, 8)
+    keys = np.concatenate([corner, weight], axis=1)
+    _, first, inverse = np.unique(
+        np.ascontiguousarray(keys).view([("", keys.dtype)] * 16).ravel(),
+        return_index=True,
+        return_inverse=True,
+    )
+    point_corner, point_weight = corner[first], weight[first]
+    positions = np.einsum("nk,nki->ni", point_weight / k**3, mesh.positions[point_corner])
+
+    is_corner = point_weight.max(axis=1) == k**3
+    coarse_nodes = np.empty(len(mesh.positions), dtype=np.int64)
+    coarse_nodes[point_corner[is_corner].max(axis=1)] = np.flatnonzero(is_corner)
+    positions[coarse_nodes] = mesh.positions
+
+    small = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    local = np.ravel_multi_index(
+        tuple(np.moveaxis(small[:, None] + VTK_CORNERS, -1, 0)), (k + 1,) * 3
+    )  # (k^3, 8)
+    cells = inverse.reshape(count, -1)[:, local].reshape(-1, 8)
+    return HexMesh(
+        positions,
+        np.ascontiguousarray(cells, dtype=np.int64),
+        coarse_nodes[mesh.coarse_nodes],
+        np.repeat(mesh.coarse_cells, k**3),
+    )
+
+
+def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Faces that belong to one cell only.
+
+    Returns
+    -------
+    faces : (n, 4) int
+        Node numbers, counter-clockwise seen from outside.
+    owners : (n,) int
+        The cell behind each face.
+    """
+    faces = cells[:, VTK_FACES].reshape(-1, 4)
+    _, first, counts = np.unique(
+        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    outer = np.sort(first[counts == 1])
+    return faces[outer], outer // 6
+
+
+def coincident_nodes(
+    points: NDArray[np.float64], targets: NDArray[np.float64], tolerance: float
+) -> NDArray[np.int64]:
+    """For each of ``targets`` (n, 3) the index of the point at the same place.
+
+    Raises
+    ------
+    MeshError
+        If a target has no point within ``tolerance`` (m).
+    """
+    distance, index = cKDTree(points).query(targets)
+    if distance.max(initial=0.0) > tolerance:
+        worst = int(np.argmax(distance))
+        raise MeshError(
+            f"node {worst} at {targets[worst]} has no coincident node in the finer mesh (the "
+            f"nearest is {distance[worst]:.3g} m away): expected a refinement of the same body."
+        )
+    return np.asarray(index, dtype=np.int64)

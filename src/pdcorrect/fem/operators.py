@@ -1,0 +1,187 @@
+"""Finite element operators from scikit-fem: the only module that imports it.
+
+scikit-fem keeps points as (3, N) and has its own order of a hexahedron's
+corners; both are converted here and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from skfem import Basis, BilinearForm, ElementHex1, FacetBasis, LinearForm, MeshHex1
+from skfem.element import Element
+from skfem.helpers import dot, grad
+
+from pdcorrect.fem.mesh import VTK_CORNERS, HexMesh
+
+Array = NDArray[np.float64]
+
+_ELEMENTS: dict[str, tuple[type[Element], Array, int]] = {
+    # name: (scikit-fem element, its nodes in VTK order, polynomial order of the quadrature)
+    "hex8": (ElementHex1, VTK_CORNERS.astype(float), 3),
+}
+_MASS_ORDER = 5  # exact for trilinear shape functions on any parallelepiped
+
+
+@BilinearForm
+def _density_product(u, v, w):  # type: ignore[no-untyped-def]
+    return w.density * u * v
+
+
+@BilinearForm
+def _gradient_product(u, v, w):  # type: ignore[no-untyped-def]
+    return w.coefficient * dot(grad(u), grad(v))
+
+
+@LinearForm
+def _load_component(v, w):  # type: ignore[no-untyped-def]
+    return w.load * v
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """Shape-function gradients and volumes at the quadrature points.
+
+    Attributes
+    ----------
+    gradients : (C, Q, K, 3)
+        Gradient of each node's shape function with respect to rest
+        coordinates, 1/m.  A view of a lane-ordered (C, K, 3, Q) array, in which
+        one cell's quadrature points are neighbours in memory.
+    weights : (C, Q)
+        Rest volume of each point, m3.
+    points : (C, Q, 3)
+        Rest position of each point, m.
+    """
+
+    gradients: Array
+    weights: Array
+    points: Array
+
+    @property
+    def lanes(self) -> Array:
+        """The gradients as stored, (C, K, 3, Q), C-contiguous."""
+        return np.moveaxis(self.gradients, 1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceQuadrature:
+    """The same on boundary faces, with what surface loads need.
+
+    Attributes
+    ----------
+    cells : (n,)
+        Owner of each face.
+    values : (n, Qf, K), gradients : (n, Qf, K, 3)
+        Shape functions of the owner's nodes, 1 and 1/m.
+    weights : (n, Qf)
+        Rest area, m2.
+    normals : (n, Qf, 3)
+        Outward unit normals at rest.
+    """
+
+    cells: NDArray[np.int64]
+    values: Array
+    gradients: Array
+    weights: Array
+    normals: Array
+
+
+class Space:
+    """A scalar finite element space on a mesh; vector fields use it three times.
+
+    Attributes
+    ----------
+    positions : (N, 3)
+        Rest positions of the element's nodes, m.
+    cells : (C, K)
+        Node numbers, VTK order.
+    """
+
+    def __init__(self, mesh: HexMesh, element: str = "hex8") -> None:
+        kind, vtk_nodes, order = _ELEMENTS[element]
+        self._element = kind()
+        self._order = order
+        # position of each VTK node in scikit-fem's list of local nodes
+        distance = np.abs(vtk_nodes[:, None] - self._element.doflocs[None]).max(axis=-1)
+        self._to_vtk = distance.argmin(axis=1)
+        corner = np.abs(VTK_CORNERS[:, None] - ElementHex1().doflocs[None]).max(axis=-1)
+        skfem_cells = np.empty_like(mesh.cells)
+        skfem_cells[:, corner.argmin(axis=1)] = mesh.cells
+        self._mesh = MeshHex1(
+            np.ascontiguousarray(mesh.positions.T), np.ascontiguousarray(skfem_cells.T)
+        )
+        self._basis = Basis(self._mesh, self._element, intorder=order)
+        self.positions: Array = np.ascontiguousarray(self._basis.doflocs.T)
+        self.cells: NDArray[np.int64] = np.ascontiguousarray(
+            self._basis.element_dofs[self._to_vtk].T, dtype=np.int64
+        )
+
+    def quadrature(self) -> Quadrature:
+        """Gradients, volumes and positions of the quadrature points."""
+        local = [self._basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, C, Q)
+        lanes = np.ascontiguousarray(np.transpose(np.stack(local), (2, 0, 1, 3)))  # (C, K, 3, Q)
+        points = np.moveaxis(np.asarray(self._basis.global_coordinates()), 0, -1)
+        return Quadrature(
+            gradients=np.moveaxis(lanes, 3, 1),
+            weights=np.ascontiguousarray(self._basis.dx),
+            points=np.ascontiguousarray(points),
+        )
+
+    def mass(self, density: Array) -> sp.csr_matrix:
+        """Consistent mass, integral of density u v, (N, N), kg; ``density`` is (C,)."""
+        basis = Basis(self._mesh, self._element, intorder=_MASS_ORDER)
+        per_point = np.broadcast_to(density[:, None], basis.dx.shape)
+        return sp.csr_matrix(_density_product.assemble(basis, density=per_point))
+
+    def volumes(self) -> Array:
+        """Rest volume of each cell, (C,), m3."""
+        return np.asarray(self._basis.dx.sum(axis=1))
+
+    def laplacian(self, coefficient: Array) -> sp.csr_matrix:
+        """Integral of coefficient grad u . grad v, (N, N); ``coefficient`` is (C,)."""
+        per_point = np.broadcast_to(coefficient[:, None], self._basis.dx.shape)
+        return sp.csr_matrix(_gradient_product.assemble(self._basis, coefficient=per_point))
+
+    def body_load(self, density: Array) -> Array:
+        """Nodal forces (N, 3), N, of a force density (C, Q, 3), N/m3, at the quadrature points."""
+        columns = [
+            _load_component.assemble(self._basis, load=np.ascontiguousarray(density[..., i]))
+            for i in range(3)
+        ]
+        return np.stack(columns, axis=1)
+
+    def interpolate(self, nodal: Array) -> Array:
+        """Values (C, Q, 3) at the quadrature points of a nodal field (N, 3)."""
+        values = np.stack([np.asarray(self._basis.basis[k][0])[0] for k in self._to_vtk])
+        return np.einsum("cki,kq->cqi", nodal[self.cells], values, optimize=True)
+
+    def face_quadrature(self, faces: NDArray[np.int64]) -> FaceQuadrature:
+        """Quadrature on the boundary faces with corner nodes ``faces`` (n, 4)."""
+        key = {tuple(f): i for i, f in enumerate(np.sort(self._mesh.facets, axis=0).T.tolist())}
+        numbers = np.array([key[tuple(sorted(f))] for f in faces.tolist()], dtype=np.int64)
+        basis = FacetBasis(self._mesh, self._element, facets=numbers, intorder=self._order)
+        values = [np.broadcast_to(np.asarray(basis.basis[k][0]), basis.dx.shape) for k in self._to_vtk]
+        gradients = [basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, n, Qf)
+        return FaceQuadrature(
+            cells=np.asarray(self._mesh.f2t[0, numbers], dtype=np.int64),
+            values=np.moveaxis(np.stack(values), 0, -1),
+            gradients=np.transpose(np.stack(gradients), (2, 3, 0, 1)),
+            weights=np.asarray(basis.dx),
+            normals=np.moveaxis(np.asarray(basis.normals), 0, -1),
+        )
+
+
+def lumped(mass: sp.csr_matrix) -> Array:
+    """Row sums of a mass matrix, (N,), kg."""
+    return np.asarray(mass.sum(axis=1)).ravel()
+
+
+def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:
+    """Sum cell-wise nodal values (C, K, 3) into (count, 3)."""
+    flat = cells.ravel()
+    columns = [np.bincount(flat, values[..., i].ravel(), minlength=count) for i in range(3)]
+    return np.stack(columns, axis=1)

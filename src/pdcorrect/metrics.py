@@ -1,0 +1,111 @@
+"""Errors and invariants of trajectories, as pure functions of arrays.
+
+Positions are (T+1, N, 3) with frame 0 the common initial state; anything with a
+``positions`` attribute is taken as well.  All runs of one comparison live on
+the same nodes (see `restrict`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pdcorrect.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def _positions(run: Any) -> Array:
+    return np.asarray(getattr(run, "positions", run), dtype=np.float64)
+
+
+def _pair(a: Any, b: Any) -> tuple[Array, Array]:
+    x, y = _positions(a), _positions(b)
+    if x.shape != y.shape or x.ndim != 3 or x.shape[-1] != 3:
+        raise InputError(
+            f"positions of shapes {x.shape} and {y.shape}: expected equal (T+1, N, 3). Bring both "
+            "runs onto the same nodes with restrict(run, to=...)."
+        )
+    return x, y
+
+
+def mean_squared_error(run: Any, reference: Any) -> float:
+    """MSE of eq. 7-1, m2: mean over frames 1..T of the squared distance summed over nodes."""
+    x, y = _pair(run, reference)
+    return float(((x[1:] - y[1:]) ** 2).sum(axis=(1, 2)).mean())
+
+
+def error_corrected(model: Any, coarse: Any, reference: Any) -> float:
+    """Omega of eq. 7-2 and 7-3, per cent: the share of the coarse error that a model removes.
+
+    100 is the reference itself, 0 the coarse solver, negative is worse.
+
+    Parameters
+    ----------
+    model, coarse, reference : Trajectory, (T+1, N, 3), or lists of them
+        Lists are averaged trajectory by trajectory, as in eq. 7-3.
+
+    Raises
+    ------
+    InputError
+        If shapes or list lengths differ, or the coarse run has no error.
+    """
+    runs = [list(r) if isinstance(r, (list, tuple)) else [r] for r in (model, coarse, reference)]
+    if len({len(r) for r in runs}) != 1:
+        raise InputError(
+            f"{[len(r) for r in runs]} trajectories of model, coarse and reference: expected as "
+            "many of each."
+        )
+    shares = []
+    for one, base, truth in zip(*runs, strict=True):
+        base_error = mean_squared_error(base, truth)
+        if base_error == 0.0:
+            raise InputError("the coarse run equals the reference: its error has no share.")
+        shares.append(100.0 * (base_error - mean_squared_error(one, truth)) / base_error)
+    return float(np.mean(shares))
+
+
+def rms_error(run: Any, reference: Any) -> float:
+    """Root mean square node distance over frames 1..T, m."""
+    x, y = _pair(run, reference)
+    return float(np.sqrt(((x[1:] - y[1:]) ** 2).sum(axis=2).mean()))
+
+
+def error_over_time(run: Any, reference: Any) -> Array:
+    """Root mean square node distance of each frame, (T+1,), m."""
+    x, y = _pair(run, reference)
+    return np.sqrt(((x - y) ** 2).sum(axis=2).mean(axis=1))
+
+
+def largest_error(run: Any, reference: Any) -> float:
+    """Largest node distance of all frames, m."""
+    x, y = _pair(run, reference)
+    return float(np.sqrt(((x - y) ** 2).sum(axis=2)).max())
+
+
+def largest_displacement(run: Any, rest: ArrayLike | None = None) -> float:
+    """Largest distance of a node from its rest position (frame 0 by default), m."""
+    x = _positions(run)
+    origin = x[0] if rest is None else np.asarray(rest)
+    return float(np.sqrt(((x - origin) ** 2).sum(axis=2)).max())
+
+
+def linear_momentum(velocities: ArrayLike, mass: ArrayLike) -> Array:
+    """Momentum of each frame, (T+1, 3), kg m/s, for velocities (T+1, N, 3) and masses (N,)."""
+    return np.einsum("tni,n->ti", np.asarray(velocities), np.asarray(mass))
+
+
+def angular_momentum(positions: ArrayLike, velocities: ArrayLike, mass: ArrayLike) -> Array:
+    """Angular momentum about the origin of each frame, (T+1, 3), kg m2/s."""
+    spin = np.cross(np.asarray(positions), np.asarray(velocities))
+    return np.einsum("tni,n->ti", spin, np.asarray(mass))
+
+
+def relative_drift(values: ArrayLike) -> float:
+    """Largest change of a conserved quantity from its first value, over its largest size."""
+    array = np.asarray(values, dtype=np.float64)
+    array = array.reshape(len(array), -1)
+    size = np.linalg.norm(array, axis=1).max()
+    return float(np.linalg.norm(array - array[0], axis=1).max() / size) if size else 0.0

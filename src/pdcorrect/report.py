@@ -1,0 +1,168 @@
+"""A `Comparison` as Markdown, CSV, JSON and figures."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+
+from pdcorrect import figures
+from pdcorrect.environment import environment
+from pdcorrect.errors import OutputError
+from pdcorrect.evaluate import Comparison, Row
+from pdcorrect.metrics import largest_displacement
+
+HEADINGS = (
+    "solver", "nodes", "RMS error [mm]", "largest error [mm]", "corrected [%]", "time/frame [ms]",
+    "speed-up", "iterations/frame",
+)  # fmt: skip
+
+
+def table(comparison: Comparison) -> list[tuple[str, ...]]:
+    """The comparison as rows of text under `HEADINGS`."""
+    slowest = next(r for r in comparison.rows if r.label == comparison.reference).seconds_a_frame
+    lines = []
+    for row in comparison.rows:
+        is_reference = row.label == comparison.reference
+        lines.append(
+            (
+                row.label,
+                str(row.nodes),
+                "reference" if is_reference else f"{1e3 * row.rms_error:.3g}",
+                "reference" if is_reference else f"{1e3 * row.largest_error:.3g}",
+                "" if np.isnan(row.omega) else f"{row.omega:.1f}",
+                f"{1e3 * row.seconds_a_frame:.3g}",
+                f"{slowest / row.seconds_a_frame:.3g}x",
+                f"{row.iterations_a_frame:.1f}",
+            )
+        )
+    return lines
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What the table's numbers mean on this scene, one sentence each."""
+    scene = comparison.scene
+    effective = scene.material.effective
+    moved = largest_displacement(comparison.on_coarse[comparison.reference])
+    frames = len(comparison.runs[comparison.reference])
+    out = [
+        f"{frames} frames of {scene.time.step:g} s; the reference moves by up to "
+        f"{1e3 * moved:.3g} mm. Errors are distances of the coarse nodes from the reference "
+        "with the same time step, over all frames.",
+        f"Material: E = {scene.material.young:g} Pa and Poisson's ratio "
+        f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
+        f"E = {effective.young:.4g} Pa and {effective.poisson:.4g} "
+        f"(volume weight '{scene.material.volume_weight}').",
+        f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD. "
+        "'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2).",
+    ]
+    if comparison.solver_error is not None:
+        out.append(
+            f"PD and Newton on the coarse mesh differ by at most "
+            f"{1e3 * comparison.solver_error:.2g} mm: that is PD's solver error; the rest of their "
+            "error is the mesh's."
+        )
+    return out
+
+
+def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
+    """The whole report as Markdown."""
+    lines = [f"# {comparison.scene.name}", ""]
+    lines += [f"![{name}]({name})" for name in pictures[:1]] + [""]
+    lines += ["| " + " | ".join(HEADINGS) + " |", "|---|" + "---:|" * (len(HEADINGS) - 1)]
+    lines += ["| " + " | ".join(cells) + " |" for cells in table(comparison)]
+    lines += ["", *[f"- {note}" for note in notes(comparison)], ""]
+    lines += [f"![{name}]({name})\n" for name in pictures[1:]]
+    lines += ["Measured on: " + ", ".join(f"{k} {v}" for k, v in environment().items()) + ".", ""]
+    return "\n".join(lines)
+
+
+def to_csv(comparison: Comparison) -> str:
+    """All numbers in SI units, one line a solver."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([f.name for f in dataclasses.fields(Row)])
+    writer.writerows(dataclasses.astuple(row) for row in comparison.rows)
+    return buffer.getvalue()
+
+
+def to_json(comparison: Comparison) -> str:
+    """Numbers, scene and environment."""
+    return json.dumps(
+        {
+            "scene": comparison.scene.to_toml(),
+            "reference": comparison.reference,
+            "solver_error": comparison.solver_error,
+            "rows": [dataclasses.asdict(row) for row in comparison.rows],
+            "environment": environment(),
+        },
+        indent=2,
+    ).replace("NaN", "null")
+
+
+def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) -> Path:
+    """Write report.md, report.csv, report.json and, if ``draw``, the figures.
+
+    Returns
+    -------
+    Path
+        Of the Markdown file.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        pictures = draw_figures(comparison, folder) if draw else []
+        (folder / "report.csv").write_text(to_csv(comparison), encoding="utf-8")
+        (folder / "report.json").write_text(to_json(comparison), encoding="utf-8")
+        (folder / "report.md").write_text(to_markdown(comparison, pictures), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: the report cannot be written ({error}).") from error
+    return folder / "report.md"
+
+
+def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
+    """comparison.png (bodies side by side) and three plots; returns their file names."""
+    runs = [comparison.runs[row.label] for row in comparison.rows]
+    labels = [row.label for row in comparison.rows]
+    truth = comparison.on_coarse[comparison.reference]
+    distance = np.linalg.norm(truth.positions - truth.points, axis=2)
+    frame, node = np.unravel_index(int(distance.argmax()), distance.shape)
+    figures.render(
+        runs,
+        folder / "comparison.png",
+        labels=[_panel_label(comparison, row) for row in comparison.rows],
+        colour="displacement",
+        frame=int(frame),
+    )
+    figures.plot_node_trajectories(
+        runs, folder / "node.png", node_point=truth.points[node], labels=labels
+    )
+    figures.plot_energy(runs, folder / "energy.png", labels=labels)
+    figures.plot_error_over_time(
+        comparison.errors_over_time(), truth.times, folder / "error_over_time.png"
+    )
+    figures.plot_error_against_time(
+        {r.label: (r.seconds_a_frame, r.rms_error) for r in comparison.rows if r.rms_error > 0},
+        folder / "error_against_time.png",
+    )
+    return [
+        "comparison.png", "error_against_time.png", "error_over_time.png", "node.png", "energy.png"
+    ]  # fmt: skip
+
+
+def _panel_label(comparison: Comparison, row: Row) -> str:
+    error = (
+        "reference"
+        if row.label == comparison.reference
+        else f"RMS error {1e3 * row.rms_error:.2g} mm"
+    )
+    return f"{row.label}, {row.nodes} nodes\n{error}, {1e3 * row.seconds_a_frame:.3g} ms a frame"

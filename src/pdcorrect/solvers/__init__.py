@@ -1,0 +1,1 @@
+"""Time stepping: projective dynamics, Newton, and rollouts of any stepper."""

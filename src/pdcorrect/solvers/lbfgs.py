@@ -1,0 +1,298 @@
+"""The minimisation loop of projective dynamics.
+
+Quasi-Newton steps d = -H g with H the L-BFGS inverse Hessian built on G^-1
+(Liu, Bouaziz and Kavan 2017), in compact form (Byrd, Nocedal and Schnabel
+1994): with S = [s_i] and Z = G^-1 Y = [z_i] as rows,
+
+    H g = x + S^T c - Z^T w,   x = G^-1 g,   w = R^-1 S g,
+    c = R^-T ((D + Y Z^T) w - Z g),
+
+so one solve with G and four products with tall matrices make an iteration.
+Without history this is the plain local/global iteration p <- p - G^-1 grad
+gamma (thesis eq. 3-14), which needs no line search.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.state import Status
+
+Array = NDArray[np.float64]
+Solve = Callable[[Array], Array]
+
+_ARMIJO = 1e-4
+_ROUND_OFF = 1e-13
+"""Relative to |gamma|: changes below this carry no information."""
+_BACKTRACKS = 30
+
+
+class Objective(Protocol):
+    """What the loop minimises, over arrays (N, 3)."""
+
+    def value_and_gradient(self, p: Array) -> tuple[float, Array]:
+        """Value and gradient; the gradient is zero where p is prescribed."""
+
+    def hessian_operator(self, p: Array) -> Callable[[Array], Array]:
+        """The second derivative at p, as a product."""
+
+
+@dataclass(frozen=True)
+class MinimiserOptions:
+    """Policy of the loop.
+
+    Attributes
+    ----------
+    tolerance : float
+        Largest accepted estimate of the remaining displacement of a node, m.
+    history : int
+        Pairs that L-BFGS keeps; 0 is plain local/global.
+    max_iterations : int
+    """
+
+    tolerance: float
+    history: int = 16
+    max_iterations: int = 1000
+
+
+@dataclass(eq=False)
+class Minimum:
+    """Where the loop ended.
+
+    ``estimate`` is the estimated largest distance of a node from the minimum,
+    m; infinite if the Hessian there is not positive definite.
+    """
+
+    positions: Array
+    value: float
+    gradient: Array
+    status: Status
+    iterations: int
+    evaluations: int
+    estimate: float
+
+
+class History:
+    """The pairs (s, z = G^-1 y) and the small matrices of the compact form.
+
+    Only S, Z, R^-1, D and Y Z^T are kept; products with Y follow from those with
+    Z, because y_i . x = z_i . g for x = G^-1 g.
+    """
+
+    def __init__(self, size: int, length: int) -> None:
+        self._capacity = size
+        self._s = np.empty((size, length))
+        self._z = np.empty((size, length))
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all pairs."""
+        self._count = 0
+        self._r_inverse = np.empty((0, 0))
+        self._d = np.empty(0)
+        self._yz = np.empty((0, 0))
+        self._sg = np.empty(0)
+        self._zg = np.empty(0)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def direction(self, gradient: Array, x: Array) -> Array:
+        """-H g for the gradient (n,) whose products `observe` or `append` took last."""
+        m = self._count
+        if m == 0:
+            return -x
+        w = self._r_inverse @ self._sg
+        c = self._r_inverse.T @ (self._d * w + self._yz @ w - self._zg)
+        out = w @ self._z[:m]
+        out -= c @ self._s[:m]
+        out -= x
+        return out
+
+    def observe(self, gradient: Array) -> None:
+        """Take the products of the stored pairs with a gradient."""
+        self._sg = self._s[: self._count] @ gradient
+        self._zg = self._z[: self._count] @ gradient
+
+    def append(self, step: Array, change: Array, gradient: Array, new_gradient: Array) -> None:
+        """Add s = ``step``, z = ``change`` of G^-1 g, for the move between two gradients.
+
+        A pair without positive curvature is not stored.
+        """
+        y_s = float(step @ new_gradient - step @ gradient)
+        y_z = float(change @ new_gradient - change @ gradient)
+        old_sg, old_zg = self._sg, self._zg
+        self.observe(new_gradient)
+        if not (y_s > 1e-12 * math.sqrt(abs(y_z) * abs(float(step @ step))) and y_z > 0):
+            return
+        s_y, z_y = self._sg - old_sg, self._zg - old_zg
+        if self._count == self._capacity:
+            self._drop_oldest()
+            s_y, z_y = s_y[1:], z_y[1:]
+        m = self._count
+        self._s[m], self._z[m] = step, change
+        r_inverse = np.zeros((m + 1, m + 1))
+        r_inverse[:m, :m] = self._r_inverse
+        r_inverse[:m, m] = -(self._r_inverse @ s_y) / y_s
+        r_inverse[m, m] = 1.0 / y_s
+        yz = np.empty((m + 1, m + 1))
+        yz[:m, :m] = self._yz
+        yz[m, :m] = yz[:m, m] = z_y
+        yz[m, m] = y_z
+        self._r_inverse, self._yz = r_inverse, yz
+        self._d = np.append(self._d, y_s)
+        self._sg = np.append(self._sg, step @ new_gradient)
+        self._zg = np.append(self._zg, change @ new_gradient)
+        self._count = m + 1
+
+    def _drop_oldest(self) -> None:
+        """R is upper triangular, so the inverse of its trailing part is the trailing part."""
+        self._s[:-1] = self._s[1:]
+        self._z[:-1] = self._z[1:]
+        self._r_inverse = self._r_inverse[1:, 1:]
+        self._d, self._yz = self._d[1:], self._yz[1:, 1:]
+        self._sg, self._zg = self._sg[1:], self._zg[1:]
+        self._count -= 1
+
+
+def minimise(
+    objective: Objective, start: Array, solve: Solve, options: MinimiserOptions
+) -> Minimum:
+    """Minimise ``objective`` from ``start`` (N, 3) with G^-1 given by ``solve``.
+
+    The loop watches the length of its own step.  When that is below the
+    tolerance, the remaining displacement is estimated by conjugate gradients
+    on the true Hessian; if the estimate is too large the loop goes on, having
+    learnt how far its own measure was off.
+    """
+    p = start
+    value, gradient = objective.value_and_gradient(p)
+    x = solve(gradient)
+    history = History(options.history, p.size)
+    threshold, evaluations, estimate = options.tolerance, 1, math.inf
+    status = Status.ITERATION_LIMIT
+    for iteration in range(options.max_iterations + 1):
+        if not math.isfinite(value):
+            status = Status.NOT_FINITE
+            break
+        direction = history.direction(gradient.ravel(), x.ravel()).reshape(p.shape)
+        length = largest_displacement(direction)
+        if length <= threshold:
+            estimate = remaining_displacement(objective, p, gradient, solve, direction)
+            if estimate <= options.tolerance:
+                status = Status.CONVERGED
+                break
+            threshold = 0.5 * length * min(1.0, options.tolerance / estimate)
+        if iteration == options.max_iterations:
+            break
+        found = line_search(objective, p, value, gradient, direction, bool(options.history))
+        evaluations += found.evaluations
+        if found.step == 0.0:
+            if len(history):
+                history.clear()
+                continue
+            status = Status.LINE_SEARCH
+            break
+        x_new = solve(found.gradient)
+        if options.history:
+            step = (found.step * direction).ravel()
+            change = (x_new - x).ravel()
+            history.append(step, change, gradient.ravel(), found.gradient.ravel())
+        p, value, gradient, x = found.positions, found.value, found.gradient, x_new
+    return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
+
+
+@dataclass(eq=False)
+class Found:
+    """Outcome of a line search; ``step`` 0 means none was found."""
+
+    step: float
+    positions: Array
+    value: float
+    gradient: Array
+    evaluations: int
+
+
+def line_search(
+    objective: Objective,
+    p: Array,
+    value: float,
+    gradient: Array,
+    direction: Array,
+    search: bool = True,
+) -> Found:
+    """Backtracking until gamma falls (Armijo).
+
+    Where the fall is lost in round-off, the slope decides (approximate Wolfe
+    condition, Hager and Zhang 2005).  ``search = False`` takes the full step.
+    """
+    slope = float(np.vdot(gradient, direction))
+    step, tried = 1.0, 0
+    if slope < 0.0:
+        noise = _ROUND_OFF * abs(value)
+        while tried < _BACKTRACKS:
+            tried += 1
+            trial = p + step * direction
+            new_value, new_gradient = objective.value_and_gradient(trial)
+            fall = new_value - value
+            if fall <= _ARMIJO * step * slope or not search:
+                return Found(step, trial, new_value, new_gradient, tried)
+            if abs(fall) <= noise and float(np.vdot(new_gradient, direction)) <= -0.8 * slope:
+                return Found(step, trial, new_value, new_gradient, tried)
+            curvature = 2.0 * (fall - step * slope) / step**2
+            best = -slope / curvature if math.isfinite(curvature) and curvature > 0 else 0.0
+            step = min(max(best, 0.1 * step), 0.5 * step)
+    return Found(0.0, p, value, gradient, tried)
+
+
+def largest_displacement(x: Array) -> float:
+    """Largest node norm of (N, 3)."""
+    return float(np.sqrt(np.einsum("ni,ni->n", x, x).max()))
+
+
+def remaining_displacement(
+    objective: Objective,
+    p: Array,
+    gradient: Array,
+    solve: Solve,
+    guess: Array,
+    steps: int = 40,
+) -> float:
+    """Estimate of the largest node distance from p to the minimum, m.
+
+    The Newton step (d2 gamma)^-1 grad gamma, by conjugate gradients
+    preconditioned with G and started from ``guess`` (minus the Newton step, as
+    the quasi-Newton direction is).  Infinite on negative curvature.
+    """
+    product = objective.hessian_operator(p)
+    x = -guess
+    r = gradient - product(x)
+    z = solve(r)
+    r_z = float(np.vdot(r, z))
+    target = 1e-2 * r_z
+    d = z
+    largest = largest_displacement(x)
+    for _ in range(steps):
+        if r_z <= 0.0 or not math.isfinite(r_z):
+            break
+        h_d = product(d)
+        curvature = float(np.vdot(d, h_d))
+        if curvature <= 0.0:
+            return math.inf
+        step = r_z / curvature
+        x = x + step * d
+        change = largest_displacement(step * d)
+        largest = largest_displacement(x)
+        r = r - step * h_d
+        z = solve(r)
+        r_z, old = float(np.vdot(r, z)), r_z
+        if r_z <= target and change <= 0.1 * largest:
+            break
+        d = z + (r_z / old) * d
+    return largest

@@ -1,0 +1,86 @@
+"""Truncated Newton with G-preconditioned conjugate gradients: the first fallback.
+
+It sees the true curvature, so it gets through places where L-BFGS stalls, and
+it needs no factor besides G's.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.solvers.lbfgs import (
+    Minimum,
+    MinimiserOptions,
+    Objective,
+    Solve,
+    largest_displacement,
+    line_search,
+)
+from pdcorrect.state import Status
+
+Array = NDArray[np.float64]
+
+_INNER_STEPS = 400
+
+
+def newton_cg(
+    objective: Objective, start: Array, solve: Solve, options: MinimiserOptions
+) -> Minimum:
+    """Minimise ``objective`` from ``start`` (N, 3); ``options.history`` is not used.
+
+    Where conjugate gradients meet negative curvature, the direction found so
+    far is used, or minus the preconditioned gradient at the first step.
+    """
+    p = start
+    value, gradient = objective.value_and_gradient(p)
+    evaluations, estimate, status = 1, math.inf, Status.ITERATION_LIMIT
+    for iteration in range(options.max_iterations + 1):
+        if not math.isfinite(value):
+            status = Status.NOT_FINITE
+            break
+        direction, convex = _direction(objective, p, gradient, solve)
+        length = largest_displacement(direction)
+        estimate = length if convex else math.inf
+        if estimate <= options.tolerance:
+            status = Status.CONVERGED
+            break
+        if iteration == options.max_iterations:
+            break
+        found = line_search(objective, p, value, gradient, direction)
+        evaluations += found.evaluations
+        if found.step == 0.0:
+            status = Status.LINE_SEARCH
+            break
+        p, value, gradient = found.positions, found.value, found.gradient
+    return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
+
+
+def _direction(
+    objective: Objective, p: Array, gradient: Array, solve: Solve
+) -> tuple[Array, bool]:
+    """The (truncated) Newton direction, and whether no negative curvature was met."""
+    product = objective.hessian_operator(p)
+    x = np.zeros_like(p)
+    r = -gradient
+    z = solve(r)
+    d, r_z = z, float(np.vdot(r, z))
+    if r_z <= 0.0:
+        return x, True
+    target = 1e-6 * r_z
+    for step in range(_INNER_STEPS):
+        h_d = product(d)
+        curvature = float(np.vdot(d, h_d))
+        if curvature <= 0.0:
+            return (z if step == 0 else x), False
+        alpha = r_z / curvature
+        x = x + alpha * d
+        r = r - alpha * h_d
+        z = solve(r)
+        r_z, old = float(np.vdot(r, z)), r_z
+        if r_z <= target:
+            break
+        d = z + (r_z / old) * d
+    return x, True

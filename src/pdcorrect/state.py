@@ -1,0 +1,150 @@
+"""What is passed around: `State`, `StepResult`, `Trajectory`.
+
+A stepper is anything that maps a state to a `StepResult`; projective dynamics,
+Newton and (later) the corrected solver are interchangeable because of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError
+
+if TYPE_CHECKING:
+    from pdcorrect.fem.problem import Problem
+
+Array = NDArray[np.float64]
+
+
+class Status(Enum):
+    """How a step ended; the value is the message.
+
+    `ok` is true for every state that satisfies the step's equations to the
+    tolerance, whatever it took to find it.
+    """
+
+    CONVERGED = "converged"
+    RECOVERED = "converged after falling back to Newton-CG"
+    SUBSTEPPED = "converged only with smaller time steps inside the frame"
+    ITERATION_LIMIT = "failed: iteration limit reached before the tolerance"
+    LINE_SEARCH = "failed: no decrease along the search direction"
+    NOT_FINITE = "failed: the state became infinite or NaN"
+
+    @property
+    def ok(self) -> bool:
+        """Whether the step's equations are satisfied."""
+        return self in (Status.CONVERGED, Status.RECOVERED, Status.SUBSTEPPED)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Positions (m) and velocities (m/s), each (N, 3) float64, at a time (s)."""
+
+    positions: Array
+    velocities: Array
+    time: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "velocities"):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
+            if array.ndim != 2 or array.shape[1] != 3:
+                raise InputError(f"{name}: expected shape (N, 3), got {array.shape}.")
+            object.__setattr__(self, name, array)
+        if self.positions.shape != self.velocities.shape:
+            raise InputError(
+                f"positions {self.positions.shape} and velocities {self.velocities.shape}: "
+                "expected the same shape."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class StepResult:
+    """One step's outcome.
+
+    Attributes
+    ----------
+    state : State
+        The state after the step; after a failed step the best iterate.
+    status : Status
+        Whether and how the step converged.
+    iterations : int
+        Iterations of the minimisation, fallbacks included.
+    residual : float
+        Largest out-of-balance force on a free node component, N.
+    error_estimate : float
+        Estimated largest distance of a node from the step's exact solution, m.
+    stats : mapping of str to float
+        Energies (J) after the step and solver counters.
+    """
+
+    state: State
+    status: Status
+    iterations: int
+    residual: float
+    error_estimate: float
+    stats: Mapping[str, float] = field(default_factory=dict)
+
+
+class Stepper(Protocol):
+    """Anything that advances a state by one step."""
+
+    @property
+    def problem(self) -> Problem:
+        """The discretised scene it steps."""
+
+    def __call__(self, state: State, forces: Array | None = None) -> StepResult:
+        """Advance ``state`` by one time step, with extra nodal forces (N, 3), N."""
+
+    def describe(self) -> dict[str, str]:
+        """Method and back end, for summaries and files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Frames of a run; frame 0 is the initial state.
+
+    Attributes
+    ----------
+    positions, velocities : (T+1, N, 3) float64
+        m and m/s.
+    times : (T+1,) float64
+        s.
+    stats : mapping of str to (T,) arrays
+        ``status`` (names of `Status`), ``iterations``, ``residual`` (N),
+        ``error_estimate`` (m), ``seconds`` (wall clock) and energies (J), one
+        entry a step.
+    points : (N, 3) float64
+        Rest positions, m.
+    cells : (C, K) int
+        Node numbers, VTK order.
+    scene_toml : str
+        The scene it came from; empty for foreign data.
+    attributes : mapping of str to str
+        Solver, refinement, element, mass, code version.
+    problem : Problem or None
+        What was stepped; None when read from a file.
+    """
+
+    positions: Array
+    velocities: Array
+    times: Array
+    stats: Mapping[str, NDArray[np.generic]]
+    points: Array
+    cells: NDArray[np.int64]
+    scene_toml: str = ""
+    attributes: Mapping[str, str] = field(default_factory=dict)
+    problem: Problem | None = None
+
+    def __len__(self) -> int:
+        """Number of steps T (there are T + 1 frames)."""
+        return len(self.times) - 1
+
+    def state(self, frame: int = -1) -> State:
+        """The state at a frame."""
+        return State(self.positions[frame], self.velocities[frame], float(self.times[frame]))

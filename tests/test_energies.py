@@ -1,0 +1,149 @@
+"""The pointwise energy: exact derivatives, projections, invariance."""
+
+import numpy as np
+import pytest
+from conftest import rotation
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem import energies
+
+R, Q = rotation(1), rotation(2)
+CASES = {
+    "random": np.eye(3) + 0.4 * np.random.default_rng(5).normal(size=(3, 3)),
+    "identity": np.eye(3),
+    "first two repeated": R @ np.diag([1.2, 1.2, 0.7]) @ Q,
+    "last two repeated": R @ np.diag([1.2, 0.7, 0.7]) @ Q,
+    "all repeated": 1.3 * R,
+    "inverted": R @ np.diag([1.3, 1.0, -0.4]) @ Q,
+    "inverted and repeated": R @ np.diag([1.0, 1.0, -0.4]) @ Q,
+    "flat": R @ np.diag([1.3, 0.8, 0.0]) @ Q,
+    "far expanded": R @ np.diag([3.0, 2.0, 1.2]) @ Q,
+    "expanded, one direction flattened by V": R @ np.diag([3.0, 2.5, 2.2]) @ Q,
+}
+WEIGHTS = {"corotated": (1.0, 0.0), "volume": (0.0, 1.0), "both": (1.0, 3.0)}
+
+
+def taylor_slope(remainder, steps=(1e-3, 5e-4)):
+    errors = [remainder(h) for h in steps]
+    return np.log2(errors[0] / errors[1])
+
+
+@pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)
+@pytest.mark.parametrize("F", CASES.values(), ids=CASES)
+def test_stress_is_the_derivative_of_the_energy(F, weights, rng):
+    d = rng.normal(size=(3, 3))
+    slope = np.vdot(energies.first_piola(F, *weights), d)
+    base = energies.energy_density(F, *weights)
+    assert taylor_slope(
+        lambda h: abs(energies.energy_density(F + h * d, *weights) - base - h * slope)
+    ) == pytest.approx(2, abs=0.05)
+
+
+@pytest.mark.parametrize("weights", WEIGHTS.values(), ids=WEIGHTS)
+@pytest.mark.parametrize("F", CASES.values(), ids=CASES)
+def test_tangent_is_the_derivative_of_the_stress(F, weights, rng):
+    d = rng.normal(size=(3, 3))
+    change = np.einsum("ijkl,kl->ij", energies.elasticity(F, *weights), d)
+    base = energies.first_piola(F, *weights)
+    assert taylor_slope(
+        lambda h: np.linalg.norm(energies.first_piola(F + h * d, *weights) - base - h * change)
+    ) == pytest.approx(2, abs=0.05)
+
+
+@pytest.mark.parametrize("F", CASES.values(), ids=CASES)
+def test_tangent_is_symmetric_and_its_projection_only_raises_eigenvalues(F):
+    exact = energies.elasticity(F, 1.0, 3.0).reshape(9, 9)
+    projected = energies.elasticity(F, 1.0, 3.0, project=True).reshape(9, 9)
+    np.testing.assert_allclose(exact, exact.T, atol=1e-12)
+    assert np.linalg.eigvalsh(projected).min() > -1e-12
+    values = np.linalg.eigvalsh(exact)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(projected), np.sort(np.maximum(values, 0)), atol=1e-9
+    )
+
+
+def test_tangent_is_finite_on_the_kinks():
+    for s in ([1.0, 0.5, -0.5], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]):
+        tangent = energies.elasticity(R @ np.diag(s) @ Q, 1.0, 3.0)
+        assert np.isfinite(tangent).all()
+        assert np.abs(tangent).max() < 1e6
+
+
+def test_signed_svd_reproduces_any_matrix_with_proper_rotations(rng):
+    F = np.concatenate(
+        [
+            rng.normal(size=(200, 3, 3)),
+            rng.normal(size=(200, 3, 3)) * [1, 1, 1e-9],
+            rng.normal(size=(50, 3, 1)) * rng.normal(size=(50, 1, 3)),
+            1e3 * rng.normal(size=(50, 3, 3)),
+            np.zeros((1, 3, 3)),
+            np.array([-np.eye(3), np.diag([3.0, 3.0, -3.0])]),
+        ]
+    )
+    U, s, V = energies.signed_svd(F)
+    scale = np.abs(F).max(axis=(1, 2), keepdims=True) + 1e-300
+    np.testing.assert_allclose((U * s[:, None] @ V.swapaxes(1, 2)) / scale, F / scale, atol=1e-14)
+    for W in (U, V):
+        np.testing.assert_allclose(
+            W @ W.swapaxes(1, 2), np.broadcast_to(np.eye(3), W.shape), atol=1e-14
+        )
+        np.testing.assert_allclose(np.linalg.det(W), 1, atol=1e-13)
+    assert (s[:, 0] >= s[:, 1] - 1e-12).all()
+    assert (s[:, 1] >= np.abs(s[:, 2]) - 1e-12 * s[:, 0]).all()
+
+
+def test_projections_are_idempotent(rng):
+    F = rng.normal(size=(100, 3, 3))
+    rotations = energies.nearest_rotation(F)
+    np.testing.assert_allclose(energies.nearest_rotation(rotations), rotations, atol=1e-13)
+    unimodular = energies.nearest_unit_determinant(F)
+    np.testing.assert_allclose(np.linalg.det(unimodular), 1, atol=1e-12)
+    np.testing.assert_allclose(
+        energies.nearest_unit_determinant(unimodular), unimodular, atol=1e-10
+    )
+
+
+def test_projections_are_nearest(rng):
+    """No other rotation and no other matrix of unit determinant is closer."""
+    for _ in range(40):
+        F = rng.normal(size=(3, 3)) * rng.uniform(0.3, 3)
+        distance = np.linalg.norm(F - energies.nearest_rotation(F))
+        others = np.array([rotation(seed) for seed in range(200)])
+        assert np.linalg.norm(F - others, axis=(1, 2)).min() >= distance - 1e-12
+
+        U, s, V = energies.signed_svd(F)
+        distance = np.linalg.norm(F - energies.nearest_unit_determinant(F))
+        pairs = np.exp(rng.uniform(-4, 2, size=(4000, 2)))
+        stretches = np.c_[pairs, 1 / pairs.prod(axis=1)]
+        signs = np.array([[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]])
+        for sign in signs:
+            assert np.linalg.norm(stretches * sign - s, axis=1).min() >= distance - 1e-9
+
+
+def test_energy_is_invariant_under_rotation_from_either_side(rng):
+    F = rng.normal(size=(20, 3, 3))
+    for G in (R @ F, F @ R):
+        np.testing.assert_allclose(
+            energies.energy_density(G, 1.0, 3.0), energies.energy_density(F, 1.0, 3.0), rtol=1e-12
+        )
+    np.testing.assert_allclose(
+        energies.first_piola(R @ F, 1.0, 3.0), R @ energies.first_piola(F, 1.0, 3.0), atol=1e-11
+    )
+
+
+def test_small_strain_energy_has_the_effective_moduli(rng):
+    """Psi -> mu |eps|^2 + omega/6 tr(eps)^2, so lambda_effective = omega / 3."""
+    strain = rng.normal(size=(3, 3))
+    strain = 1e-5 * (strain + strain.T)
+    mu, omega = 2.0, 5.0
+    expected = mu * (strain**2).sum() + omega / 6 * np.trace(strain) ** 2
+    assert energies.energy_density(np.eye(3) + strain, mu, omega) == pytest.approx(
+        expected, rel=1e-3
+    )
+
+
+def test_wrong_input_is_refused():
+    with pytest.raises(InputError, match=r"\(2, 3\)"):
+        energies.first_piola(np.zeros((2, 3)), 1.0, 1.0)
+    with pytest.raises(InputError, match="NaN"):
+        energies.first_piola(np.full((3, 3), np.nan), 1.0, 1.0)
