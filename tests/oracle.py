@@ -72,7 +72,7 @@ def residual(v, w):
 
 @BilinearForm
 def tangent(u, v, w):
-    """rho u . v / h2 + grad v : dP/dF : grad u."""
+    """Rho u . v / h2 + grad v : dP/dF : grad u."""
     stiff = np.einsum("ij...,ijkl...,kl...->...", grad(v), w.C, grad(u))
     return w.density / w.h2 * dot(u, v) + stiff
 
@@ -94,7 +94,7 @@ class Oracle:
         """One Newton-solved step; returns the number of iterations."""
         predicted = self.u + self.h * self.v
         u = self.u.copy()
-        for iteration in range(50):
+        for iteration in range(50):  # noqa: B007
             gradient = np.moveaxis(self.basis.interpolate(u).grad, (0, 1), (-2, -1))
             P, C = stress_and_tangent(np.eye(3) + gradient, self.mu, self.omega)
             points = {
@@ -102,9 +102,7 @@ class Oracle:
                 "C": np.moveaxis(C, (-4, -3, -2, -1), (0, 1, 2, 3)),
                 "h2": self.h**2,
                 "density": self.density,
-                "force": np.broadcast_to(
-                    self.force[:, None, None], (3, *self.basis.dx.shape)
-                ),
+                "force": np.broadcast_to(self.force[:, None, None], (3, *self.basis.dx.shape)),
                 "offset": self.basis.interpolate(u - predicted),
             }
             r = residual.assemble(self.basis, **points)

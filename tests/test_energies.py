@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from conftest import rotation
 
+from conftest import rotation
 from pdcorrect.errors import InputError
 from pdcorrect.fem import energies
 
@@ -111,7 +111,7 @@ def test_projections_are_nearest(rng):
         others = np.array([rotation(seed) for seed in range(200)])
         assert np.linalg.norm(F - others, axis=(1, 2)).min() >= distance - 1e-12
 
-        U, s, V = energies.signed_svd(F)
+        _, s, _ = energies.signed_svd(F)
         distance = np.linalg.norm(F - energies.nearest_unit_determinant(F))
         pairs = np.exp(rng.uniform(-4, 2, size=(4000, 2)))
         stretches = np.c_[pairs, 1 / pairs.prod(axis=1)]

@@ -58,9 +58,7 @@ def test_refining_twice_equals_refining_once_by_the_product():
     once, twice = refine(mesh, 4), refine(refine(mesh, 2), 2)
     order = coincident_nodes(twice.positions, once.positions, 1e-12)
     assert len(np.unique(order)) == len(once.positions) == len(twice.positions)
-    np.testing.assert_allclose(
-        twice.positions[twice.coarse_nodes], mesh.positions, atol=0, rtol=0
-    )
+    np.testing.assert_allclose(twice.positions[twice.coarse_nodes], mesh.positions, atol=0, rtol=0)
 
 
 def test_boundary_faces_point_outwards_and_close_the_body():

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from conftest import beam, cross, disturbed, rotation
-from test_mesh import distorted_mesh
 
 import pdcorrect as pc
+from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.loads import cofactor, torsion_field
 from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import Materials, _build
+from test_mesh import distorted_mesh
 
 
 def distorted_problem(poisson=0.4):
@@ -21,9 +21,7 @@ def distorted_problem(poisson=0.4):
     materials = Materials.from_moduli(
         scene, np.linspace(2e5, 4e5, count), np.full(count, poisson), np.full(count, 1e3)
     )
-    return _build(
-        scene, 1, "hex8", "lumped", mesh, space, space.quadrature(), materials, 0.05
-    )
+    return _build(scene, 1, "hex8", "lumped", mesh, space, space.quadrature(), materials, 0.05)
 
 
 @pytest.mark.parametrize("make", [lambda: pc.discretise(cross()), distorted_problem])
@@ -140,7 +138,7 @@ def test_assembled_and_applied_tangents_agree(rng):
 
 
 def test_global_matrix_bounds_the_tangent(rng):
-    """gamma's local/global descent rests on G - d2W >= 0."""
+    """Gamma's local/global descent rests on G - d2W >= 0."""
     problem = pc.discretise(cross())
     G = np.kron(problem.global_matrix(1e9).toarray(), np.eye(3))
     for amplitude in (0.0, 0.2, 0.5):
@@ -208,7 +206,7 @@ def test_nodal_loads_act_on_coarse_nodes_only_on_every_mesh():
 
 def test_torsion_field_is_the_published_one(rng):
     points = rng.normal(size=(50, 3))
-    x, y, z = points.T
+    _, y, z = points.T
     k, alpha = 0.3, 0.7
     raw = np.stack([np.full(50, alpha), -z - k * y, y - k * z], axis=1)
     np.testing.assert_allclose(
@@ -253,10 +251,17 @@ def amplitude(problem, start, end):
 
 def test_amplitudes_are_averaged_over_the_step():
     def gravity(**more):
-        return pc.discretise(beam(loads=[{"kind": "gravity", "acceleration": [0, 0, -9.81], **more}]))
+        return pc.discretise(
+            beam(loads=[{"kind": "gravity", "acceleration": [0, 0, -9.81], **more}])
+        )
 
     window = gravity(window=[0.0, 0.03])
-    assert [round(amplitude(window, t, t + 0.01), 12) for t in (0, 0.01, 0.02, 0.03)] == [1, 1, 1, 0]
+    assert [round(amplitude(window, t, t + 0.01), 12) for t in (0, 0.01, 0.02, 0.03)] == [
+        1,
+        1,
+        1,
+        0,
+    ]
     assert amplitude(window, 0.02, 0.04) == pytest.approx(0.5)
     ramp = gravity(window=[0.1, 0.5], ramp=0.2)
     assert amplitude(ramp, 0.0, 0.1) == 0
@@ -273,7 +278,12 @@ def test_amplitudes_are_averaged_over_the_step():
 
 
 def test_the_impulse_does_not_depend_on_the_step():
-    load = {"kind": "gravity", "acceleration": [0, 0, -9.81], "window": [0.003, 0.027], "ramp": 0.01}
+    load = {
+        "kind": "gravity",
+        "acceleration": [0, 0, -9.81],
+        "window": [0.003, 0.027],
+        "ramp": 0.01,
+    }
     problem = pc.discretise(beam(loads=[load]))
     impulses = [
         sum(total(problem, t, t + h)[2] * h for t in np.arange(0, 0.04, h))
@@ -308,14 +318,23 @@ def test_moving_clamps_follow_their_tables():
         "times": [0.0, 0.1], "displacement": [[0, 0, 0], [0.01, 0, 0]],
         "rotation": [0.0, 90.0], "axis": "x", "centre": [0, 0.02, 0.02],
     }  # fmt: skip
-    problem = pc.discretise(beam(clamps=[{"region": {"plane": "x", "at": "max"}, "motion": motion}]))
+    problem = pc.discretise(
+        beam(clamps=[{"region": {"plane": "x", "at": "max"}, "motion": motion}])
+    )
     held = ~problem.free[:, 0]
     x = problem.positions[held] - [0, 0.02, 0.02]
-    for time, angle, shift in ((0.0, 0, 0), (0.05, np.pi / 4, 0.005), (0.1, np.pi / 2, 0.01), (9, np.pi / 2, 0.01)):
+    for time, angle, shift in (
+        (0.0, 0, 0),
+        (0.05, np.pi / 4, 0.005),
+        (0.1, np.pi / 2, 0.01),
+        (9, np.pi / 2, 0.01),
+    ):
         c, s = np.cos(angle), np.sin(angle)
         turned = x @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T
         np.testing.assert_allclose(
-            problem.clamped_positions(time)[held], turned + [shift, 0.02, 0.02], atol=1e-15
+            problem.clamped_positions(time)[held],
+            turned + np.array([shift, 0.02, 0.02]),
+            atol=1e-15,
         )
 
 
@@ -325,7 +344,7 @@ def test_moving_clamps_follow_their_tables():
         ({"clamps": [{"region": {"plane": "x", "at": 0.5}}]}, r"clamps\[0\].region .* no node"),
         ({"clamps": [{"region": {"nodes": [999]}}]}, "node 999"),
         (
-            {"loads": [{"kind": "traction", "traction": [1, 0, 0], "region": {"plane": "y", "at": 0.01}}]},
+            {"loads": [{"kind": "pressure", "pressure": 1.0, "region": {"plane": "y", "at": 0.01}}]},
             r"loads\[0\].region .* no boundary face",
         ),
         (

@@ -39,7 +39,32 @@ _HOME = {
 }
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
-__all__ = [*_HOME, *_MODULES, "__version__"]
+__all__ = [  # noqa: RUF022
+    "Scene",
+    "State",
+    "Status",
+    "StepResult",
+    "Stepper",
+    "Trajectory",
+    "Problem",
+    "discretise",
+    "ProjectiveDynamics",
+    "Newton",
+    "rollout",
+    "restrict",
+    "load_trajectory",
+    "save_trajectory",
+    "TrajectoryWriter",
+    "write_vtu_series",
+    "render",
+    "compare",
+    "metrics",
+    "errors",
+    "figures",
+    "evaluate",
+    "report",
+    "__version__",
+]
 
 if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report

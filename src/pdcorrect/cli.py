@@ -24,7 +24,9 @@ app = typer.Typer(
 FAILED, BAD_INPUT = 1, 2
 
 SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=False)]
-Frames = Annotated[Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)]
+Frames = Annotated[
+    Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)
+]
 
 
 @app.command()
@@ -71,9 +73,9 @@ def simulate(
 @app.command()
 def compare(
     scene: SceneFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the report.")
-    ] = Path("comparison"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")] = Path(
+        "comparison"
+    ),
     frames: Frames = None,
     figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
 ) -> None:
@@ -121,9 +123,7 @@ def compare(
 def render(
     runs: Annotated[list[Path], typer.Argument(help="Trajectory files.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture: .png, .gif or .mp4.")],
-    label: Annotated[
-        Optional[list[str]], typer.Option(help="Title of each run, in order.")
-    ] = None,
+    label: Annotated[Optional[list[str]], typer.Option(help="Title of each run, in order.")] = None,
     colour: Annotated[str, typer.Option(help="displacement, error or none.")] = "displacement",
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a .gif or .mp4.")] = 25.0,

@@ -138,7 +138,9 @@ def compare(
         )
         on_coarse[case.label] = restrict(runs[case.label], to=coarse)
     truth = on_coarse[cases[0].label]
-    base = next((on_coarse[c.label] for c in cases[::-1] if c.refine == 1 and c.solver == "pd"), None)
+    base = next(
+        (on_coarse[c.label] for c in cases[::-1] if c.refine == 1 and c.solver == "pd"), None
+    )
     rows = []
     for case in sorted(cases, key=lambda c: (c.refine, c.solver != "pd")):
         run, here = runs[case.label], on_coarse[case.label]

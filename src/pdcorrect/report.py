@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdcorrect import figures
+import pdcorrect.figures as figures
 from pdcorrect.environment import environment
 from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
@@ -25,7 +25,7 @@ HEADINGS = (
 def table(comparison: Comparison) -> list[tuple[str, ...]]:
     """The comparison as rows of text under `HEADINGS`."""
     slowest = next(r for r in comparison.rows if r.label == comparison.reference).seconds_a_frame
-    lines = []
+    lines: list[tuple[str, ...]] = []
     for row in comparison.rows:
         is_reference = row.label == comparison.reference
         lines.append(

@@ -8,6 +8,7 @@ key, the value, and what was expected.  `docs/scene.md` lists all keys.
 from __future__ import annotations
 
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -95,8 +96,9 @@ class Region(_Strict):
             return np.ones(len(points), dtype=bool)
         if self.plane is not None:
             axis = "xyz".index(self.plane)
-            at = {"min": bounds[0, axis], "max": bounds[1, axis]}.get(self.at, self.at)  # type: ignore[arg-type]
-            return np.abs(points[:, axis] - at) <= tolerance
+            low, high = bounds[:, axis]
+            at = {"min": low, "max": high}[self.at] if isinstance(self.at, str) else self.at
+            return np.abs(points[:, axis] - np.float64(at)) <= tolerance
         if self.box is not None:
             low, high = np.sort(np.asarray(self.box), axis=0)
             inside = (points >= low - tolerance) & (points <= high + tolerance)
@@ -142,9 +144,7 @@ class Cross(_VoxelBody):
 
     def occupancy(self) -> shapes.Occupancy:
         """Solid cells and the index of the cell at the origin, see `shapes`."""
-        return shapes.cross(
-            self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length
-        )
+        return shapes.cross(self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length)
 
 
 class Weight(_VoxelBody):
@@ -293,7 +293,7 @@ class Motion(_Strict):
 
     @model_validator(mode="after")
     def _tables_match(self) -> Motion:
-        if any(b <= a for a, b in zip(self.times, self.times[1:])):
+        if any(b <= a for a, b in pairwise(self.times)):
             raise ValueError("expected motion.times to increase")
         if self.displacement is None and self.rotation is None:
             raise ValueError("expected motion.displacement or motion.rotation")
@@ -344,7 +344,7 @@ class _Load(_Strict):
             if self.window is not None or self.ramp:
                 raise ValueError("expected either table, or window and ramp, not both")
             times = [row[0] for row in self.table]
-            if len(times) < 2 or any(b <= a for a, b in zip(times, times[1:])):
+            if len(times) < 2 or any(b <= a for a, b in pairwise(times)):
                 raise ValueError("expected table to have two or more rows with increasing times")
         return self
 
@@ -567,7 +567,7 @@ def _explain(error: ValidationError, source: str) -> str:
             value = repr(item["input"])
             value = value if len(value) < 80 else value[:77] + "..."
             sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")
-    return f"{source}: " + " ".join(dict.fromkeys(sentences))
+    return " ".join(f"{source}: {' '.join(dict.fromkeys(sentences))}".split())
 
 
 def _key(location: tuple[int | str, ...]) -> str:

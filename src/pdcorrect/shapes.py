@@ -90,7 +90,7 @@ def weight(
     wx, wy, wz = weight_cells
     _check_weight(support_cells, pendulum_start, pendulum_cells, weight_start, weight_cells)
 
-    half_x, half_y = (wx - px) // 2, (wy - py) // 2
+    half_x = (wx - px) // 2
     left = max(0, half_x - pendulum_start)
     right = max(0, pendulum_start + px + half_x - sx)
     second = max(second_support_length, 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,7 @@ class Trajectory:
     positions: Array
     velocities: Array
     times: Array
-    stats: Mapping[str, NDArray[np.generic]]
+    stats: Mapping[str, NDArray[Any]]
     points: Array
     cells: NDArray[np.int64]
     scene_toml: str = ""

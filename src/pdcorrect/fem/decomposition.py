@@ -18,11 +18,12 @@ v_i = (s_i + sqrt(s_i^2 + 4 k)) / 2.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
-OPTIONS = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 """numba settings of all kernels: IEEE division, fused multiply-add allowed."""
 
 _SWEEPS = 12

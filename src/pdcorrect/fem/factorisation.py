@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, Protocol
 
@@ -39,7 +39,7 @@ class Factor(Protocol):
     backend: str
 
     def solve(self, b: Array) -> Array:
-        """x with A x = b, for b (n,) or (n, m)."""
+        """X with A x = b, for b (n,) or (n, m)."""
 
 
 class CholeskyFactor:
@@ -120,7 +120,11 @@ class MultigridSolver:
         return out.reshape(np.shape(b))
 
 
-_BACKENDS = {"cholespy": CholeskyFactor, "splu": LUFactor, "amg": MultigridSolver}
+_BACKENDS: dict[str, Callable[[sp.csc_matrix], Factor]] = {
+    "cholespy": CholeskyFactor,
+    "splu": LUFactor,
+    "amg": MultigridSolver,
+}
 
 
 def factorise(matrix: sp.spmatrix, backend: Backend = "auto") -> Factor:
@@ -156,9 +160,9 @@ def choose_backend(size: int, nonzeros: int, memory: float | None = None) -> Bac
 def factor_bytes(size: int, nonzeros: int) -> float:
     """Expected bytes of a Cholesky factor of a three-dimensional mesh's matrix.
 
-    Nested dissection of a compact 3-D mesh with n nodes fills about 12 n^(4/3)
-    entries; a matrix of three unknowns a node has nine times as many.  Slender
-    bodies fill less.  The constant is fitted in ``benchmarks/factor_size.py``.
+    A compact 3-D mesh with n nodes fills about 12 n^(4/3) entries; a matrix of
+    three unknowns a node has nine times as many.  Within a factor of three for
+    blocks and beams of 700 to 18 000 nodes (``benchmarks``, case factor_size).
     """
     unknowns = 3 if nonzeros > 45 * size else 1
     nodes = size / unknowns

@@ -7,14 +7,16 @@ number of threads.  Work arrays are made once a chunk.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
 from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_svd_lanes
 from pdcorrect.fem.energies import density_and_stress_lanes, tangent_lanes
 
-PARALLEL = {**OPTIONS, "parallel": True}
-_REDUCE = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
+PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
+_REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
 _CHUNK = 16
 """Cells that one thread takes at a time."""
 
@@ -136,7 +138,7 @@ def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: i
 
 @njit(**OPTIONS)
 def _transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
-    """out = U^T A V (forward) or U A V^T, all (9, Q)."""
+    """Out = U^T A V (forward) or U A V^T, all (9, Q)."""
     for i in range(3):
         for j in range(3):
             for q in range(A.shape[1]):
@@ -222,7 +224,7 @@ def _node_block(x, y, A, p, m, block):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _add_rotated(U, q, block, half, out):  # type: ignore[no-untyped-def]
-    """out += U block U^T for the U of quadrature point q."""
+    """Out += U block U^T for the U of quadrature point q."""
     for i in range(3):
         for b in range(3):
             half[i, b] = (
@@ -233,7 +235,9 @@ def _add_rotated(U, q, block, half, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[i, j] += (
-                half[i, 0] * U[3 * j, q] + half[i, 1] * U[3 * j + 1, q] + half[i, 2] * U[3 * j + 2, q]
+                half[i, 0] * U[3 * j, q]
+                + half[i, 1] * U[3 * j + 1, q]
+                + half[i, 2] * U[3 * j + 2, q]
             )
 
 

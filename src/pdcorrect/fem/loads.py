@@ -36,7 +36,7 @@ class Amplitude:
 
     def __init__(self, load: Load) -> None:
         if load.table is not None:
-            self._times, self._values = (np.array(column) for column in zip(*load.table))
+            self._times, self._values = np.array(load.table).T
             self._outside = (self._values[0], self._values[-1])
             return
         start, end = load.window or (0.0, np.inf)
@@ -138,7 +138,9 @@ def _gravity(
     return lambda positions: pattern
 
 
-def _body_force(load: BodyForce, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+def _body_force(
+    load: BodyForce, space: Space, selector: Selector, mass: Array, key: str
+) -> Sampler:
     pattern = _in_cells(space, selector.cells(load.region, key), np.array(load.density))
     return lambda positions: pattern
 
@@ -245,4 +247,3 @@ def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:
     inside[cells] = 1.0
     shape = (*space.interpolate(space.positions).shape[:2], 3)
     return space.body_load(np.broadcast_to(density, shape) * inside[:, None, None])
-

@@ -164,7 +164,9 @@ class Space:
         key = {tuple(f): i for i, f in enumerate(np.sort(self._mesh.facets, axis=0).T.tolist())}
         numbers = np.array([key[tuple(sorted(f))] for f in faces.tolist()], dtype=np.int64)
         basis = FacetBasis(self._mesh, self._element, facets=numbers, intorder=self._order)
-        values = [np.broadcast_to(np.asarray(basis.basis[k][0]), basis.dx.shape) for k in self._to_vtk]
+        values = [
+            np.broadcast_to(np.asarray(basis.basis[k][0]), basis.dx.shape) for k in self._to_vtk
+        ]
         gradients = [basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, n, Qf)
         return FaceQuadrature(
             cells=np.asarray(self._mesh.f2t[0, numbers], dtype=np.int64),

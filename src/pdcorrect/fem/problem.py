@@ -41,9 +41,7 @@ class Materials:
     density: Array
 
     @classmethod
-    def from_moduli(
-        cls, scene: Scene, young: Array, poisson: Array, density: Array
-    ) -> Materials:
+    def from_moduli(cls, scene: Scene, young: Array, poisson: Array, density: Array) -> Materials:
         """Weights from Young's modulus (C,), Pa, and Poisson's ratio (C,)."""
         mu = young / (2 * (1 + poisson))
         lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
@@ -94,6 +92,12 @@ class Problem:
     loads: tuple[NodalLoad, ...]
     mass_matrix: sp.csr_matrix
     cell_size: float
+
+    def __repr__(self) -> str:
+        return (
+            f"Problem({self.scene.name!r}, refine={self.refine}: {len(self.positions)} nodes, "
+            f"{len(self.cells)} {self.element} cells, {self.mass_rule} mass)"
+        )
 
     # --- names of the contract --------------------------------------------------
 
@@ -385,9 +389,7 @@ def _mass_matrix(rule: str, space: Space, density: Array) -> sp.csr_matrix:
         return sp.csr_matrix(0.5 * (consistent + diagonal))
     if rule == "lumped":
         return diagonal
-    raise SceneError(
-        f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node."
-    )
+    raise SceneError(f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node.")
 
 
 _LIMITS = {"young": (0.0, np.inf), "poisson": (-1e-300, 0.5), "density": (0.0, np.inf)}

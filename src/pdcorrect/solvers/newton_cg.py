@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.solvers.lbfgs import (
-    Minimum,
     MinimiserOptions,
+    Minimum,
     Objective,
     Solve,
     largest_displacement,
@@ -58,9 +58,7 @@ def newton_cg(
     return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
 
 
-def _direction(
-    objective: Objective, p: Array, gradient: Array, solve: Solve
-) -> tuple[Array, bool]:
+def _direction(objective: Objective, p: Array, gradient: Array, solve: Solve) -> tuple[Array, bool]:
     """The (truncated) Newton direction, and whether no negative curvature was met."""
     product = objective.hessian_operator(p)
     x = np.zeros_like(p)

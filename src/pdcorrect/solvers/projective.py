@@ -20,7 +20,7 @@ VOLUME_SCALE = 0.25
 
 G overestimates the stiffness of the volume term where it acts; a quarter took
 the fewest iterations in twist, bending and free flight at Poisson's ratio 0.3
-and 0.45 (``benchmarks/first_hessian.py``).
+and 0.45 (``benchmarks``, case first_hessian).
 """
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,9 @@ def rollout(
     if frames < 0:
         raise InputError(f"frames = {frames}: expected 0 or more.")
     current = problem.rest_state() if state is None else state
-    states, results, seconds = [current], [], []
+    states = [current]
+    results: list[StepResult] = []
+    seconds: list[float] = []
     for frame in range(1, frames + 1):
         started = time.perf_counter()
         result = stepper(current, forces(current) if forces else None)
@@ -95,7 +97,7 @@ def _trajectory(
     stepper: Stepper, states: list[State], results: list[StepResult], seconds: list[float]
 ) -> Trajectory:
     problem = stepper.problem
-    stats: dict[str, NDArray[np.generic]] = {
+    stats: dict[str, NDArray[Any]] = {
         "status": np.array([r.status.name for r in results], dtype=str),
         "iterations": np.array([r.iterations for r in results], dtype=np.int64),
         "residual": np.array([r.residual for r in results], dtype=np.float64),

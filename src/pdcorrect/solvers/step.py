@@ -51,7 +51,7 @@ class StepObjective:
         self.start = np.where(self.free, self._target, prescribed)
 
     def value_and_gradient(self, p: Array) -> tuple[float, Array]:
-        """gamma (J) and its gradient (N, 3), N, zero where clamped."""
+        """Gamma (J) and its gradient (N, 3), N, zero where clamped."""
         energy, elastic = self.problem.energy_and_forces(p)
         offset = p - self._target
         inertia = self.problem.mass_times(offset) / self.time_step**2
@@ -124,7 +124,7 @@ class GlobalSolver:
         return self._parts[0][0].backend
 
     def __call__(self, r: Array) -> Array:
-        """x (N, 3) with G x = r on the free components, zero elsewhere."""
+        """X (N, 3) with G x = r on the free components, zero elsewhere."""
         if self._all_free:
             return self._parts[0][0].solve(r)
         out = np.zeros_like(r)

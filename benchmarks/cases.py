@@ -1,0 +1,138 @@
+"""What is timed."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pdcorrect as pc
+from pdcorrect.fem.factorisation import factor_bytes, factorise
+from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
+from pdcorrect.solvers.step import GlobalSolver, StepObjective
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def seconds(command: list[str], runs: int = 7) -> dict[str, float]:
+    """Median and extremes of a whole process, after one warm-up."""
+    taken = []
+    for _ in range(runs + 1):
+        started = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        taken.append(time.perf_counter() - started)
+    taken = taken[1:]
+    return {"median": statistics.median(taken), "min": min(taken), "max": max(taken)}
+
+
+def start_up() -> dict[str, Any]:
+    """Whole-process seconds of the program's help, the import, and bare Python."""
+    program = Path(sys.executable).parent / "pdcorrect"
+    return {
+        "pdcorrect --help": seconds([str(program), "--help"]),
+        "import pdcorrect": seconds([sys.executable, "-c", "import pdcorrect"]),
+        "python -c pass": seconds([sys.executable, "-c", "pass"]),
+    }
+
+
+def steps() -> list[dict[str, Any]]:
+    """Median milliseconds a frame over the first ten frames of the twisted cross."""
+    script = Path(__file__).parent / "steps.py"
+    rows = []
+    for threads in (1, 2):
+        out = subprocess.run(
+            [sys.executable, str(script), str(threads)], check=True, capture_output=True, text=True
+        )
+        rows += json.loads(out.stdout.splitlines()[-1])
+    return rows
+
+
+def first_hessian() -> list[dict[str, Any]]:
+    """Mean L-BFGS iterations over eight frames, by the scale of the volume weight in G."""
+    rows = []
+    for motion in ("twist", "bending", "flight"):
+        for poisson in (0.3, 0.45):
+            problem = pc.discretise(_beam(motion, poisson), refine=2)
+            row: dict[str, Any] = {"motion": motion, "poisson": poisson, "history": 16}
+            for scale in (1.0, 0.5, 0.25, 0.1):
+                row[f"scale {scale:g}"] = _mean_iterations(problem, motion, scale)
+            rows.append(row)
+    return rows
+
+
+def factor_size() -> list[dict[str, Any]]:
+    """Bytes of a symmetric factor (12 for each entry) against the estimate, blocks and beams."""
+    rows = []
+    for cells in ((8, 8, 8), (16, 16, 16), (24, 24, 24), (96, 8, 8), (224, 8, 8)):
+        problem = pc.discretise(_beam("bending", 0.3, cells))
+        matrix = problem.global_matrix(0.01)
+        started = time.perf_counter()
+        factor = factorise(matrix, "cholespy")
+        factor_seconds = time.perf_counter() - started
+        right = np.random.default_rng(0).normal(size=problem.positions.shape)
+        solves = []
+        for _ in range(5):
+            started = time.perf_counter()
+            factor.solve(right)
+            solves.append(time.perf_counter() - started)
+        entries = factorise(matrix, "splu")._lu.L.nnz
+        rows.append(
+            {
+                "cells": cells,
+                "nodes": len(problem.positions),
+                "splu_factor_megabytes": 12e-6 * entries,
+                "estimated_megabytes": 1e-6 * factor_bytes(matrix.shape[0], matrix.nnz),
+                "cholespy_factor_seconds": factor_seconds,
+                "cholespy_solve_milliseconds": 1e3 * statistics.median(solves),
+            }
+        )
+    return rows
+
+
+def _beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12, 2, 2)) -> pc.Scene:
+    loads = {
+        "twist": [{"kind": "torsion", "strength": 2e5}],
+        "bending": [{"kind": "gravity", "acceleration": [0, 0, -9.81]}],
+        "flight": [],
+    }
+    return pc.Scene(
+        body={"shape": "beam", "cells": cells, "cell_size": 0.02},
+        material={"young": 1e6, "poisson": poisson, "density": 1e3},
+        time={"step": 0.01, "frames": 8},
+        clamps=[] if motion == "flight" else [{"region": {"plane": "x", "at": 0.0}}],
+        loads=loads[motion],
+    )
+
+
+def _mean_iterations(problem: pc.Problem, motion: str, scale: float) -> float:
+    solve = GlobalSolver(problem, 0.01, volume_scale=scale)
+    state = problem.rest_state()
+    if motion == "flight":
+        spin = np.cross([5.0, 3.0, 2.0], state.positions - 0.03)
+        noise = 0.3 * np.random.default_rng(0).normal(size=spin.shape)
+        state = pc.State(state.positions, spin + noise)
+    options = MinimiserOptions(1e-4 * problem.cell_size, history=16, max_iterations=5000)
+    counts = []
+    for _ in range(8):
+        loads = problem.external_forces(state.time, state.time + 0.01)
+        objective = StepObjective(problem, state, 0.01, loads)
+        found = minimise(objective, objective.start, solve, options)
+        counts.append(found.iterations)
+        velocities = (found.positions - state.positions) / 0.01
+        state = pc.State(found.positions, velocities, state.time + 0.01)
+    return float(np.mean(counts))
+
+
+CASES: dict[str, Callable[[], Any]] = {
+    "start_up": start_up,
+    "steps": steps,
+    "first_hessian": first_hessian,
+    "factor_size": factor_size,
+}

@@ -1,0 +1,42 @@
+"""Run the benchmarks and write one JSON file for this machine."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from pathlib import Path
+
+import cases
+
+from pdcorrect.environment import environment
+
+
+def main() -> None:
+    """Run the cases named on the command line, or all."""
+    names = sys.argv[1:] or list(cases.CASES)
+    unknown = set(names) - set(cases.CASES)
+    if unknown:
+        sys.exit(f"unknown: {sorted(unknown)}; expected some of {list(cases.CASES)}")
+    machine = environment()
+    folder = Path(__file__).parent / "results"
+    folder.mkdir(exist_ok=True)
+    slug = re.sub(r"[^a-z0-9]+", "-", machine["processor"].lower()).strip("-")
+    path = folder / f"{slug}-{machine['cores']}cores.json"
+    record = json.loads(path.read_text()) if path.exists() else {}
+    for name in names:
+        print(f"{name} ...", flush=True)
+        record[name] = {
+            "date": time.strftime("%Y-%m-%d"),
+            "command": f"python benchmarks/run.py {name}",
+            "environment": machine,
+            "results": cases.CASES[name](),
+        }
+        print(json.dumps(record[name]["results"], indent=2))
+        path.write_text(json.dumps(record, indent=2) + "\n")
+    print(f"wrote {path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,217 @@
+"""The program: what it writes, what it says, and how it ends."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from conftest import beam, cross
+from pdcorrect import cli
+
+PROGRAM = Path(sys.executable).parent / "pdcorrect"
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(beam((4, 2, 1), time={"frames": 4}).to_toml(), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def run(capsys, monkeypatch):
+    """Call the program in this process; returns (status, standard output, standard error)."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["pdcorrect", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            status = end.code or 0
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return call
+
+
+def test_simulate_writes_the_rollout(run, scene_file, tmp_path):
+    output = tmp_path / "run.h5"
+    status, out, err = run("simulate", scene_file, "-o", output)
+    assert (status, err) == (0, "")
+    problem = pc.discretise(pc.Scene.load(scene_file))
+    expected = pc.rollout(pc.ProjectiveDynamics(problem))
+    loaded = pc.load_trajectory(output)
+    np.testing.assert_array_equal(loaded.positions, expected.positions)
+    np.testing.assert_array_equal(loaded.stats["iterations"], expected.stats["iterations"])
+    assert loaded.scene_toml == problem.scene.to_toml()
+    for word in ("4 frames", "30 nodes", "iterations a frame", "worst residual", "energy", "wrote"):
+        assert word in out
+
+
+@pytest.mark.parametrize("solver", ["pd", "newton"])
+def test_simulate_refines_and_takes_either_solver(run, scene_file, tmp_path, solver):
+    output = tmp_path / "run.h5"
+    arguments = ("--refine", 2, "--solver", solver, "--frames", 2, "--vtu", tmp_path / "vtu")
+    status, out, _ = run("simulate", scene_file, "-o", output, *arguments)
+    assert status == 0
+    loaded = pc.load_trajectory(output)
+    assert loaded.positions.shape == (3, 9 * 5 * 3, 3)
+    assert solver in loaded.attributes["solver"].lower() or "projective" in out
+    assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
+
+
+def test_an_existing_file_is_kept_unless_told(run, scene_file, tmp_path):
+    output = tmp_path / "run.h5"
+    output.write_text("precious")
+    status, _, err = run("simulate", scene_file, "-o", output)
+    assert status != 0
+    assert "run.h5" in err
+    assert output.read_text() == "precious"
+    assert run("simulate", scene_file, "-o", output, "--overwrite", "--frames", 1)[0] == 0
+    assert len(pc.load_trajectory(output)) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("poisson = 0.45|poisson = 0.5", "material.poisson = 0.5"),
+        ("density = |weight = ", "material.weight: unknown key"),
+        ("at = 0.0|at = 7.0", "contains no node"),
+    ],
+)
+def test_bad_scenes_end_with_status_2_and_one_paragraph(run, scene_file, tmp_path, change, words):
+    old, new = change.split("|")
+    text = scene_file.read_text()
+    assert old in text
+    scene_file.write_text(text.replace(old, new))
+    status, out, err = run("simulate", scene_file, "-o", tmp_path / "run.h5")
+    assert status == cli.BAD_INPUT
+    assert words in err
+    assert err.startswith("error: ")
+    assert "Traceback" not in out + err
+    assert not (tmp_path / "run.h5").exists()
+
+
+def test_other_bad_input_ends_with_status_2(run, scene_file, tmp_path):
+    out = tmp_path / "x.h5"
+    for arguments in (
+        ("simulate", tmp_path / "none.toml", "-o", out),
+        ("simulate", scene_file, "-o", out, "--solver", "magic"),
+        ("simulate", scene_file, "-o", out, "--refine", "0"),
+        ("simulate", scene_file),
+        ("render", tmp_path / "none.h5", "-o", tmp_path / "x.png"),
+        ("render", scene_file, "-o", tmp_path / "x.png"),
+        ("frobnicate",),
+    ):
+        status, _, err = run(*arguments)
+        assert status == cli.BAD_INPUT, arguments
+        assert "Traceback" not in err
+
+
+def test_an_unwritable_output_is_named(run, scene_file):
+    for target in (scene_file / "run.h5", "/proc/nowhere/run.h5"):
+        status, _, err = run("simulate", scene_file, "-o", target)
+        assert status != 0
+        assert "run.h5" in err
+        assert "Traceback" not in err
+
+
+def test_a_run_that_fails_keeps_its_frames_and_ends_with_status_1(
+    run, scene_file, tmp_path, monkeypatch
+):
+    real = pc.ProjectiveDynamics.__call__
+
+    def fails_third(self, state, *rest, **named):
+        result = real(self, state, *rest, **named)
+        if state.time > 0.015:
+            from dataclasses import replace
+
+            return replace(result, status=pc.Status.ITERATION_LIMIT)
+        return result
+
+    monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_third)
+    output = tmp_path / "run.h5"
+    status, _, err = run("simulate", scene_file, "-o", output)
+    assert status == cli.FAILED
+    assert "frame 3" in err
+    assert len(pc.load_trajectory(output)) == 2
+
+
+def test_compare_writes_its_report(run, tmp_path):
+    scene = tmp_path / "cross.toml"
+    scene.write_text(cross(0.4, name="small cross", solver={"tolerance": 1e-4}).to_toml())
+    folder = tmp_path / "report"
+    status, out, _ = run("compare", scene, "-o", folder, "--frames", 3)
+    assert status == 0
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    assert list(rows) == ["coarse PD", "coarse Newton", "intermediate PD", "fine PD"]
+    assert float(rows["fine PD"]["rms_error"]) == 0
+    errors = [float(rows[k]["rms_error"]) for k in ("coarse PD", "intermediate PD")]
+    assert errors[0] > 2 * errors[1] > 0
+    assert float(rows["coarse PD"]["omega"]) == 0
+    assert float(rows["intermediate PD"]["omega"]) == pytest.approx(
+        100 * (1 - (errors[1] / errors[0]) ** 2)
+    )
+    record = json.loads((folder / "report.json").read_text())
+    assert record["solver_error"] < 1e-2 * errors[0]
+    assert record["environment"]["threads"]
+    text = (folder / "report.md").read_text()
+    for name in ("comparison.png", "node.png", "energy.png", "error_over_time.png"):
+        assert f"]({name})" in text
+        assert (folder / name).stat().st_size > 5000
+    assert "small cross" in out
+    for label in rows:
+        assert label in out
+        assert f"| {label} |" in text
+
+
+def test_compare_without_figures_needs_no_view_extra(run, scene_file, tmp_path, monkeypatch):
+    for module in ("pyvista", "matplotlib"):
+        monkeypatch.setitem(sys.modules, module, None)
+    status, _, _ = run("compare", scene_file, "-o", tmp_path / "r", "--frames", 2, "--no-figures")
+    assert status == 0
+    assert not list((tmp_path / "r").glob("*.png"))
+    status, _, err = run("compare", scene_file, "-o", tmp_path / "r2", "--frames", 2)
+    assert status == cli.BAD_INPUT
+    assert "pip install 'pdcorrect[view]'" in err
+
+
+def test_render_draws_runs_side_by_side(run, scene_file, tmp_path):
+    for name, solver in (("a", "pd"), ("b", "newton")):
+        run("simulate", scene_file, "-o", tmp_path / f"{name}.h5", "--solver", solver)
+    files = (tmp_path / "a.h5", tmp_path / "b.h5")
+    for name in ("still.png", "moving.gif"):
+        status, _, err = run("render", *files, "-o", tmp_path / name)
+        assert (status, err) == (0, "")
+        assert (tmp_path / name).stat().st_size > 5000
+    status, _, err = run("render", *files, "-o", tmp_path / "x.png", "--frame", 99)
+    assert status == cli.BAD_INPUT
+    status, _, err = run("render", *files, "-o", tmp_path / "x.bmp2")
+    assert status == cli.BAD_INPUT
+
+
+def test_doctor_looks_at_everything(run):
+    status, out, _ = run("doctor")
+    for word in ("numpy", "scikit-fem", "BLAS", "kernel threads", "factorisation cholespy", "GPU",
+                 "off-screen rendering"):  # fmt: skip
+        assert word in out
+    assert status in (0, 1)
+    assert ("PROBLEM" in out) == (status == 1)
+
+
+def test_help_names_every_command():
+    out = subprocess.run([PROGRAM, "--help"], capture_output=True, text=True, check=True).stdout
+    for command in ("simulate", "compare", "render", "doctor"):
+        assert command in out
+        help_text = subprocess.run(
+            [PROGRAM, command, "--help"], capture_output=True, text=True, check=True,
+            env={**os.environ, "COLUMNS": "100"},
+        ).stdout  # fmt: skip
+        assert "Usage" in help_text

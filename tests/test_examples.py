@@ -1,0 +1,98 @@
+"""Every scene in examples/ and every command and snippet of the documentation runs."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from pdcorrect import scene as scene_module
+
+ROOT = Path(__file__).parent.parent
+SCENES = sorted((ROOT / "examples").glob("*.toml"))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda p: p.stem)
+def test_example_scenes_run_with_both_solvers(path):
+    scene = pc.Scene.load(path)
+    problem = pc.discretise(scene)
+    pd = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-7), frames=12)
+    newton = pc.rollout(pc.Newton(problem), frames=12)
+    assert set(pd.stats["status"]) == {"CONVERGED"}
+    assert np.abs(pd.positions - newton.positions).max() < 1e-5 * problem.cell_size
+    assert pc.metrics.largest_displacement(pd) > 0.02 * problem.cell_size
+
+
+def blocks(language):
+    for page in PAGES:
+        for i, text in enumerate(re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)):
+            yield pytest.param(text, id=f"{page.stem}-{i}")
+
+
+@pytest.mark.parametrize("text", list(blocks("python")))
+def test_python_snippets_run(text, monkeypatch, example_folder):
+    monkeypatch.chdir(example_folder)
+    exec(compile(text, "snippet", "exec"), _names)
+
+
+_names: dict = {}
+"""Snippets of a page build on each other."""
+
+
+@pytest.fixture
+def example_folder(tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    return tmp_path
+
+
+def shell_lines():
+    for page in PAGES:
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text(), re.S):
+            for line in block.splitlines():
+                if line.startswith("pdcorrect "):
+                    yield page.stem, line.split("#")[0].strip()
+
+
+def test_documented_commands_run(monkeypatch, tmp_path, capsys):
+    """In the order of the pages, few frames each, as the commands build on each other's files."""
+    import sys
+
+    from pdcorrect import cli
+
+    lines = list(dict.fromkeys(line for _, line in shell_lines()))
+    assert len(lines) >= 4
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        words = shlex.split(line)
+        if words[1] in ("simulate", "compare") and "--frames" not in words:
+            words += ["--frames", "2"]
+        monkeypatch.setattr(sys, "argv", words)
+        try:
+            cli.main()
+        except SystemExit as end:
+            assert not end.code or words[1] == "doctor", (line, capsys.readouterr().err)
+
+
+def test_the_scene_page_names_every_key():
+    page = (ROOT / "docs" / "scene.md").read_text()
+    models = [
+        scene_module.Beam, scene_module.Cross, scene_module.Weight, scene_module.Voxels,
+        scene_module.MeshFile, scene_module.Material, scene_module.Region, scene_module.Clamp,
+        scene_module.Motion, scene_module.Gravity, scene_module.BodyForce, scene_module.Force,
+        scene_module.Traction, scene_module.Pressure, scene_module.Torsion, scene_module.Time,
+        scene_module.Solver, scene_module.Scene,
+    ]  # fmt: skip
+    for model in models:
+        for name, field in model.model_fields.items():
+            key = field.alias or name
+            assert re.search(rf"[`\[ ]{key}[`\] =]", page), f"{model.__name__}.{key}"
+
+
+def test_documented_links_exist():
+    for page in PAGES:
+        for target in re.findall(r"\]\((?!http|#)([^)#]+)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name} -> {target}"

@@ -1,0 +1,143 @@
+"""The package's shape: imports point one way, heavy modules stay out until needed."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parent.parent / "src" / "pdcorrect"
+
+ORDER = [
+    "pdcorrect",
+    "errors",
+    "shapes",
+    "scene",
+    "state",
+    "fem",
+    "fem.mesh",
+    "fem.mesh_files",
+    "fem.operators",
+    "fem.decomposition",
+    "fem.energies",
+    "fem.kernels",
+    "fem.factorisation",
+    "fem.selection",
+    "fem.loads",
+    "fem.clamps",
+    "fem.problem",
+    "solvers",
+    "solvers.step",
+    "solvers.lbfgs",
+    "solvers.newton_cg",
+    "solvers.implicit",
+    "solvers.projective",
+    "solvers.newton",
+    "solvers.rollout",
+    "io",
+    "io.superblock",
+    "io.trajectory_reader",
+    "io.trajectory",
+    "io.vtk",
+    "metrics",
+    "evaluate",
+    "figures",
+    "environment",
+    "report",
+    "cli",
+]
+"""From bottom to top: a module imports only modules above it in this list."""
+
+
+def module_name(path):
+    parts = list(path.relative_to(SOURCE).with_suffix("").parts)
+    if parts[-1] == "__init__":
+        parts.pop()
+    return ".".join(parts) or "pdcorrect"
+
+
+def imported(path):
+    """Package modules that a file imports at run time (not under TYPE_CHECKING)."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    hidden = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
+            hidden.update(ast.walk(node))
+    for node in ast.walk(tree):
+        if node in hidden:
+            continue
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pdcorrect"):
+            base = node.module.removeprefix("pdcorrect").lstrip(".")
+            for alias in node.names:
+                name = f"{base}.{alias.name}".lstrip(".")
+                yield name if name in ORDER else (base or "pdcorrect")
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                if alias.name.startswith("pdcorrect"):
+                    yield alias.name.removeprefix("pdcorrect").lstrip(".") or "pdcorrect"
+
+
+def test_every_module_has_its_place():
+    assert sorted(module_name(p) for p in SOURCE.rglob("*.py")) == sorted(ORDER)
+
+
+@pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=module_name)
+def test_imports_point_one_way(path):
+    here = module_name(path)
+    for name in imported(path):
+        assert ORDER.index(name) < ORDER.index(here), f"{here} imports {name}"
+
+
+def test_scikit_fem_is_imported_in_one_place():
+    users = [module_name(p) for p in SOURCE.rglob("*.py") if "skfem" in p.read_text()]
+    assert users == ["fem.operators"]
+
+
+def loaded_after(code):
+    script = (
+        f"{code}\nimport sys; print(' '.join(sorted({{m.split('.')[0] for m in sys.modules}})))"
+    )
+    out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(out.stdout.splitlines()[-1].split())
+
+
+HEAVY = {"torch", "pyvista", "vtk", "vtkmodules", "h5py", "meshio", "matplotlib"}
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    assert not loaded_after("import pdcorrect") & (HEAVY | {"numpy", "scipy", "numba", "skfem"})
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['pdcorrect', '--help']\n"
+        "from pdcorrect.cli import app\n"
+        "try:\n    app()\nexcept SystemExit:\n    pass"
+    )
+    assert not loaded_after(code) & (HEAVY | {"numpy", "scipy", "numba", "skfem"})
+
+
+def test_stepping_loads_neither_torch_nor_files_nor_pictures():
+    code = (
+        "import pdcorrect as pc\n"
+        "scene = pc.Scene(body={'shape': 'beam', 'cells': [2, 1, 1], 'cell_size': 0.1},\n"
+        "    material={'young': 1e5, 'poisson': 0.3, 'density': 1e3}, time={'step': 0.01,"
+        " 'frames': 1})\n"
+        "pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))\n"
+        "pc.rollout(pc.Newton(pc.discretise(scene)))"
+    )
+    assert not loaded_after(code) & HEAVY
+
+
+def test_rendering_does_not_load_torch():
+    assert "torch" not in loaded_after("from pdcorrect import figures, report")
+
+
+def test_public_names_exist():
+    import pdcorrect as pc
+
+    for name in pc.__all__:
+        assert getattr(pc, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        pc.nothing  # noqa: B018

@@ -1,0 +1,211 @@
+"""Scene files: what they mean, round trips, and messages for wrong ones."""
+
+import math
+import tomllib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import pdcorrect as pc
+from conftest import beam, cross
+from pdcorrect.errors import SceneError
+
+TEXT = """
+name = "gravity beam"
+[body]
+shape = "beam"
+cells = [24, 2, 2]
+cell_size = 0.02
+[material]
+energy = "corotated"
+volume_weight = "lame"
+young = 1.0e6
+poisson = 0.45
+density = 1.0e3
+[time]
+step = 0.01
+frames = 50
+[[clamps]]
+region = { plane = "x", at = 0.0 }
+[[loads]]
+kind = "gravity"
+acceleration = [0.0, 0.0, -9.81]
+[solver]
+mass = "lumped"
+element = "hex8"
+tolerance = 1.0e-5
+"""
+
+
+def test_the_documented_scene_is_read():
+    scene = pc.Scene.from_toml(TEXT)
+    assert scene.body.cells == (24, 2, 2)
+    assert scene.time.step == 0.01
+    assert scene.loads[0].acceleration == (0, 0, -9.81)
+    assert scene.clamps[0].components == ("x", "y", "z")
+    assert scene.solver.mass == "lumped"
+
+
+@pytest.mark.parametrize("scene", [beam(), cross(), pc.Scene.from_toml(TEXT)])
+def test_scenes_survive_toml(scene):
+    again = pc.Scene.from_toml(scene.to_toml())
+    assert again == scene
+    assert again.to_toml() == scene.to_toml()
+
+
+def test_effective_moduli_are_the_documented_ones():
+    def effective(**material):
+        return beam(
+            material={"young": 1e6, **material}, poisson=material["poisson"]
+        ).material.effective
+
+    exact = effective(poisson=0.45)
+    assert (exact.young, exact.poisson) == pytest.approx((1e6, 0.45))
+    published = effective(poisson=0.45, volume_weight="published")
+    assert published.poisson == pytest.approx(0.375)
+    assert published.young == pytest.approx(0.948e6, rel=1e-3)
+    alone = effective(poisson=0.45, energy="corotated-only")
+    assert (alone.young, alone.poisson) == pytest.approx((2e6 / 2.9, 0.0))
+    fluid = effective(poisson=0.45, energy="volume-only")
+    assert (fluid.young, fluid.poisson) == pytest.approx((0.0, 0.5))
+
+
+def changed(old, new):
+    assert old in TEXT
+    return TEXT.replace(old, new, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (changed("poisson = 0.45", "poisson = 0.5"), ["material.poisson = 0.5", "less than 0.5"]),
+        (changed("poisson = 0.45", "poisson = -0.1"), ["material.poisson = -0.1", "equal to 0"]),
+        (changed("density = 1.0e3", "density = -1.0"), ["material.density = -1.0", "than 0"]),
+        (changed("young = 1.0e6", "young = nan"), ["material.young = nan", "finite"]),
+        (changed("young = 1.0e6", "young = inf"), ["material.young = inf", "finite"]),
+        (changed("young = 1.0e6\n", ""), ["material.young: missing"]),
+        (changed("young = 1.0e6", 'young = "soft"'), ["material.young = 'soft'", "number"]),
+        (changed("young = 1.0e6", "youngs = 1.0e6"), ["material.youngs: unknown key"]),
+        (changed('"lame"', '"lambda"'), ["material.volume_weight = 'lambda'", "'published'"]),
+        (changed("cells = [24, 2, 2]", "cells = [24, 0, 2]"), ["body.cells[1] = 0", "equal to 1"]),
+        (changed("cells = [24, 2, 2]", "cells = [24, 2]"), ["body.cells[2]: missing"]),
+        (changed('"beam"', '"bean"'), ["body", "'bean'", "'cross'"]),
+        (changed("step = 0.01", "step = 0.0"), ["time.step = 0.0", "greater than 0"]),
+        (changed("frames = 50", "frames = 1.5"), ["time.frames = 1.5", "integer"]),
+        (changed("at = 0.0 }", 'at = "middle" }'), ["clamps[0].region.at = 'middle'", "'max'"]),
+        (changed(", at = 0.0 }", " }"), ["clamps[0].region", "plane and at together"]),
+        (changed('plane = "x", at = 0.0', ""), ["clamps[0].region", "exactly one of plane"]),
+        (changed('"gravity"', '"gravty"'), ["loads[0]", "'gravty'", "'body-force'"]),
+        (changed("[0.0, 0.0, -9.81]", "[0.0, nan, -9.81]"), ["loads[0].acceleration[1]", "finite"]),
+        (changed("[solver]", "[solver]\nspeed = 9"), ["solver.speed: unknown key"]),
+        (changed("tolerance = 1.0e-5", "tolerance = 0.0"), ["solver.tolerance = 0.0"]),
+        (changed('"hex8"', '"hex9"'), ["solver.element = 'hex9'", "'hex8'"]),
+        (changed("kind = ", "window = [0.2, 0.1]\nkind = "), ["window", "start < end"]),
+        (changed("kind = ", "table = [[0, 1], [0, 2]]\nkind = "), ["table", "increasing"]),
+        (changed("kind = ", "ramp = 1.0\ntable = [[0, 1], [1, 2]]\nkind = "), ["not both"]),
+        (changed("name = ", "name = ["), ["not valid TOML"]),
+        (changed('"gravity beam"', '" "'), ["name", "not empty"]),
+    ],
+)
+def test_wrong_scenes_are_refused_in_one_paragraph(text, words):
+    with pytest.raises(SceneError) as caught:
+        pc.Scene.from_toml(text, source="beam.toml")
+    message = str(caught.value)
+    assert message.startswith("beam.toml: ")
+    assert "\n" not in message
+    for word in words:
+        assert word in message
+
+
+def test_keys_of_loads_and_bodies_are_named_as_written():
+    with pytest.raises(SceneError, match=r"loads\[0\]\.force\[1\]"):
+        beam(loads=[{"kind": "force", "force": [1, "a", 2], "region": {"everywhere": True}}])
+    with pytest.raises(SceneError, match=r"body\.arm_length: missing"):
+        beam(body={"shape": "cross", "arm_start": 1})
+    with pytest.raises(SceneError, match=r"motion.displacement to have the 2 entries"):
+        beam(
+            clamps=[
+                {
+                    "region": {"everywhere": True},
+                    "motion": {"times": [0, 1], "displacement": [[0, 0, 0]]},
+                }
+            ]
+        )
+
+
+def test_unreadable_files_are_named(tmp_path):
+    with pytest.raises(SceneError, match="nowhere.toml: cannot be read"):
+        pc.Scene.load(tmp_path / "nowhere.toml")
+    with pytest.raises(SceneError, match="cannot be read"):
+        pc.Scene.load(tmp_path)
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(SceneError, match="not a UTF-8"):
+        pc.Scene.load(tmp_path / "binary.toml")
+
+
+def test_changes_keep_the_rest():
+    scene = beam()
+    other = scene.with_changes(material={"poisson": 0.1}, loads=[])
+    assert other.material.young == scene.material.young
+    assert other.material.poisson == 0.1
+    assert other.loads == ()
+    with pytest.raises(SceneError, match=r"material\.poisson = 0\.6"):
+        scene.with_changes(material={"poisson": 0.6})
+
+
+def test_a_scene_is_immutable():
+    with pytest.raises(ValueError, match="frozen"):
+        beam().material.young = 1.0
+
+
+leaf = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+tree = st.recursive(
+    leaf,
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.sampled_from(["body", "material", "time", "clamps", "loads", "solver", "x"]), tree)
+def test_any_value_anywhere_gives_a_scene_or_a_scene_error(section, value):
+    data = tomllib.loads(TEXT)
+    data[section] = value
+    try:
+        scene = pc.Scene(**data)
+    except SceneError as error:
+        assert "\n" not in str(error)
+    else:
+        assert math.isfinite(scene.material.young)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_any_leaf_anywhere_gives_a_scene_or_a_scene_error(data):
+    scene = tomllib.loads(TEXT)
+    node = scene
+    while True:
+        keys = list(node) if isinstance(node, dict) else list(range(len(node)))
+        key = data.draw(st.sampled_from(keys))
+        if isinstance(node[key], (dict, list)) and node[key] and data.draw(st.booleans()):
+            node = node[key]
+            continue
+        node[key] = data.draw(tree)
+        break
+    try:
+        pc.Scene(**scene)
+    except SceneError as error:
+        assert len(str(error)) < 4000
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.text(max_size=200) | st.builds(lambda i, c: TEXT[:i] + c + TEXT[i + 1 :],
+       st.integers(0, len(TEXT) - 1), st.characters()))  # fmt: skip
+def test_any_text_gives_a_scene_or_a_scene_error(text):
+    try:
+        pc.Scene.from_toml(text)
+    except SceneError as error:
+        assert str(error)
