@@ -98,15 +98,10 @@ class Comparison:
 
 
 def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
-    """A stepper by name, ``"pd"`` or ``"newton"``, factorised and with its kernels compiled.
-
-    The warm-up is one step on a throw-away state, so that the first timed step
-    is like the others.
-    """
+    """A stepper by name, ``"pd"`` or ``"newton"``, factorised and with its kernels compiled."""
     problem = discretise(scene, refine=refine)
     stepper = ProjectiveDynamics(problem) if solver == "pd" else Newton(problem)
-    stepper(problem.rest_state())
-    return stepper
+    return stepper.prepare()
 
 
 def compare(

@@ -24,7 +24,7 @@ from pdcorrect.errors import InputError
 Array = NDArray[np.float64]
 Backend = Literal["auto", "cholespy", "splu", "amg"]
 
-_AMG_TOLERANCE = 1e-13
+_AMG_TOLERANCE = 1e-12
 _MEMORY_SHARE = 0.5
 """Share of the free memory that a factor may be expected to take."""
 

@@ -6,7 +6,7 @@ import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,6 +113,15 @@ class ImplicitStepper:
             if found is not None:
                 after, minimum, work = found
         return self._report(after, minimum, effort, work)
+
+    def prepare(self) -> Self:
+        """Factorise and load the compiled kernels now, so that the first step is like the others."""
+        with _quiet_blas():
+            self._global_solver(self.time_step)
+            rest = self.problem.positions
+            self.problem.energy_and_forces(rest)
+            self.problem.linearise(rest).apply(rest)
+        return self
 
     def describe(self) -> dict[str, str]:
         """Method, tolerance, step and factorisation in use."""

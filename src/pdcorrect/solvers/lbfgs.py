@@ -29,12 +29,17 @@ Solve = Callable[[Array], Array]
 
 _ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
-"""Relative to |gamma|: changes below this carry no information."""
+"""Relative to the terms of gamma: changes below this carry no information."""
 _BACKTRACKS = 30
 
 
 class Objective(Protocol):
-    """What the loop minimises, over arrays (N, 3)."""
+    """What the loop minimises, over arrays (N, 3).
+
+    ``scale`` is the size of the terms that the last value was summed from.
+    """
+
+    scale: float
 
     def value_and_gradient(self, p: Array) -> tuple[float, Array]:
         """Value and gradient; the gradient is zero where p is prescribed."""
@@ -235,7 +240,7 @@ def line_search(
     slope = float(np.vdot(gradient, direction))
     step, tried = 1.0, 0
     if slope < 0.0:
-        noise = _ROUND_OFF * abs(value)
+        noise = _ROUND_OFF * objective.scale
         while tried < _BACKTRACKS:
             tried += 1
             trial = p + step * direction

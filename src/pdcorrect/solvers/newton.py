@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,16 @@ class Newton(ImplicitStepper):
         self._options = replace(self._options, max_iterations=max_iterations)
         self._free = np.flatnonzero(problem.free.ravel())
         self._used_backend = "none yet"
+
+    def prepare(self) -> Self:
+        """Assemble and factorise once at rest, so that the first step is like the others."""
+        state = self.problem.rest_state()
+        objective = StepObjective(
+            self.problem, state, self.time_step, np.zeros_like(state.positions)
+        )
+        _, gradient = objective.value_and_gradient(state.positions)
+        self._direction(objective, state.positions, gradient)
+        return self
 
     def describe(self) -> dict[str, str]:
         """Method, tolerance, step and factorisation in use."""

@@ -39,12 +39,16 @@ class StepObjective:
     ----------
     start : (N, 3)
         Inertial prediction p + h v, prescribed where clamped: the first iterate.
+    scale : float
+        Size of the terms of gamma where it was last evaluated, J: round-off in
+        gamma is relative to this.
     """
 
     def __init__(self, problem: Problem, state: State, time_step: float, forces: Array) -> None:
         self.problem = problem
         self.time_step = time_step
         self.free = problem.free
+        self.scale = 0.0
         self._forces = forces
         self._target = state.positions + time_step * state.velocities
         prescribed = problem.clamped_positions(state.time + time_step)
@@ -55,8 +59,10 @@ class StepObjective:
         energy, elastic = self.problem.energy_and_forces(p)
         offset = p - self._target
         inertia = self.problem.mass_times(offset) / self.time_step**2
-        moved = p - self.problem.positions
-        value = energy + 0.5 * np.vdot(offset, inertia) - np.vdot(self._forces, moved)
+        kinetic = 0.5 * np.vdot(offset, inertia)
+        work = np.vdot(self._forces, p - self.problem.positions)
+        self.scale = float(energy + kinetic + abs(work))
+        value = energy + kinetic - work
         gradient = inertia
         gradient -= elastic
         gradient -= self._forces

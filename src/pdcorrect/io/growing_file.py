@@ -1,0 +1,229 @@
+"""An HDF5 file that grows by one record at a time and survives its writer.
+
+Each record is one chunk of every growing dataset, with a checksum.  One dataset
+counts the complete records, because it is written after the others have reached
+the file.  While it grows the file is in HDF5's single-writer/multiple-reader
+mode: a killed writer leaves it readable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import OutputError
+from pdcorrect.io.disk_space import Reserve, abandon
+from pdcorrect.io.superblock import read_superblock
+
+_LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
+_FILL: dict[str, Any] = {"f": np.nan, "i": -1, "S": b""}
+
+
+class Column(NamedTuple):
+    """A growing dataset: type and shape of an entry, and the first record that has one."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...] = ()
+    first: int = 0
+
+
+class GrowingFile:
+    """Attributes and fixed arrays, then records.
+
+    Parameters
+    ----------
+    path : Path
+        A new file in an existing folder.
+    columns : mapping of str to Column
+        Growing datasets; more may be added with a record.
+    counter : str
+        The one of them that is written last.
+    arrays : mapping of str to array
+        Datasets that do not grow.
+    attributes : mapping of str to str or int
+    overwrite, compress : bool
+        Replace an existing file; use gzip with byte shuffling.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be created.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        columns: Mapping[str, Column],
+        counter: str,
+        arrays: Mapping[str, NDArray[np.generic]],
+        attributes: Mapping[str, str | int],
+        *,
+        overwrite: bool = False,
+        compress: bool = False,
+    ) -> None:
+        _check_target(path, overwrite)
+        self.path = path
+        self.records = 0
+        self._filters: dict[str, Any] = {"fletcher32": True}
+        if compress:
+            self._filters |= {"shuffle": True, "compression": "gzip", "compression_opts": 4}
+        self._columns: dict[str, Column] = {}
+        self._counter = counter
+        self._reserve = Reserve(path)
+        self._broken = False
+        with io.BytesIO() as memory:  # complete before anything is on the disk
+            with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
+                self._create(arrays, attributes)
+                self._add(columns)
+            _save(memory.getvalue(), path, overwrite)
+
+    def append(self, entries: Mapping[str, Any], columns: Mapping[str, Column]) -> None:
+        """Write one record.
+
+        Parameters
+        ----------
+        entries : mapping of str to value
+            What is left out gets the fill value (NaN, -1, empty).
+        columns : mapping of str to Column
+            Datasets of ``entries``; new ones are added.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or fails; the records before are intact.
+        """
+        if self._broken:
+            raise OutputError(f"{self.path}: nothing more can be written after a failure.")
+        new = {name: column for name, column in columns.items() if name not in self._columns}
+        if new or not self._file:
+            self._declare(new)
+        self._make_room(self._file.id.get_filesize())
+        with self._reporting():
+            for name, column in self._columns.items():
+                if name != self._counter and self.records >= column.first:
+                    self._extend(name, entries)
+            self._file.flush()
+            self._extend(self._counter, entries)
+            self._file.flush()
+        self.records += 1
+
+    def close(self) -> None:
+        """Finish the file; harmless when repeated."""
+        if not self._broken and self._file:
+            with self._reporting():
+                self._file.close()
+                self._reserve.release(read_superblock(self.path).end)
+
+    def _create(
+        self, arrays: Mapping[str, NDArray[np.generic]], attributes: Mapping[str, str | int]
+    ) -> None:
+        for name, value in attributes.items():
+            if isinstance(value, str):
+                # of fixed length, so that it lies under the checksum of the file's index
+                data = value.encode("utf-8")
+                dtype = h5py.string_dtype("utf-8", max(1, len(data)))
+                self._file.attrs.create(name, np.bytes_(data), dtype=dtype)
+            else:
+                self._file.attrs.create(name, value)
+        for name, array in arrays.items():
+            self._file.create_dataset(name, data=array, chunks=array.shape, **self._filters)
+
+    def _add(self, columns: Mapping[str, Column]) -> None:
+        for name, (dtype, shape, first) in columns.items():
+            dataset = self._file.create_dataset(
+                name,
+                (max(0, self.records - first), *shape),
+                dtype,
+                maxshape=(None, *shape),
+                chunks=(1, *shape),
+                fillvalue=_FILL[dtype.kind],
+                **self._filters,
+            )
+            if len(dataset):
+                dataset[...] = _FILL[dtype.kind]
+        self._columns |= columns
+
+    def _declare(self, new: Mapping[str, Column]) -> None:
+        """Open the file; add datasets, for which the swmr mode has to be left."""
+        self.close()
+        room = sum(4096 + 256 * self.records for _ in new)
+        self._make_room(self.path.stat().st_size, room)
+        with self._reporting():
+            self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
+            self._add(new)
+            self._file.swmr_mode = True
+
+    def _extend(self, name: str, entries: Mapping[str, Any]) -> None:
+        dtype, _, first = self._columns[name]
+        dataset = self._file[name]
+        dataset.resize(self.records - first + 1, axis=0)
+        dataset[self.records - first] = entries.get(name, _FILL[dtype.kind])
+
+    def _make_room(self, used: int, more: int = 0) -> None:
+        """Room for a record: its chunks, and the blocks by which the indices grow."""
+        size = sum(c.dtype.itemsize * math.prod(c.shape) for c in self._columns.values())
+        index = 256 * (16 + math.isqrt(self.records)) * len(self._columns)
+        try:
+            self._reserve.ensure(used, 2 * size + index + more + 65536)
+        except OSError as error:
+            self._broken = True
+            with contextlib.suppress(OSError, RuntimeError):
+                self._file.close()
+            raise self._failure(error) from error
+
+    @contextlib.contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Turn what HDF5 raises into `OutputError`, and give the file up."""
+        try:
+            yield
+        except (OSError, RuntimeError, ValueError) as error:
+            self._broken = True
+            if self._file:
+                abandon(self._file, self.path)
+            raise self._failure(error) from error
+
+    def _failure(self, error: Exception) -> OutputError:
+        return OutputError(
+            f"{self.path}: cannot be written ({_reason(error)}); its first {self.records} frames "
+            "are intact. Free some space or choose another place."
+        )
+
+
+def _check_target(path: Path, overwrite: bool) -> None:
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder; give the name of a file in it.")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {path.parent}; create it first.")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: exists already; allow overwriting or choose another name.")
+
+
+def _save(data: bytes, path: Path, overwrite: bool) -> None:
+    created = False
+    try:
+        with path.open("wb" if overwrite else "xb") as file:
+            created = True
+            file.write(data)
+    except OSError as error:
+        if created:
+            path.unlink(missing_ok=True)
+        raise OutputError(
+            f"{path}: cannot be written ({_reason(error)}); choose another place."
+        ) from error
+
+
+def _reason(error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number is not None:
+        return os.strerror(number)
+    text = str(error)
+    return text.splitlines()[0] if text else type(error).__name__

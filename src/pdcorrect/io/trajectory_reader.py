@@ -1,0 +1,238 @@
+"""Reading trajectory files, also damaged ones: every fault becomes one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from pdcorrect.errors import FileFormatError
+from pdcorrect.io.superblock import RepairedFile, Superblock, read_superblock
+from pdcorrect.state import Status, Trajectory
+
+FORMAT = "pdcorrect-trajectory"
+VERSION = 1
+RESERVED = frozenset({"format", "format_version", "scene_toml", "pdcorrect_version"})
+"""Attributes of the file that are not the run's."""
+
+_FRAMES = {"positions": 3, "velocities": 3, "times": 1}  # and their dimensions
+
+
+class _RefusalError(Exception):
+    """Why a file is not accepted; becomes `FileFormatError` with the file's name."""
+
+
+def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
+    """Read a trajectory file, finished or not.
+
+    A file that is still being written, or whose writer was killed, is read up
+    to its last complete frame.
+
+    Parameters
+    ----------
+    path : path
+        A file of `TrajectoryWriter`.
+    salvage : bool
+        Of a truncated or damaged file, return the frames before the damage.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is not a trajectory, or is damaged; says
+        which, and how many frames could be salvaged.
+    """
+    path = Path(path)
+    block = read_superblock(path)
+    try:
+        with _opened(path, block) as file:
+            return _read(file, block, salvage)
+    except _RefusalError as refusal:
+        raise FileFormatError(f"{path}: {refusal}.") from None
+    except Exception as error:  # HDF5 raises nearly every type on damaged bytes
+        lost = f"expected {block.end} bytes, got {block.size}" if block.truncated else ""
+        reason = f"truncated ({lost}), with" if lost else "damaged, with"
+        raise FileFormatError(
+            f"{path}: {reason} its index lost, so that no frame can be read ({_first_line(error)})."
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    text = str(error.args[0]) if error.args else ""
+    return text.splitlines()[0] if text else type(error).__name__
+
+
+def trajectory_fault(trajectory: Trajectory) -> str | None:
+    """What contradicts the description of `Trajectory`, or None."""
+    frames, nodes = len(trajectory.times), len(trajectory.points)
+    expected = {
+        "positions": (trajectory.positions, (frames, nodes, 3)),
+        "velocities": (trajectory.velocities, (frames, nodes, 3)),
+        "times": (trajectory.times, (frames,)),
+        "points": (trajectory.points, (nodes, 3)),
+    }
+    for name, (array, shape) in expected.items():
+        if array.shape != shape or array.dtype != np.float64:
+            return f"{name} has {array.dtype} of shape {array.shape}, expected float64 of {shape}"
+        if not np.isfinite(array).all():
+            return f"{name} has infinite or NaN entries"
+    if not frames or not nodes:
+        return "it has no frames" if nodes else "it has no nodes"
+    if (np.diff(trajectory.times) <= 0).any():
+        return "times do not increase"
+    return _cells_fault(trajectory.cells, nodes) or _stats_fault(trajectory, frames - 1)
+
+
+def _cells_fault(cells: Any, nodes: int) -> str | None:
+    if cells.ndim != 2 or cells.shape[1] not in (8, 27) or cells.dtype.kind not in "iu":
+        return f"cells has {cells.dtype} of shape {cells.shape}, expected integers of (C, 8 or 27)"
+    if not len(cells):
+        return "it has no cells"
+    if cells.min() < 0 or cells.max() >= nodes:
+        return f"cells refer to nodes {cells.min()} to {cells.max()}, expected 0 to {nodes - 1}"
+    return None
+
+
+def _stats_fault(trajectory: Trajectory, steps: int) -> str | None:
+    for name, array in trajectory.stats.items():
+        if array.shape != (steps,):
+            return f"stats {name!r} has shape {array.shape}, expected ({steps},)"
+        if (array.dtype.kind == "U") != (name == "status"):
+            return f"stats {name!r} has {array.dtype}, expected numbers, and status as text"
+    unknown = set(trajectory.stats.get("status", np.array([])).tolist()) - set(Status.__members__)
+    return f"status {sorted(unknown)[0]!r} is unknown" if unknown else None
+
+
+@contextlib.contextmanager
+def _opened(path: Path, block: Superblock) -> Iterator[Any]:
+    if not (block.truncated or block.in_writing):
+        with h5py.File(path, "r", locking=False) as file:
+            yield file
+        return
+    with RepairedFile(path, block) as view, h5py.File(view, "r") as file:
+        yield file
+
+
+def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
+    _check_format(file)
+    datasets = {name: _dataset(file, name, "f", ndim) for name, ndim in _FRAMES.items()}
+    points = _dataset(file, "mesh/points", "f", 2)[...]
+    cells = _dataset(file, "mesh/cells", "iu", 2)[...]
+    names = list(_group(file, "stats"))
+    stats = {n: _dataset(file, f"stats/{n}", "S" if n == "status" else "fi", 1) for n in names}
+    frames = datasets["times"].shape[0]
+    _check_lengths(datasets, stats, frames)
+    if salvage or block.truncated or block.in_writing:
+        intact = _intact_frames([*datasets.values()], [*stats.values()], frames, block.size)
+        if not salvage and block.truncated and (intact < frames or not block.in_writing):
+            raise _RefusalError(_truncation(block, intact, frames))
+        frames = intact
+    try:
+        frames = _written(datasets["times"][:frames])
+        arrays = {name: dataset[:frames] for name, dataset in datasets.items()}
+        values = {name: dataset[: max(0, frames - 1)] for name, dataset in stats.items()}
+    except OSError as error:
+        raise _RefusalError(
+            f"damaged ({error}); salvage reads the frames before the damage"
+        ) from None
+    if not frames:
+        raise _RefusalError("no complete frame is left")
+    trajectory = Trajectory(
+        positions=arrays["positions"],
+        velocities=arrays["velocities"],
+        times=arrays["times"],
+        stats={name: _text(v) if v.dtype.kind == "S" else v for name, v in values.items()},
+        points=points,
+        cells=cells.astype(np.int64, copy=False),
+        scene_toml=_attribute(file, "scene_toml"),
+        attributes={name: _attribute(file, name) for name in file.attrs if name not in RESERVED},
+    )
+    fault = trajectory_fault(trajectory)
+    if fault:
+        raise _RefusalError(fault)
+    return trajectory
+
+
+def _check_format(file: Any) -> None:
+    if "format" not in file.attrs or _attribute(file, "format") != FORMAT:
+        raise _RefusalError(f"an HDF5 file, but not a trajectory: its format is not {FORMAT!r}")
+    version = file.attrs.get("format_version")
+    if version != VERSION:
+        raise _RefusalError(
+            f"format version {version}, expected {VERSION}: use the matching pdcorrect"
+        )
+
+
+def _attribute(file: Any, name: str) -> str:
+    value = file.attrs[name]
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)
+
+
+def _group(file: Any, name: str) -> Any:
+    if name not in file or not isinstance(file[name], h5py.Group):
+        raise _RefusalError(f"the group {name!r} is missing")
+    return file[name]
+
+
+def _dataset(file: Any, name: str, kinds: str, ndim: int) -> Any:
+    if name not in file or not isinstance(file[name], h5py.Dataset):
+        raise _RefusalError(f"the dataset {name!r} is missing")
+    dataset = file[name]
+    if dataset.dtype.kind not in kinds or dataset.ndim != ndim:
+        raise _RefusalError(
+            f"{name!r} has {dataset.dtype} of shape {dataset.shape}: expected kind {kinds!r} "
+            f"with {ndim} dimensions"
+        )
+    return dataset
+
+
+def _written(times: Any) -> int:
+    """Number of frames that were complete: a time that was not written yet is NaN."""
+    written = np.flatnonzero(~np.isnan(times))
+    return int(written[-1]) + 1 if len(written) else 0
+
+
+def _check_lengths(datasets: dict[str, Any], stats: dict[str, Any], frames: int) -> None:
+    """Nothing may be shorter than ``times`` says; an interrupted writer leaves more."""
+    expected = {name: (dataset, frames) for name, dataset in datasets.items()}
+    expected |= {f"stats/{name}": (dataset, max(0, frames - 1)) for name, dataset in stats.items()}
+    for name, (dataset, length) in expected.items():
+        if dataset.shape[0] < length:
+            raise _RefusalError(f"{name!r} has {dataset.shape[0]} entries, expected {length}")
+
+
+def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int, size: int) -> int:
+    """Number of leading frames whose every chunk is complete and has the right checksum."""
+    for k in range(frames):
+        parts = [(dataset, k) for dataset in frame_data]
+        parts += [(dataset, k - 1) for dataset in step_data if k]
+        if not all(_intact(dataset, index, size) for dataset, index in parts):
+            return k
+    return frames
+
+
+def _intact(dataset: Any, index: int, size: int) -> bool:
+    try:
+        if dataset.chunks:
+            corner = (index - index % dataset.chunks[0],) + (0,) * (dataset.ndim - 1)
+            chunk = dataset.id.get_chunk_info_by_coord(corner)
+            if chunk.byte_offset is None or chunk.byte_offset + chunk.size > size:
+                return False
+        dataset[index]
+    except (OSError, RuntimeError, ValueError):
+        return False
+    return True
+
+
+def _truncation(block: Superblock, intact: int, frames: int) -> str:
+    kept = f"{intact} of its {frames} frames are intact; salvage reads them"
+    return f"truncated: expected {block.end} bytes, got {block.size}; " + (
+        kept if intact else f"none of its {frames} frames is intact"
+    )
+
+
+def _text(values: Any) -> Any:
+    return np.char.decode(values, "ascii")

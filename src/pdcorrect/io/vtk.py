@@ -1,0 +1,87 @@
+"""A trajectory for ParaView: one VTU a frame and a PVD with the times."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError, OutputError
+from pdcorrect.fem.mesh_files import write_vtu
+from pdcorrect.state import Trajectory
+
+Array = NDArray[np.float64]
+Data = Callable[[int], Mapping[str, Array]]
+"""Extra fields of a frame, by name."""
+
+
+def write_vtu_series(
+    trajectory: Trajectory,
+    folder: str | Path,
+    *,
+    every: int = 1,
+    name: str = "run",
+    point_data: Data | None = None,
+    cell_data: Data | None = None,
+) -> Path:
+    """Write ``name_0000.vtu`` … and ``name.pvd``; open the latter in ParaView.
+
+    Points are the current positions; ``displacement`` (m) and ``velocity``
+    (m/s) are point data.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    folder : path
+        Created if missing.
+    every : int
+        Write each such frame; frame 0 always.
+    point_data, cell_data : callable, optional
+        Frame -> fields (N, ...) or (C, ...).
+
+    Returns
+    -------
+    Path
+        Of the PVD file.
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be written.
+    """
+    if every < 1:
+        raise InputError(f"every = {every}: expected 1 or more.")
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from error
+    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ET.SubElement(root, "Collection")
+    for frame in range(0, len(trajectory.times), every):
+        file = f"{name}_{frame:04d}.vtu"
+        write_vtu(
+            folder / file,
+            trajectory.positions[frame],
+            trajectory.cells,
+            {
+                "displacement": trajectory.positions[frame] - trajectory.points,
+                "velocity": trajectory.velocities[frame],
+                **(point_data(frame) if point_data else {}),
+            },
+            cell_data(frame) if cell_data else None,
+        )
+        time = repr(float(trajectory.times[frame]))
+        ET.SubElement(collection, "DataSet", timestep=time, part="0", file=file)
+    ET.indent(root)
+    path = folder / f"{name}.pvd"
+    part = path.with_name(path.name + ".part")
+    try:
+        ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
+    return path
