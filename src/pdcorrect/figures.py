@@ -281,7 +281,10 @@ class _Stage:
             title.prop.justification_vertical = "top"
             self._clocks.append(
                 plotter.add_text(
-                    " ", position=(0.03, 0.03), viewport=True, font_size=self._font(10),
+                    " ",
+                    position=(0.03, 0.03),
+                    viewport=True,
+                    font_size=self._font(10),
                     color="#404040",
                 )  # fmt: skip
             )
