@@ -344,7 +344,7 @@ def test_moving_clamps_follow_their_tables():
         ({"clamps": [{"region": {"plane": "x", "at": 0.5}}]}, r"clamps\[0\].region .* no node"),
         ({"clamps": [{"region": {"nodes": [999]}}]}, "node 999"),
         (
-            {"loads": [{"kind": "pressure", "pressure": 1.0, "region": {"plane": "y", "at": 0.01}}]},
+            {"loads": [{"kind": "pressure", "pressure": 1, "region": {"plane": "y", "at": 0.01}}]},
             r"loads\[0\].region .* no boundary face",
         ),
         (

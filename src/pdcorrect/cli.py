@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
+from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
@@ -23,6 +24,22 @@ app = typer.Typer(
 
 FAILED, BAD_INPUT = 1, 2
 
+
+class SolverName(StrEnum):
+    """Choices of --solver."""
+
+    pd = "pd"
+    newton = "newton"
+
+
+class Colour(StrEnum):
+    """Choices of --colour."""
+
+    displacement = "displacement"
+    error = "error"
+    none = "none"
+
+
 SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=False)]
 Frames = Annotated[
     Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)
@@ -34,7 +51,7 @@ def simulate(
     scene: SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
     refine: Annotated[int, typer.Option(help="Cut each coarse cell into K^3.", min=1)] = 1,
-    solver: Annotated[str, typer.Option(help="pd or newton.")] = "pd",
+    solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
     frames: Frames = None,
     vtu: Annotated[
         Optional[Path], typer.Option(help="Also write VTU files and a PVD into this folder.")
@@ -124,7 +141,7 @@ def render(
     runs: Annotated[list[Path], typer.Argument(help="Trajectory files.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture: .png, .gif or .mp4.")],
     label: Annotated[Optional[list[str]], typer.Option(help="Title of each run, in order.")] = None,
-    colour: Annotated[str, typer.Option(help="displacement, error or none.")] = "displacement",
+    colour: Annotated[Colour, typer.Option(help="What to colour by.")] = Colour.displacement,
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a .gif or .mp4.")] = 25.0,
 ) -> None:
@@ -132,16 +149,15 @@ def render(
     from pdcorrect import figures
     from pdcorrect.io.trajectory import load_trajectory
 
-    if colour not in ("displacement", "error", "none"):
-        raise InputError(f"--colour {colour}: expected displacement, error or none.")
     loaded = [load_trajectory(path) for path in runs]
+    by_value: figures.Colour = "error" if colour is Colour.error else "displacement"
     still = output.suffix.lower() == ".png"
     figures.render(
         loaded,
         output,
         labels=label or [path.stem for path in runs],
-        colour=None if colour == "none" else colour,
-        reference=loaded[-1] if colour == "error" else None,
+        colour=None if colour is Colour.none else by_value,
+        reference=loaded[-1] if colour is Colour.error else None,
         frame=(-1 if frame is None else frame) if still else None,
         fps=fps,
     )
@@ -165,12 +181,10 @@ def doctor() -> None:
         raise typer.Exit(FAILED)
 
 
-def _make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
+def _make_stepper(scene: Scene, solver: SolverName, refine: int) -> Stepper:
     from pdcorrect.evaluate import make_stepper
 
-    if solver not in ("pd", "newton"):
-        raise InputError(f"--solver {solver}: expected pd or newton.")
-    return make_stepper(scene, solver, refine)
+    return make_stepper(scene, solver.value, refine)
 
 
 def _summary(run: Trajectory, stepper: Stepper) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, OutputError, require_extra
-from pdcorrect.fem.mesh import VTK_EDGES, coincident_nodes
+from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
@@ -243,7 +243,7 @@ class _Stage:
         return grid
 
     def _aim(self) -> None:
-        """The same parallel camera for all panels, fitted to every frame shown and the rest shape."""
+        """One parallel camera for all panels, fitted to the rest shape and every frame shown."""
         points = [p.run.points for p in self._panels]
         points += [p.run.positions[list(self._frames)].reshape(-1, 3) for p in self._panels]
         cloud = np.concatenate(points)

@@ -17,8 +17,7 @@ from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import largest_displacement
 
 HEADINGS = (
-    "solver", "nodes", "RMS error [mm]", "largest error [mm]", "corrected [%]", "time/frame [ms]",
-    "speed-up", "iterations/frame",
+    "solver", "nodes", "RMS [mm]", "worst [mm]", "corrected", "ms/frame", "speed-up", "iterations",
 )  # fmt: skip
 
 
@@ -32,9 +31,9 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
             (
                 row.label,
                 str(row.nodes),
-                "reference" if is_reference else f"{1e3 * row.rms_error:.3g}",
-                "reference" if is_reference else f"{1e3 * row.largest_error:.3g}",
-                "" if np.isnan(row.omega) else f"{row.omega:.1f}",
+                "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
+                "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
+                "" if np.isnan(row.omega) else f"{row.omega:.1f} %",
                 f"{1e3 * row.seconds_a_frame:.3g}",
                 f"{slowest / row.seconds_a_frame:.3g}x",
                 f"{row.iterations_a_frame:.1f}",
@@ -51,8 +50,9 @@ def notes(comparison: Comparison) -> list[str]:
     frames = len(comparison.runs[comparison.reference])
     out = [
         f"{frames} frames of {scene.time.step:g} s; the reference moves by up to "
-        f"{1e3 * moved:.3g} mm. Errors are distances of the coarse nodes from the reference "
-        "with the same time step, over all frames.",
+        f"{1e3 * moved:.3g} mm. Errors (RMS, worst) are distances of the coarse nodes from the "
+        f"reference, {comparison.reference}, with the same time step, over all frames. Times and "
+        "iterations are for one frame.",
         f"Material: E = {scene.material.young:g} Pa and Poisson's ratio "
         f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
         f"E = {effective.young:.4g} Pa and {effective.poisson:.4g} "

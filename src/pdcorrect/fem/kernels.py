@@ -7,6 +7,7 @@ number of threads.  Work arrays are made once a chunk.
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,10 @@ from numba import njit, prange
 
 from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_svd_lanes
 from pdcorrect.fem.energies import density_and_stress_lanes, tangent_lanes
+
+# GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
+# takes 5 to 15 times as long as soon as another process wants a core.
+os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
 _REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}

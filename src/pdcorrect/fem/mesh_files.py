@@ -48,8 +48,8 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     solids = {kind for kind in found if kind.startswith(_SOLID)}
     if solids != {"hexahedron"}:
         raise MeshError(
-            f"{path} holds cells of type {', '.join(found) or 'none'}: expected 'hexahedron' (eight "
-            "nodes) as the only solid cells."
+            f"{path} holds cells of type {', '.join(found) or 'none'}: expected 'hexahedron' "
+            "(eight nodes) as the only solid cells."
         )
     cells = np.concatenate([b.data for b in mesh.cells if b.type == "hexahedron"]).astype(np.int64)
     if mesh.points.shape[1] != 3 or cells.size == 0 or cells.max() >= len(mesh.points):

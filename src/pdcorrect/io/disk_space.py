@@ -37,16 +37,15 @@ class Reserve:
         allocate = getattr(os, "posix_fallocate", None)  # not on every system
         if used + need <= self._end or allocate is None:
             return
-        end = used + 2 * need
         descriptor = os.open(self._path, os.O_RDWR)
         try:
-            allocate(descriptor, used, end - used)
+            allocate(descriptor, used, need)
         except OSError as error:
             if error.errno not in _UNSUPPORTED:
                 raise
         finally:
             os.close(descriptor)
-        self._end = end
+        self._end = used + need
 
     def release(self, used: int) -> None:
         """Cut off what was not needed of the closed file."""

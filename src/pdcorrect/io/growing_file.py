@@ -12,7 +12,8 @@ import contextlib
 import io
 import math
 import os
-from collections.abc import Iterator, Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +37,14 @@ class Column(NamedTuple):
     first: int = 0
 
 
+class Content(NamedTuple):
+    """What does not grow: attributes of the file, datasets, and groups that may stay empty."""
+
+    attributes: Mapping[str, str | int]
+    arrays: Mapping[str, NDArray[np.generic]]
+    groups: Sequence[str] = ()
+
+
 class GrowingFile:
     """Attributes and fixed arrays, then records.
 
@@ -47,9 +56,10 @@ class GrowingFile:
         Growing datasets; more may be added with a record.
     counter : str
         The one of them that is written last.
-    arrays : mapping of str to array
-        Datasets that do not grow.
-    attributes : mapping of str to str or int
+    first : mapping of str to value
+        Record 0.
+    content : Content
+        What does not grow.
     overwrite, compress : bool
         Replace an existing file; use gzip with byte shuffling.
 
@@ -64,8 +74,8 @@ class GrowingFile:
         path: Path,
         columns: Mapping[str, Column],
         counter: str,
-        arrays: Mapping[str, NDArray[np.generic]],
-        attributes: Mapping[str, str | int],
+        first: Mapping[str, Any],
+        content: Content,
         *,
         overwrite: bool = False,
         compress: bool = False,
@@ -82,8 +92,9 @@ class GrowingFile:
         self._broken = False
         with io.BytesIO() as memory:  # complete before anything is on the disk
             with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
-                self._create(arrays, attributes)
+                self._create(content)
                 self._add(columns)
+                self._write(first)
             _save(memory.getvalue(), path, overwrite)
 
     def append(self, entries: Mapping[str, Any], columns: Mapping[str, Column]) -> None:
@@ -106,15 +117,9 @@ class GrowingFile:
         new = {name: column for name, column in columns.items() if name not in self._columns}
         if new or not self._file:
             self._declare(new)
-        self._make_room(self._file.id.get_filesize())
+        self._make_room()
         with self._reporting():
-            for name, column in self._columns.items():
-                if name != self._counter and self.records >= column.first:
-                    self._extend(name, entries)
-            self._file.flush()
-            self._extend(self._counter, entries)
-            self._file.flush()
-        self.records += 1
+            self._write(entries)
 
     def close(self) -> None:
         """Finish the file; harmless when repeated."""
@@ -123,10 +128,8 @@ class GrowingFile:
                 self._file.close()
                 self._reserve.release(read_superblock(self.path).end)
 
-    def _create(
-        self, arrays: Mapping[str, NDArray[np.generic]], attributes: Mapping[str, str | int]
-    ) -> None:
-        for name, value in attributes.items():
+    def _create(self, content: Content) -> None:
+        for name, value in content.attributes.items():
             if isinstance(value, str):
                 # of fixed length, so that it lies under the checksum of the file's index
                 data = value.encode("utf-8")
@@ -134,8 +137,10 @@ class GrowingFile:
                 self._file.attrs.create(name, np.bytes_(data), dtype=dtype)
             else:
                 self._file.attrs.create(name, value)
-        for name, array in arrays.items():
+        for name, array in content.arrays.items():
             self._file.create_dataset(name, data=array, chunks=array.shape, **self._filters)
+        for name in content.groups:
+            self._file.require_group(name)
 
     def _add(self, columns: Mapping[str, Column]) -> None:
         for name, (dtype, shape, first) in columns.items():
@@ -153,14 +158,30 @@ class GrowingFile:
         self._columns |= columns
 
     def _declare(self, new: Mapping[str, Column]) -> None:
-        """Open the file; add datasets, for which the swmr mode has to be left."""
+        """Open the file, with more datasets; they are added to a copy that then replaces it."""
         self.close()
-        room = sum(4096 + 256 * self.records for _ in new)
-        self._make_room(self.path.stat().st_size, room)
+        part = self.path.with_name(self.path.name + ".part")
         with self._reporting():
-            self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
-            self._add(new)
-            self._file.swmr_mode = True
+            try:
+                if new:
+                    shutil.copyfile(self.path, part)
+                    Reserve(part).ensure(part.stat().st_size, self._room(len(new)))
+                    with h5py.File(part, "r+", libver=_LIBRARY) as self._file:
+                        self._add(new)
+                    part.replace(self.path)
+                self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
+                self._file.swmr_mode = True
+            finally:
+                part.unlink(missing_ok=True)
+
+    def _write(self, entries: Mapping[str, Any]) -> None:
+        for name, column in self._columns.items():
+            if name != self._counter and self.records >= column.first:
+                self._extend(name, entries)
+        self._file.flush()
+        self._extend(self._counter, entries)
+        self._file.flush()
+        self.records += 1
 
     def _extend(self, name: str, entries: Mapping[str, Any]) -> None:
         dtype, _, first = self._columns[name]
@@ -168,12 +189,15 @@ class GrowingFile:
         dataset.resize(self.records - first + 1, axis=0)
         dataset[self.records - first] = entries.get(name, _FILL[dtype.kind])
 
-    def _make_room(self, used: int, more: int = 0) -> None:
-        """Room for a record: its chunks, and the blocks by which the indices grow."""
+    def _room(self, new: int = 0) -> int:
+        """Bytes for a record and for ``new`` datasets, with the blocks of their indices."""
         size = sum(c.dtype.itemsize * math.prod(c.shape) for c in self._columns.values())
-        index = 256 * (16 + math.isqrt(self.records)) * len(self._columns)
+        index = 256 * (16 + math.isqrt(self.records)) * (len(self._columns) + new)
+        return 2 * size + index + new * (2048 + 64 * self.records) + 32768
+
+    def _make_room(self) -> None:
         try:
-            self._reserve.ensure(used, 2 * size + index + more + 65536)
+            self._reserve.ensure(self._file.id.get_filesize(), self._room())
         except OSError as error:
             self._broken = True
             with contextlib.suppress(OSError, RuntimeError):

@@ -83,10 +83,11 @@ class RepairedFile(io.RawIOBase):
         super().__init__()
         self._file = path.open("rb")
         head = bytearray(self._file.read(_SIZE))
+        self._size = max(block.size, block.end)
         head[11] = 0
+        head[_END : _END + 8] = struct.pack("<Q", self._size)
         head[_CHECKSUM:] = struct.pack("<I", _lookup3(bytes(head[:_CHECKSUM])))
         self._head = bytes(head)
-        self._size = max(block.size, block.end)
         self._at = 0
 
     def readable(self) -> bool:

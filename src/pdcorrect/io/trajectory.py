@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pdcorrect import __version__
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.io.growing_file import Column, GrowingFile
+from pdcorrect.io.growing_file import Column, Content, GrowingFile
 from pdcorrect.io.trajectory_reader import (
     FORMAT,
     RESERVED,
@@ -96,7 +96,6 @@ class TrajectoryWriter:
         )
         _refuse(first)
         self._shape = first.points.shape
-        self._time = -np.inf
         frames = {
             "positions": Column(_FLOAT, self._shape),
             "velocities": Column(_FLOAT, self._shape),
@@ -106,13 +105,16 @@ class TrajectoryWriter:
             Path(path),
             frames,
             "times",
-            {"mesh/points": first.points, "mesh/cells": first.cells},
-            _file_attributes(first),
+            _entries(initial),
+            Content(
+                _file_attributes(first),
+                {"mesh/points": first.points, "mesh/cells": first.cells},
+                groups=["stats"],
+            ),
             overwrite=overwrite,
             compress=compress,
         )
-        self.append_values(initial, {})
-        self._file.close()  # complete, should no step follow
+        self._time = initial.time
 
     @property
     def path(self) -> Path:
@@ -155,10 +157,7 @@ class TrajectoryWriter:
         columns = {f"stats/{name}": _column(name, value) for name, value in values.items()}
         self._check(state)
         entries = {f"stats/{name}": value for name, value in values.items()}
-        entries["positions"] = state.positions
-        entries["velocities"] = state.velocities
-        entries["times"] = state.time
-        self._file.append(entries, columns)
+        self._file.append(entries | _entries(state), columns)
         self._time = state.time
 
     def close(self) -> None:
@@ -209,6 +208,10 @@ def _refuse(trajectory: Trajectory) -> None:
     taken = sorted(set(trajectory.attributes) & RESERVED)
     if taken:
         raise InputError(f"attribute {taken[0]!r} is the file's own: choose another name.")
+
+
+def _entries(state: State) -> dict[str, Any]:
+    return {"positions": state.positions, "velocities": state.velocities, "times": state.time}
 
 
 def _column(name: str, value: Any) -> Column:

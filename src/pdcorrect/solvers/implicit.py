@@ -115,7 +115,7 @@ class ImplicitStepper:
         return self._report(after, minimum, effort, work)
 
     def prepare(self) -> Self:
-        """Factorise and load the compiled kernels now, so that the first step is like the others."""
+        """Factorise and load the kernels now, so that the first step is like the others."""
         with _quiet_blas():
             self._global_solver(self.time_step)
             rest = self.problem.positions
