@@ -286,7 +286,7 @@ class _Stage:
                     viewport=True,
                     font_size=self._font(10),
                     color="#404040",
-                )  # fmt: skip
+                )
             )
         self._add_ruler()
         plotter.subplot(1, 0)
@@ -469,7 +469,11 @@ def plot_error_against_time(points: Mapping[str, tuple[float, float]], output: s
     axis.set_xlabel("time a frame [ms]")
     axis.set_ylabel("RMS error [mm]")
     axis.margins(0.25)
-    axis.grid(which="both", alpha=0.2)
+    ticker = require_extra("matplotlib.ticker", "view")
+    for direction in (axis.xaxis, axis.yaxis):
+        direction.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        direction.set_major_formatter("{x:g}")
+        direction.set_minor_formatter(ticker.NullFormatter())
     axis.legend(frameon=False, fontsize=9)
     return _save(figure, output)
 

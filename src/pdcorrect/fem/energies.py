@@ -142,13 +142,13 @@ def signed_svd(F: Array) -> tuple[Array, Array, Array]:
 
 
 def nearest_rotation(F: Array) -> Array:
-    """The rotation R (..., 3, 3) with det R = +1 that minimises |F - R|."""
+    """The rotation R (..., 3, 3) with det R = +1 nearest to F in the Frobenius norm."""
     U, _, V = signed_svd(F)
     return U @ np.swapaxes(V, -1, -2)
 
 
 def nearest_unit_determinant(F: Array) -> Array:
-    """The matrix V (..., 3, 3) with det V = 1 that minimises |F - V|."""
+    """The matrix V (..., 3, 3) with det V = 1 nearest to F in the Frobenius norm."""
     flat, shape = _to_lanes(F)
     U, _, V, _, _, v, _ = _decompose(flat)
     scaled = _from_lanes(U, shape) * v.T.reshape(*shape, 1, 3)

@@ -62,7 +62,7 @@ class Problem:
     ----------
     scene : Scene
     refine : int
-        Each coarse cell is cut into ``refine``^3.
+        Each coarse cell is cut into ``refine ** 3``.
     element, mass_rule : str
     space : Space
         The scalar finite element space.

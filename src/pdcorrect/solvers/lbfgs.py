@@ -31,6 +31,11 @@ _ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
 _BACKTRACKS = 30
+_FIRST_CHECK = 0.15
+"""Length of the loop's own step, of the tolerance, at which the estimate is first made.
+
+The estimate is usually 3 to 10 times that length.
+"""
 
 
 class Objective(Protocol):
@@ -171,16 +176,17 @@ def minimise(
 ) -> Minimum:
     """Minimise ``objective`` from ``start`` (N, 3) with G^-1 given by ``solve``.
 
-    The loop watches the length of its own step.  When that is below the
-    tolerance, the remaining displacement is estimated by conjugate gradients
-    on the true Hessian; if the estimate is too large the loop goes on, having
-    learnt how far its own measure was off.
+    The loop watches the length of its own step.  When that is small, the
+    remaining displacement is estimated by conjugate gradients on the true
+    Hessian; if the estimate is too large the loop goes on, having learnt how
+    far its own measure was off.
     """
     p = start
     value, gradient = objective.value_and_gradient(p)
     x = solve(gradient)
     history = History(options.history, p.size)
-    threshold, evaluations, estimate = options.tolerance, 1, math.inf
+    threshold = _FIRST_CHECK * options.tolerance
+    evaluations, estimate = 1, math.inf
     status = Status.ITERATION_LIMIT
     for iteration in range(options.max_iterations + 1):
         if not math.isfinite(value):
