@@ -30,7 +30,7 @@ ORDER = [
     "solvers",
     "solvers.step",
     "solvers.lbfgs",
-    "solvers.newton_cg",
+    "solvers.newton_loop",
     "solvers.implicit",
     "solvers.projective",
     "solvers.newton",

@@ -8,7 +8,7 @@ from pdcorrect.errors import InputError
 
 
 def shifted(reference, distance):
-    return reference + [0.0, distance, 0.0]
+    return reference + np.array([0.0, distance, 0.0])
 
 
 @pytest.fixture

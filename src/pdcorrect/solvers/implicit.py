@@ -16,7 +16,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
-from pdcorrect.solvers.newton_cg import newton_cg
+from pdcorrect.solvers.newton_loop import newton_cg
 from pdcorrect.solvers.step import GlobalSolver, StepObjective, check_input
 from pdcorrect.state import State, Status, StepResult
 
@@ -129,8 +129,11 @@ class ImplicitStepper:
             "solver": self.name,
             "tolerance": f"{self.tolerance:g}",
             "time_step": f"{self.time_step:g}",
-            "factorisation": self._global_solver(self.time_step).backend,
+            "factorisation": self._factorisation(),
         }
+
+    def _factorisation(self) -> str:
+        return self._global_solver(self.time_step).backend
 
     # --- one attempt ----------------------------------------------------------------
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Self
 
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, factorise
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper
-from pdcorrect.solvers.lbfgs import Minimum, largest_displacement, line_search
+from pdcorrect.solvers.lbfgs import Minimum
+from pdcorrect.solvers.newton_loop import newton_loop
 from pdcorrect.solvers.step import StepObjective
-from pdcorrect.state import Status
 
 Array = NDArray[np.float64]
 
@@ -65,38 +64,13 @@ class Newton(ImplicitStepper):
         self._direction(objective, state.positions, gradient)
         return self
 
-    def describe(self) -> dict[str, str]:
-        """Method, tolerance, step and factorisation in use."""
-        return {
-            "solver": self.name,
-            "tolerance": f"{self.tolerance:g}",
-            "time_step": f"{self.time_step:g}",
-            "factorisation": self._used_backend,
-        }
+    def _factorisation(self) -> str:
+        return self._used_backend
 
     def _minimise(self, objective: StepObjective) -> Minimum:
-        p = objective.start
-        value, gradient = objective.value_and_gradient(p)
-        evaluations, estimate, status = 1, math.inf, Status.ITERATION_LIMIT
-        for iteration in range(self._options.max_iterations + 1):
-            if not math.isfinite(value):
-                status = Status.NOT_FINITE
-                break
-            direction, exact = self._direction(objective, p, gradient)
-            length = largest_displacement(direction)
-            estimate = length if exact else math.inf
-            if estimate <= self._options.tolerance:
-                status = Status.CONVERGED
-                break
-            if iteration == self._options.max_iterations:
-                break
-            found = line_search(objective, p, value, gradient, direction)
-            evaluations += found.evaluations
-            if found.step == 0.0:
-                status = Status.LINE_SEARCH
-                break
-            p, value, gradient = found.positions, found.value, found.gradient
-        return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
+        return newton_loop(
+            objective, objective.start, lambda p, g: self._direction(objective, p, g), self._options
+        )
 
     def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:
         """Minus the Newton step, and whether the exact tangent was used."""

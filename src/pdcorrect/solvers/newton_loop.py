@@ -1,12 +1,13 @@
-"""Truncated Newton with G-preconditioned conjugate gradients: the first fallback.
+"""Newton's loop, and truncated Newton with G-preconditioned conjugate gradients.
 
-It sees the true curvature, so it gets through places where L-BFGS stalls, and
-it needs no factor besides G's.
+The latter is the first fallback: it sees the true curvature, so it gets through
+places where L-BFGS stalls, and it needs no factor besides G's.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,17 @@ Array = NDArray[np.float64]
 _INNER_STEPS = 400
 
 
-def newton_cg(
-    objective: Objective, start: Array, solve: Solve, options: MinimiserOptions
-) -> Minimum:
-    """Minimise ``objective`` from ``start`` (N, 3); ``options.history`` is not used.
+Direction = Callable[[Array, Array], tuple[Array, bool]]
+"""(p, gradient) -> (minus the Newton step, whether the exact, positive Hessian gave it)."""
 
-    Where conjugate gradients meet negative curvature, the direction found so
-    far is used, or minus the preconditioned gradient at the first step.
+
+def newton_loop(
+    objective: Objective, start: Array, direction: Direction, options: MinimiserOptions
+) -> Minimum:
+    """Minimise ``objective`` from ``start`` (N, 3) along the steps of ``direction``.
+
+    Converged when a Newton step of the exact Hessian is shorter than the
+    tolerance; ``options.history`` is not used.
     """
     p = start
     value, gradient = objective.value_and_gradient(p)
@@ -41,21 +46,33 @@ def newton_cg(
         if not math.isfinite(value):
             status = Status.NOT_FINITE
             break
-        direction, convex = _direction(objective, p, gradient, solve)
-        length = largest_displacement(direction)
-        estimate = length if convex else math.inf
+        step, exact = direction(p, gradient)
+        estimate = largest_displacement(step) if exact else math.inf
         if estimate <= options.tolerance:
             status = Status.CONVERGED
             break
         if iteration == options.max_iterations:
             break
-        found = line_search(objective, p, value, gradient, direction)
+        found = line_search(objective, p, value, gradient, step)
         evaluations += found.evaluations
         if found.step == 0.0:
             status = Status.LINE_SEARCH
             break
         p, value, gradient = found.positions, found.value, found.gradient
     return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
+
+
+def newton_cg(
+    objective: Objective, start: Array, solve: Solve, options: MinimiserOptions
+) -> Minimum:
+    """`newton_loop` with conjugate gradients preconditioned by ``solve``.
+
+    Where these meet negative curvature, the direction found so far is used, or
+    minus the preconditioned gradient at the first step.
+    """
+    return newton_loop(
+        objective, start, lambda p, gradient: _direction(objective, p, gradient, solve), options
+    )
 
 
 def _direction(objective: Objective, p: Array, gradient: Array, solve: Solve) -> tuple[Array, bool]:
