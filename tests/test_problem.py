@@ -7,8 +7,9 @@ import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.loads import cofactor, torsion_field
+from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.operators import Space, lumped
-from pdcorrect.fem.problem import Materials, _build
+from pdcorrect.fem.problem import _build
 from test_mesh import distorted_mesh
 
 
@@ -19,7 +20,7 @@ def distorted_problem(poisson=0.4):
     space = Space(mesh)
     count = len(mesh.cells)
     materials = Materials.from_moduli(
-        scene, np.linspace(2e5, 4e5, count), np.full(count, poisson), np.full(count, 1e3)
+        scene.material, np.linspace(2e5, 4e5, count), np.full(count, poisson), np.full(count, 1e3)
     )
     return _build(scene, 1, "hex8", "lumped", mesh, space, space.quadrature(), materials, 0.05)
 

@@ -15,6 +15,7 @@ from skfem import Basis, BilinearForm, ElementHex1, FacetBasis, LinearForm, Mesh
 from skfem.element import Element
 from skfem.helpers import dot, grad
 
+from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import VTK_CORNERS, HexMesh
 
 Array = NDArray[np.float64]
@@ -180,6 +181,28 @@ class Space:
 def lumped(mass: sp.csr_matrix) -> Array:
     """Row sums of a mass matrix, (N,), kg."""
     return np.asarray(mass.sum(axis=1)).ravel()
+
+
+def mass_matrix(rule: str, space: Space, density: Array) -> sp.csr_matrix:
+    """Mass (N, N), kg, by one of the rules of `scene.Solver`, for densities (C,), kg/m3.
+
+    "lumped": row sums on the diagonal; "consistent"; "averaged": their mean;
+    "per-node": density times cell volume on every node (the mean over the cells
+    that touch it), as DiffPD.
+    """
+    if rule == "per-node":
+        flat, width = space.cells.ravel(), space.cells.shape[1]
+        heaped = np.bincount(flat, np.repeat(density * space.volumes(), width))
+        return sp.diags_array(heaped / np.bincount(flat)).tocsr()
+    consistent = space.mass(density)
+    if rule == "consistent":
+        return consistent
+    diagonal = sp.diags_array(lumped(consistent)).tocsr()
+    if rule == "averaged":
+        return sp.csr_matrix(0.5 * (consistent + diagonal))
+    if rule == "lumped":
+        return diagonal
+    raise SceneError(f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node.")
 
 
 def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:

@@ -15,8 +15,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.assembly import Linearisation
 from pdcorrect.fem.factorisation import Backend, Factor, factorise
-from pdcorrect.fem.problem import Linearisation, Problem
+from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]

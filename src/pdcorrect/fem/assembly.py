@@ -1,0 +1,87 @@
+"""Cell-wise results summed into nodal vectors and sparse matrices, in a fixed order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from pdcorrect.fem import kernels
+from pdcorrect.fem.operators import Quadrature
+
+Array = NDArray[np.float64]
+
+
+class Assembly:
+    """Connectivity of ``cells`` (C, K) between ``count`` nodes."""
+
+    def __init__(self, cells: NDArray[np.int64], count: int) -> None:
+        self.cells = cells
+        self._count = count
+        flat = cells.ravel()
+        self._start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
+        self._slots = np.argsort(flat, kind="stable")
+
+    def vector(self, by_cell: Array) -> Array:
+        """Sum cell-wise nodal values (C, K, 3) into (N, 3)."""
+        out = np.empty((self._count, 3))
+        kernels.gather_nodes(self._start, self._slots, by_cell.reshape(-1, 3), out)
+        return out
+
+    def matrix(self, blocks: Array) -> sp.csr_matrix:
+        """Sum cell-wise node blocks (C, K, K, 3, 3) into (3N, 3N)."""
+        indptr, indices, place = self._pattern
+        data = np.zeros((len(indices), 3, 3))
+        kernels.add_blocks(place, blocks.reshape(-1, 3, 3), data)
+        size = 3 * self._count
+        return sp.bsr_matrix((data, indices, indptr), shape=(size, size)).tocsr()
+
+    @cached_property
+    def _pattern(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+        """Block rows and columns, and the place of each cell's node pair among them."""
+        width = self.cells.shape[1]
+        rows = np.repeat(self.cells, width, axis=1).ravel()
+        columns = np.tile(self.cells, width).ravel()
+        keys, place = np.unique(rows * self._count + columns, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(self._count + 1) * self._count)
+        return indptr.astype(np.int32), (keys % self._count).astype(np.int32), place.ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The tangent of the elastic energy at one state, see `kernels.linearise_cells`.
+
+    Attributes
+    ----------
+    left, right : (C, 9, Q)
+        Factors of the signed SVD of F.
+    tangent : (C, 12, Q)
+        Tangent in their frame times the volumes, N m.
+    """
+
+    assembly: Assembly
+    quadrature: Quadrature
+    left: Array
+    right: Array
+    tangent: Array
+
+    def apply(self, x: Array) -> Array:
+        """Tangent times x, both (N, 3), without assembling."""
+        by_cell = np.empty((*self.assembly.cells.shape, 3))
+        kernels.apply_linearised(
+            x, self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
+            by_cell,
+        )  # fmt: skip
+        return self.assembly.vector(by_cell)
+
+    def assemble(self) -> sp.csr_matrix:
+        """The tangent as a sparse matrix (3N, 3N), N/m."""
+        count, nodes = self.assembly.cells.shape
+        blocks = np.empty((count, nodes, nodes, 3, 3))
+        kernels.cell_stiffness(
+            self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
+        )
+        return self.assembly.matrix(blocks)

@@ -1,0 +1,40 @@
+"""`Scene`: everything a simulation is told, from TOML or from memory.
+
+A scene is plain, validated data: SI units, no arrays, no mesh.  `discretise`
+turns it into a `Problem`.  Unknown keys are refused and every message names the
+key, the value, and what was expected.  `docs/scene.md` lists all keys.
+"""
+
+from __future__ import annotations
+
+from pdcorrect.scene.bodies import Beam, Body, Cross, MeshFile, Voxels, Weight
+from pdcorrect.scene.clamps import Clamp, Motion
+from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
+from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
+from pdcorrect.scene.regions import Region
+from pdcorrect.scene.scene import Scene, Solver, Time
+
+__all__ = [
+    "Beam",
+    "Body",
+    "BodyForce",
+    "Clamp",
+    "Cross",
+    "EffectiveModuli",
+    "Force",
+    "Gravity",
+    "Load",
+    "Material",
+    "MaterialRegion",
+    "MeshFile",
+    "Motion",
+    "Pressure",
+    "Region",
+    "Scene",
+    "Solver",
+    "Time",
+    "Torsion",
+    "Traction",
+    "Voxels",
+    "Weight",
+]

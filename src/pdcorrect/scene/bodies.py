@@ -1,0 +1,96 @@
+"""Bodies: voxel shapes and mesh files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Union
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from pdcorrect import shapes
+from pdcorrect.scene.regions import Cells, Positive, PositiveCount, Strict, Vector
+
+
+class _VoxelBody(Strict):
+    cell_size: Positive
+    origin: Vector = (0.0, 0.0, 0.0)
+
+
+class Beam(_VoxelBody):
+    """Block of cells along x, y, z with one corner at the origin."""
+
+    shape: Literal["beam"]
+    cells: Cells
+
+    def occupancy(self) -> shapes.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `shapes`."""
+        return shapes.beam(self.cells)
+
+
+class Cross(_VoxelBody):
+    """Beam along x with two or four perpendicular branches (thesis fig. 6.1)."""
+
+    shape: Literal["cross"]
+    cells: Cells
+    arms: Literal[2, 4] = 4
+    arm_start: Annotated[int, Field(ge=0)]
+    arm_width: PositiveCount = 2
+    arm_length: PositiveCount
+
+    def occupancy(self) -> shapes.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `shapes`."""
+        return shapes.cross(self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length)
+
+
+class Weight(_VoxelBody):
+    """Support beams, a pendulum, and its inflated part (thesis fig. 6.2)."""
+
+    shape: Literal["weight"]
+    support_cells: Cells
+    second_support_length: Annotated[int, Field(ge=0)] = 0
+    pendulum_start: Annotated[int, Field(ge=0)]
+    pendulum_cells: Cells
+    weight_start: Annotated[int, Field(ge=0)]
+    weight_cells: Cells
+
+    def occupancy(self) -> shapes.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `shapes`."""
+        return shapes.weight(
+            self.support_cells,
+            self.second_support_length,
+            self.pendulum_start,
+            self.pendulum_cells,
+            self.weight_start,
+            self.weight_cells,
+        )
+
+
+class Voxels(_VoxelBody):
+    """Any set of grid cells: a nested list ``occupancy[x][y][z]`` of 0 and 1."""
+
+    shape: Literal["voxels"]
+    occupancy_list: tuple[tuple[tuple[Literal[0, 1], ...], ...], ...] = Field(alias="occupancy")
+
+    @model_validator(mode="after")
+    def _rectangular(self) -> Voxels:
+        widths = {len(plane) for plane in self.occupancy_list}
+        depths = {len(row) for plane in self.occupancy_list for row in plane}
+        if len(widths) != 1 or len(depths) != 1:
+            raise ValueError("expected all planes and rows of occupancy to have the same length")
+        return self
+
+    def occupancy(self) -> shapes.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `shapes`."""
+        return shapes.voxels(np.array(self.occupancy_list))
+
+
+class MeshFile(Strict):
+    """Hexahedral mesh from a file that meshio reads (Gmsh, Abaqus, VTU)."""
+
+    shape: Literal["file"]
+    path: Path
+    scale: Positive = 1.0
+
+
+Body = Annotated[Union[Beam, Cross, Weight, Voxels, MeshFile], Field(discriminator="shape")]

@@ -1,0 +1,56 @@
+"""Clamps: held, rolling or moving."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from pydantic import Field, model_validator
+
+from pdcorrect.scene.regions import Axis, Region, Strict, Vector
+
+
+class Motion(Strict):
+    """Prescribed motion of a clamp: piecewise linear tables over time.
+
+    Attributes
+    ----------
+    times
+        Increasing, s.  Before the first and after the last the motion rests.
+    displacement
+        One vector (m) for each time.
+    rotation
+        One angle (degrees) for each time, about ``axis`` through ``centre``.
+    """
+
+    times: tuple[float, ...] = Field(min_length=1)
+    displacement: tuple[Vector, ...] | None = None
+    rotation: tuple[float, ...] | None = None
+    axis: Axis = "x"
+    centre: Vector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _tables_match(self) -> Motion:
+        if any(b <= a for a, b in pairwise(self.times)):
+            raise ValueError("expected motion.times to increase")
+        if self.displacement is None and self.rotation is None:
+            raise ValueError("expected motion.displacement or motion.rotation")
+        for name in ("displacement", "rotation"):
+            table = getattr(self, name)
+            if table is not None and len(table) != len(self.times):
+                raise ValueError(
+                    f"expected motion.{name} to have the {len(self.times)} entries of "
+                    f"motion.times, got {len(table)}"
+                )
+        return self
+
+
+class Clamp(Strict):
+    """Nodes of a region whose named components are held, or moved.
+
+    ``components = ["z"]`` makes a roller; without ``motion`` the nodes are held
+    at their rest positions.
+    """
+
+    region: Region
+    components: tuple[Axis, ...] = Field(default=("x", "y", "z"), min_length=1)
+    motion: Motion | None = None

@@ -1,0 +1,75 @@
+"""Materials: what was asked for, and what the energy makes of it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pdcorrect.scene.regions import Positive, Region, Strict
+
+
+class EffectiveModuli(Strict):
+    """What the energy amounts to at small strain: E in Pa, Poisson's ratio."""
+
+    young: float
+    poisson: float
+
+
+class Material(Strict):
+    """Elastic material: corotated energy with an independent volume term.
+
+    The energy density is ``mu |F - R|^2 + omega/2 |F - V|^2`` (section 3 of the
+    theory page) with ``mu = E / (2 (1 + nu))`` and
+    ``lambda = E nu / ((1 + nu) (1 - 2 nu))``.
+
+    Attributes
+    ----------
+    energy
+        "corotated" (both terms), "corotated-only" or "volume-only".
+    volume_weight
+        "lame": omega = 3 lambda, which gives the E and nu asked for.
+        "published": omega = lambda, DiffPD's rule.
+    young, poisson, density
+        Pa, dimensionless in [0, 0.5), kg/m3.
+    """
+
+    energy: Literal["corotated", "corotated-only", "volume-only"] = "corotated"
+    volume_weight: Literal["lame", "published"] = "lame"
+    young: Positive
+    poisson: Annotated[float, Field(ge=0, lt=0.5)]
+    density: Positive
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus, Pa."""
+        return self.young / (2 * (1 + self.poisson))
+
+    @property
+    def lam(self) -> float:
+        """First Lame parameter, Pa."""
+        return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
+
+    @property
+    def effective(self) -> EffectiveModuli:
+        """Young's modulus and Poisson's ratio that the energy really has.
+
+        For small strain ``|F - V|^2 = tr(eps)^2 / 3``, so the volume term acts
+        as a first Lame parameter ``omega / 3``.
+        """
+        mu = 0.0 if self.energy == "volume-only" else self.mu
+        lam = 0.0 if self.energy == "corotated-only" else self.lam
+        lam = lam if self.volume_weight == "lame" else lam / 3
+        total = lam + mu
+        if total == 0:
+            return EffectiveModuli(young=0.0, poisson=0.0)
+        return EffectiveModuli(young=mu * (3 * lam + 2 * mu) / total, poisson=lam / (2 * total))
+
+
+class MaterialRegion(Strict):
+    """Other values of the material in part of the body (cells by their centre)."""
+
+    region: Region
+    young: Positive | None = None
+    poisson: Annotated[float, Field(ge=0, lt=0.5)] | None = None
+    density: Positive | None = None

@@ -1,0 +1,94 @@
+"""Number types that all sections share, and `Region`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pdcorrect.errors import SceneError
+
+Axis = Literal["x", "y", "z"]
+Vector = tuple[float, float, float]
+PositiveCount = Annotated[int, Field(ge=1)]
+Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+
+
+class Strict(BaseModel):
+    """Base of all sections: unknown keys, infinite and NaN numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Region(Strict):
+    """A set of points: exactly one of a plane, a box, a sphere, nodes, everything.
+
+    Attributes
+    ----------
+    plane, at
+        Points with coordinate ``plane`` equal to ``at`` (m, or "min" / "max" of
+        the body).
+    box
+        Lowest and highest corner, m.
+    sphere, radius
+        Centre and radius, m.
+    nodes
+        Node numbers of the coarse mesh; on refined meshes the same points.
+    everywhere
+        The whole body.
+    """
+
+    plane: Axis | None = None
+    at: Annotated[float | Literal["min", "max"] | None, Field(union_mode="left_to_right")] = None
+    box: tuple[Vector, Vector] | None = None
+    sphere: Vector | None = None
+    radius: Positive | None = None
+    nodes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    everywhere: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Region:
+        kinds = [k for k in ("plane", "box", "sphere", "nodes", "everywhere") if getattr(self, k)]
+        if len(kinds) != 1:
+            raise ValueError(
+                "expected exactly one of plane (with at), box, sphere (with radius), nodes, "
+                f"everywhere; got {kinds or 'none'}"
+            )
+        if (self.plane is None) != (self.at is None):
+            raise ValueError('expected plane and at together, such as { plane = "x", at = 0.0 }')
+        if (self.sphere is None) != (self.radius is None):
+            raise ValueError("expected sphere and radius together")
+        return self
+
+    def contains(
+        self, points: NDArray[np.float64], tolerance: float, bounds: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Which of ``points`` (n, 3) lie in a geometric region, as (n,) bool.
+
+        ``tolerance`` (m) widens the region; ``bounds`` (2, 3) are the body's
+        lowest and highest coordinates, for ``at = "min" | "max"``.  A region of
+        node numbers is resolved by the caller, who knows the numbering.
+        """
+        if self.everywhere:
+            return np.ones(len(points), dtype=bool)
+        if self.plane is not None:
+            axis = "xyz".index(self.plane)
+            low, high = bounds[:, axis]
+            at = {"min": low, "max": high}[self.at] if isinstance(self.at, str) else self.at
+            return np.abs(points[:, axis] - np.float64(at)) <= tolerance
+        if self.box is not None:
+            low, high = np.sort(np.asarray(self.box), axis=0)
+            inside = (points >= low - tolerance) & (points <= high + tolerance)
+            return inside.all(axis=1)
+        if self.sphere is not None and self.radius is not None:
+            distance = np.linalg.norm(points - np.asarray(self.sphere), axis=1)
+            return distance <= self.radius + tolerance
+        raise SceneError("a region of node numbers has no geometry to test points against")
+
+    def describe(self) -> str:
+        """The region as it would stand in the file, for messages."""
+        return str({k: v for k, v in self.model_dump().items() if v is not None})

@@ -1,0 +1,168 @@
+"""`Scene`, its time and solver sections, and messages for wrong ones."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomli_w
+from pydantic import Field, PrivateAttr, ValidationError, field_validator
+
+from pdcorrect.errors import SceneError
+from pdcorrect.scene.bodies import Body
+from pdcorrect.scene.clamps import Clamp
+from pdcorrect.scene.loads import Load
+from pdcorrect.scene.materials import Material, MaterialRegion
+from pdcorrect.scene.regions import Positive, PositiveCount, Strict
+
+
+class Time(Strict):
+    """Step size (s) and number of frames; one frame is one step."""
+
+    step: Positive
+    frames: PositiveCount
+
+
+class Solver(Strict):
+    """Discretisation and accuracy.
+
+    Attributes
+    ----------
+    mass
+        "lumped" (row sums), "averaged", "consistent", or "per-node" (density
+        times cell volume on every node, as DiffPD; only to reproduce published
+        results).
+    element
+        "hex8": trilinear displacements, 2x2x2 Gauss points.
+    tolerance
+        Largest accepted estimate of a node's distance from the step's exact
+        solution, as a fraction of the coarse cell size.
+    """
+
+    mass: Literal["lumped", "averaged", "consistent", "per-node"] = "lumped"
+    element: Literal["hex8"] = "hex8"
+    tolerance: Annotated[float, Field(gt=0, lt=0.1)] = 1e-5
+
+
+class Scene(Strict):
+    """A body, its material, how it is held and loaded, and for how long.
+
+    Examples
+    --------
+    >>> scene = Scene(
+    ...     body={"shape": "beam", "cells": [4, 1, 1], "cell_size": 0.1},
+    ...     material={"young": 1e5, "poisson": 0.3, "density": 1e3},
+    ...     time={"step": 0.01, "frames": 10},
+    ...     clamps=[{"region": {"plane": "x", "at": 0.0}}],
+    ...     loads=[{"kind": "gravity", "acceleration": [0, 0, -9.81]}],
+    ... )
+    >>> scene.material.effective.poisson
+    0.3
+    """
+
+    name: str = "scene"
+    body: Body
+    material: Material
+    materials: tuple[MaterialRegion, ...] = ()
+    time: Time
+    clamps: tuple[Clamp, ...] = ()
+    loads: tuple[Load, ...] = ()
+    solver: Solver = Solver()
+    _folder: Path = PrivateAttr(default=Path())
+
+    def __init__(self, **data: Any) -> None:
+        source = data.pop("__source__", "scene")
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise SceneError(_explain(error, source)) from None
+
+    @field_validator("name")
+    @classmethod
+    def _named(cls, name: str) -> str:
+        if not name.strip():
+            raise ValueError("expected a name that is not empty")
+        return name
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Read a scene from a TOML file; relative paths in it start at its folder.
+
+        Raises
+        ------
+        SceneError
+            If the file cannot be read, is not TOML, or is not a valid scene.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
+            raise SceneError(f"{path}: cannot be read ({reason}).") from None
+        scene = cls.from_toml(text, source=str(path))
+        scene._folder = path.parent
+        return scene
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "scene") -> Scene:
+        """Read a scene from TOML text; ``source`` names it in messages."""
+        try:
+            data = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"{source}: not valid TOML: {error}.") from None
+        return cls(**data, __source__=source)
+
+    def to_toml(self) -> str:
+        """The scene as TOML, with every default written out."""
+        data = self.model_dump(mode="json", exclude_none=True, by_alias=True)
+        return tomli_w.dumps(data)
+
+    def resolve(self, path: Path) -> Path:
+        """A path of this scene, relative ones from the scene file's folder."""
+        return path if path.is_absolute() else self._folder / path
+
+    def with_changes(self, **sections: Any) -> Scene:
+        """The same scene with some sections' keys replaced.
+
+        Examples
+        --------
+        ``scene.with_changes(material={"poisson": 0.3}, time={"frames": 5})``
+        """
+        data = self.model_dump(mode="python", exclude_none=True, by_alias=True)
+        for section, change in sections.items():
+            if isinstance(change, dict) and isinstance(data.get(section), dict):
+                data[section] = {**data[section], **change}
+            else:
+                data[section] = change
+        changed = Scene(**data)
+        changed._folder = self._folder
+        return changed
+
+
+def _explain(error: ValidationError, source: str) -> str:
+    """One paragraph: each wrong key, its value, and what was expected."""
+    sentences: list[str] = []
+    for item in error.errors():
+        key = _key(item["loc"])
+        if item["type"] == "extra_forbidden":
+            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
+        elif item["type"] == "missing":
+            sentences.append(f"{key}: missing; a value is required.")
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            value = repr(item["input"])
+            value = value if len(value) < 80 else value[:77] + "..."
+            sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")
+    return " ".join(f"{source}: {' '.join(dict.fromkeys(sentences))}".split())
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    """Dotted key as the user wrote it: pydantic also names the union member it chose."""
+    parts = [str(part) for part in location]
+    tag_at = {"body": 1, "loads": 2}.get(parts[0], len(parts)) if parts else 0
+    parts = parts[:tag_at] + parts[tag_at + 1 :]
+    if len(parts) > 1 and parts[-2] == "at":
+        parts.pop()
+    text = "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in parts)
+    return text.lstrip(".") or "the scene"
