@@ -1,147 +1,366 @@
-"""Pictures: not blank, nothing clipped, equal runs look equal, wrong requests are named."""
+"""Pictures: complete, comparable, labelled; and what is refused."""
 
-from dataclasses import replace
+import dataclasses
+import sys
+import warnings
 
-import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-import pdcorrect as pc
-from conftest import cross
+from motion import trajectory
 from pdcorrect import figures
-from pdcorrect.errors import InputError, OutputError
+from pdcorrect.errors import InputError, MeshError, MissingExtraError, OutputError
+from pdcorrect.figures import curves
 
-WHITE = 255
+pytest.importorskip("pyvista")
+pytest.importorskip("matplotlib")
+iio = pytest.importorskip("imageio.v3")
+
+WIDTH = 400
+"""Of a panel in most tests, pixels."""
 
 
 @pytest.fixture(scope="module")
-def runs():
-    return [pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=k)), 6) for k in (1, 2)]
+def run():
+    return trajectory(frames=6)
 
 
-def panels(path, count):
-    """The panels of a picture without the strip below."""
-    image = imageio.imread(path)[..., :3]
-    image = image[: figures._PANEL[1]]
-    return np.split(image, count, axis=1)
+@pytest.fixture(scope="module")
+def fine():
+    return trajectory(frames=6, refine=2, angle=1.2)
 
 
-def body(panel):
-    """Pixels that are neither white nor grey: a coloured body."""
-    pixels = panel.astype(int)
-    return np.ptp(pixels, axis=-1) > 40
+def drawn(path):
+    return iio.imread(path)[..., :3].astype(int)
 
 
-def test_two_equal_runs_give_equal_panels(runs, tmp_path):
-    figures.render([runs[0], runs[0]], tmp_path / "x.png", labels=["same", "same"])
-    left, right = panels(tmp_path / "x.png", 2)
-    corner = slice(int(0.75 * left.shape[0]), None), slice(left.shape[1] // 2, None)
-    different = (left != right).any(axis=-1)
-    different[corner] = False  # the length scale is drawn once
-    assert different.mean() < 1e-3
-    assert body(left).mean() > 0.1
+def paper(image):
+    """Whether each pixel is white."""
+    return (image == 255).all(axis=-1)
 
 
-@pytest.mark.parametrize("colour", ["displacement", "error", None])
-def test_bodies_are_inside_their_panels(runs, tmp_path, colour):
+def bodies(image):
+    """Whether each pixel is coloured, as bodies are and text and outlines are not."""
+    return np.ptp(image, axis=-1) > 25
+
+
+def panels_of(image, count):
+    """The panels' columns without what lies above and below the bodies."""
+    width = image.shape[1] // count
+    return [image[:, k * width : (k + 1) * width] for k in range(count)]
+
+
+def body_rows(image):
+    """Rows between captions and legend: those of the tallest coloured block."""
+    coloured = bodies(image).any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], coloured.astype(int), [0]])))
+    start, stop = max(edges.reshape(-1, 2), key=lambda ends: ends[1] - ends[0])
+    return slice(start, stop)
+
+
+def test_a_picture_shows_a_body_and_its_legend(run, tmp_path):
+    path = figures.render(run, tmp_path / "a.png", labels=["one"], window=WIDTH)
+    assert path == tmp_path / "a.png"
+    image = drawn(path)
+    assert image.shape[1] == WIDTH
+    assert 0.08 < bodies(image).mean() < 0.6
+    rows = body_rows(image)
+    assert (~paper(image[: rows.start])).any()  # caption
+    assert (~paper(image[rows.stop + 5 :])).any()  # legend
+    assert not list(tmp_path.glob("*.part*"))
+
+
+@pytest.mark.parametrize("colour", ["displacement", None])
+@pytest.mark.parametrize("frame", [0, 3, -1])
+def test_no_body_touches_the_border_of_its_panel(run, tmp_path, colour, frame):
+    """Even when stretched, turned and moved far from the origin."""
+    far = np.array([40.0, -3.0, 7.0])
+    moved, wild = (
+        dataclasses.replace(run, positions=size * run.positions + far, points=far + run.points)
+        for size in (1.0, 2.5)
+    )
     path = figures.render(
-        runs, tmp_path / "x.png", colour=colour, reference=runs[1], labels=["a", "b"], frame=3
+        [wild, moved], tmp_path / "a.png", frame=frame, window=2 * WIDTH, colour=colour
     )
-    for panel in panels(path, 2):
-        inside = body(panel)
-        assert inside.any() or colour == "error"
-        for edge in (inside[:4], inside[-4:], inside[:, :4], inside[:, -4:]):
-            assert not edge.any()
+    image = drawn(path)
+    rows = body_rows(image)
+    for panel in panels_of(image[rows.start - 5 : rows.stop + 5], 2):
+        assert bodies(panel).mean() > 0.02
+        for margin in (panel[:5], panel[-5:], panel[:, :5], panel[:, -5:]):
+            assert not bodies(margin).any()
+        assert paper(panel[:, :4]).all()
+        assert paper(panel[:, -4:]).all()
 
 
-def test_far_moving_bodies_are_never_clipped(runs, tmp_path):
-    far = runs[0]
-    shift = np.linspace(0, 3, len(far.times))[:, None, None] * [1.0, 0.5, -1.0]
-    far = replace(far, positions=far.positions + shift)
-    path = figures.render([far], tmp_path / "x.gif")
-    frames = imageio.imread(path, index=None)[..., :3]
-    assert len(frames) == len(far.times)
-    for frame in frames:
-        inside = body(frame[: figures._PANEL[1]])
-        assert inside.any()
-        for edge in (inside[:3], inside[-3:], inside[:, :3], inside[:, -3:]):
-            assert not edge.any()
+def test_a_body_fills_its_panel(run, tmp_path):
+    image = drawn(figures.render(run, tmp_path / "a.png", window=WIDTH))
+    columns = np.flatnonzero(bodies(image[body_rows(image)]).any(axis=0))
+    assert columns[0] < 0.12 * WIDTH
+    assert columns[-1] > 0.8 * WIDTH
 
 
-def test_larger_errors_are_brighter(runs, tmp_path):
-    """The error colours follow the distance: a run against itself is all black."""
-    figures.render([runs[0]], tmp_path / "far.png", colour="error", reference=runs[1])
-    figures.render([runs[1]], tmp_path / "self.png", colour="error", reference=runs[1])
-    far, near = (panels(tmp_path / n, 1)[0] for n in ("far.png", "self.png"))
-    assert body(far).mean() > 0.05
-    assert body(near).mean() < 0.01
+def test_equal_runs_give_equal_panels_and_others_do_not(run, tmp_path):
+    other = trajectory(frames=6, angle=-0.9)
+    image = drawn(figures.render([run, run, other], tmp_path / "a.png", window=3 * WIDTH))
+    rows = body_rows(image)
+    first, second, third = panels_of(image[rows], 3)
+    assert first.shape[1] == WIDTH
+    np.testing.assert_array_equal(first, second)
+    assert (np.abs(first - third).max(axis=-1) > 30).mean() > 0.02
 
 
-def test_error_is_the_distance_at_shared_nodes(runs):
-    coarse, fine = runs
-    run, values = figures._distance(coarse, fine)
-    here = pc.restrict(fine, to=coarse)
-    np.testing.assert_allclose(
-        values, np.linalg.norm(coarse.positions - here.positions, axis=2), atol=1e-15
-    )
-    assert run is coarse
-    shown, values = figures._distance(fine, coarse)
-    assert len(shown.points) == len(coarse.points) == values.shape[1]
+def test_panels_share_their_scale(run, tmp_path):
+    """A body of half the size is drawn at half the size."""
+    small = dataclasses.replace(run, positions=0.5 * run.positions, points=0.5 * run.points)
+    image = drawn(figures.render([run, small], tmp_path / "a.png", frame=0, window=2 * WIDTH))
+    widths = []
+    for panel in panels_of(image[body_rows(image)], 2):
+        columns = np.flatnonzero(bodies(panel).any(axis=0))
+        widths.append(columns[-1] - columns[0])
+    assert widths[1] / widths[0] == pytest.approx(0.5, abs=0.02)
 
 
-def test_films_have_every_frame(runs, tmp_path):
-    figures.render(runs[:1], tmp_path / "x.mp4", fps=10)
-    film = imageio.imread(tmp_path / "x.mp4", plugin="FFMPEG")
-    assert len(film) == len(runs[0].times)
-    assert (film[0] != film[-1]).any()
+def test_panels_share_their_colours(run, tmp_path):
+    """What hardly moves is dark beside what moves far."""
+    still = dataclasses.replace(run, positions=run.points + 0.05 * (run.positions - run.points))
+    image = drawn(figures.render([run, still], tmp_path / "a.png", frame=4, window=2 * WIDTH))
+    greens = [p[bodies(p)][:, 1].max() for p in panels_of(image[body_rows(image)], 2)]
+    assert greens[0] > 180
+    assert greens[1] < 100
 
 
-def test_plots_are_drawn(runs, tmp_path):
-    truth = pc.restrict(runs[1], to=runs[0])
-    errors = {"coarse": pc.metrics.error_over_time(runs[0], truth)}
-    made = [
-        figures.plot_node_trajectories(
-            runs, tmp_path / "a.png", node_point=[0.4, 0, 0], labels=["a", "b"]
-        ),
-        figures.plot_energy(runs, tmp_path / "b.png", labels=["a", "b"]),
-        figures.plot_error_over_time(errors, truth.times, tmp_path / "c.png"),
-        figures.plot_error_against_time({"a": (0.01, 1e-3), "b": (0.1, 1e-4)}, tmp_path / "d.png"),
-    ]
-    for path in made:
-        image = imageio.imread(path)[..., :3]
-        assert (np.ptp(image.astype(int), axis=-1) > 60).mean() > 1e-4  # coloured curves
+def test_the_error_of_the_reference_is_nothing(run, fine, tmp_path):
+    """Zero is the pale end of the map; on a finer mesh as well as on a coarser one."""
+    for reference in (fine, run):
+        image = drawn(
+            figures.render(
+                [run, fine], tmp_path / "a.png", colour="error", reference=reference,
+                window=2 * WIDTH,
+            )
+        )  # fmt: skip
+        panels = panels_of(image[body_rows(image)], 2)
+        reds = [((p[..., 0] - p[..., 1] > 90) & bodies(p)).mean() for p in panels]
+        wrong, right = reds if reference is fine else reds[::-1]
+        assert wrong > 0.05
+        assert right == 0
 
 
-def test_wrong_requests_are_named(runs, tmp_path):
-    for call, words in (
-        (lambda: figures.render(runs, tmp_path / "x.png", labels=["one"]), "1 labels for 2"),
-        (lambda: figures.render(runs, tmp_path / "x.tiff"), "x.tiff"),
-        (lambda: figures.render(runs, tmp_path / "x.png", frame=7), "-7 to 6"),
-        (lambda: figures.render(runs, tmp_path / "x.png", colour="error"), "reference"),
-        (lambda: figures.render(runs, tmp_path / "x.png", colour="age"), "'age'"),
-        (lambda: figures.render([], tmp_path / "x.png"), "at least one"),
-        (
-            lambda: figures.plot_energy(
-                [replace(runs[0], stats={})], tmp_path / "x.png", labels=["a"]
-            ),
-            "elastic_energy",
-        ),
+def test_errors_are_distances_at_coincident_nodes(run, fine):
+    for shown, reference in ((run, fine), (fine, run)):
+        frames = np.arange(7)
+        body = figures._body(shown, frames, "error", reference, frames)
+        points = [tuple(np.round(p, 9)) for p in body.run.points]
+        assert len(points) == len(run.points)
+        for run_here, positions in ((shown, body.run.positions), (reference, None)):
+            place = {tuple(np.round(p, 9)): k for k, p in enumerate(run_here.points)}
+            nodes = [place[p] for p in points]
+            if positions is not None:
+                np.testing.assert_array_equal(positions, run_here.positions[:, nodes])
+                mine = run_here.positions[:, nodes]
+            else:
+                theirs = run_here.positions[:, nodes]
+        np.testing.assert_allclose(body.values, np.linalg.norm(mine - theirs, axis=2))
+        assert body.values.max() > 0.005
+
+
+def test_runs_are_compared_at_equal_times(run):
+    halved = trajectory(frames=9, step=0.01)
+    common = figures._common_frames([run, halved])
+    assert common.shape == (2, 5)
+    np.testing.assert_allclose(run.times[common[0]], halved.times[common[1]], atol=1e-12)
+    shifted = dataclasses.replace(run, times=run.times + 0.005)
+    with pytest.raises(InputError, match="no time in common"):
+        figures._common_frames([run, shifted])
+
+
+def test_several_frames_lie_beside_or_below_each_other(run, tmp_path):
+    strip = drawn(figures.render(run, tmp_path / "a.png", frame=[0, 3, 6], window=3 * WIDTH))
+    table = drawn(figures.render([run, run], tmp_path / "b.png", frame=[0, 3, 6], window=2 * WIDTH))
+    assert strip.shape[1] == 3 * WIDTH
+    assert table.shape[1] == 2 * WIDTH
+    assert table.shape[0] > 2.4 * (strip.shape[0] - 100)
+    first, _, last = panels_of(strip[body_rows(strip)], 3)
+    assert (first != last).mean() > 0.05
+
+
+def test_size_factor_and_window(run, tmp_path):
+    small = drawn(figures.render(run, tmp_path / "a.png", window=300))
+    large = drawn(figures.render(run, tmp_path / "b.png", window=300, scale=2.0))
+    assert small.shape[1] == 300
+    assert large.shape[1] == 600
+    assert large.shape[0] == pytest.approx(2 * small.shape[0], abs=8)
+
+
+def test_films_hold_every_common_frame(run, tmp_path):
+    short = trajectory(frames=4)
+    path = figures.render([run, short], tmp_path / "a.gif", window=2 * 150, fps=20)
+    film = iio.imread(path)
+    assert film.shape[0] == 5
+    assert film.shape[2] == 300
+    assert iio.immeta(path)["duration"] == 50
+    assert all((film[k] != film[k + 1]).any() for k in range(4))
+    chosen = iio.imread(figures.render(run, tmp_path / "b.gif", frame=[0, 6], window=200))
+    assert chosen.shape[0] == 2
+
+
+def test_mp4(run, tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    path = figures.render(run, tmp_path / "a.mp4", window=201, fps=10)
+    film = iio.imread(path, plugin="FFMPEG")
+    assert film.shape[0] == 7
+    assert film.shape[1] % 2 == film.shape[2] % 2 == 0
+    assert (film[0] > 250).mean() > 0.4
+
+
+def test_flat_still_and_tiny_cases_are_drawn(run, tmp_path):
+    still = dataclasses.replace(run, positions=np.repeat(run.points[None], 7, axis=0))
+    micro = dataclasses.replace(run, positions=1e-6 * run.positions, points=1e-6 * run.points)
+    start = dataclasses.replace(
+        run, positions=run.positions[:1], velocities=run.velocities[:1], times=run.times[:1],
+        stats={},
+    )  # fmt: skip
+    for case in (still, micro, start):
+        image = drawn(figures.render(case, tmp_path / "a.png", window=WIDTH))
+        assert 0.08 < bodies(image).mean() < 0.6
+    figures.render(run, tmp_path / "b.png", colour="error", reference=run, window=WIDTH)
+
+
+def test_long_labels_stay_in_their_panel(run, tmp_path):
+    long = "a label that is much longer than the panel above which it stands, by far\nand more"
+    image = drawn(figures.render([run, run], tmp_path / "a.png", labels=[long, ""], window=800))
+    caption = image[: body_rows(image).start - 40]
+    assert (~paper(caption[:, :400])).any()
+    assert paper(caption[:, 392:408]).all()
+
+
+def test_bad_input_is_refused(run, fine, tmp_path):
+    png = tmp_path / "a.png"
+    for arguments, named, words in (
+        (([], png), {}, "at least one"),
+        (([run, run], png), {"labels": ["a"]}, "1 labels for 2 runs"),
+        ((run, tmp_path / "a.bmp2"), {}, r"\.png, \.gif or \.mp4"),
+        ((run, tmp_path / "a"), {}, r"\.png, \.gif or \.mp4"),
+        ((run, png), {"frame": 7}, "frame 7: expected -7 to 6"),
+        ((run, png), {"frame": [0, -8]}, "frame -8: expected -7 to 6"),
+        ((run, png), {"frame": []}, "empty"),
+        ((run, png), {"colour": "stress"}, "'stress'"),
+        ((run, png), {"colour": "error"}, "reference"),
+        ((run, tmp_path / "a.gif"), {"fps": 0.0}, "fps"),
     ):
         with pytest.raises(InputError, match=words):
-            call()
-    with pytest.raises(OutputError, match="does not exist"):
-        figures.render(runs, tmp_path / "nowhere" / "x.png")
+            figures.render(*arguments, **named)
+    other = dataclasses.replace(fine, points=fine.points + 0.003)
+    with pytest.raises(MeshError, match="coincident"):
+        figures.render(run, png, colour="error", reference=other)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_library_says_what_to_install(runs, tmp_path, monkeypatch):
-    import sys
+def test_unwritable_outputs_are_named(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.png").mkdir()
+    for path in (
+        tmp_path / "none" / "a.png",
+        tmp_path / "file" / "a.png",
+        tmp_path / "folder.png",
+    ):
+        with pytest.raises(OutputError, match=path.name):
+            figures.render(run, path, window=100)
 
+
+def test_missing_libraries_are_named(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(pc.errors.MissingExtraError, match=r"pip install 'pdcorrect\[view\]'"):
-        figures.render(runs, tmp_path / "x.png")
+    with pytest.raises(MissingExtraError, match=r"pdcorrect\[view\]"):
+        figures.render(run, tmp_path / "a.png")
 
 
-def test_the_probe_says_what_it_found():
+# --- curves ----------------------------------------------------------------------------
+
+
+def caught_lines(monkeypatch):
+    """What the plots draw: (axis label, curve label, x, y)."""
+    seen = []
+    real = curves._save
+
+    def save(figure, output):
+        for axis in figure.axes:
+            for line in axis.get_lines():
+                seen.append((axis.get_ylabel(), line.get_label(), *line.get_data()))
+        return real(figure, output)
+
+    monkeypatch.setattr(curves, "_save", save)
+    return seen
+
+
+def test_node_curves_show_displacements_in_millimetres(run, fine, tmp_path, monkeypatch):
+    seen = caught_lines(monkeypatch)
+    place = run.points[7]
+    path = figures.plot_node_trajectories(
+        [run, fine], tmp_path / "a.png", node_point=place + 1e-4, labels=["coarse", "fine"]
+    )
+    assert drawn(path).std() > 5
+    assert len(seen) == 6
+    node = int(np.flatnonzero(np.abs(fine.points - place).max(axis=1) < 1e-9)[0])
+    for axis in range(3):
+        label, name, x, y = seen[2 * axis + 1]
+        assert "xyz"[axis] in label
+        assert "mm" in label
+        assert name == "fine"
+        np.testing.assert_array_equal(x, fine.times)
+        moved = fine.positions[:, node, axis] - fine.points[node, axis]
+        np.testing.assert_allclose(y, 1e3 * moved, atol=1e-12)
+
+
+def test_energy_curves(run, tmp_path, monkeypatch):
+    seen = caught_lines(monkeypatch)
+    partial = dataclasses.replace(run, stats={"elastic_energy": run.stats["elastic_energy"]})
+    figures.plot_energy([run, partial], tmp_path / "a.png", labels=["a", "b"])
+    assert [line[1] for line in seen] == ["a", "b", "a", "a"]
+    np.testing.assert_array_equal(seen[0][2], run.times[1:])
+    np.testing.assert_array_equal(seen[2][3], run.stats["kinetic_energy"])
+    np.testing.assert_allclose(seen[3][3][-1], run.stats["external_work"].sum())
+    figures.plot_energy(run, tmp_path / "b.pdf", labels=["a"])
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF")
+    with pytest.raises(InputError, match="kinetic_energy"):
+        figures.plot_energy(dataclasses.replace(run, stats={}), tmp_path / "a.png", labels=["a"])
+
+
+def test_error_curves(run, tmp_path, monkeypatch):
+    seen = caught_lines(monkeypatch)
+    errors = {"one": np.linspace(0, 0.002, 7), "two": np.linspace(0, 0.001, 7)}
+    figures.plot_error_over_time(errors, run.times, tmp_path / "a.png")
+    assert [line[1] for line in seen] == ["one", "two"]
+    assert seen[0][3][-1] == pytest.approx(2.0)
+    with pytest.raises(InputError, match="one"):
+        figures.plot_error_over_time(errors, run.times[1:], tmp_path / "a.png")
+
+
+def test_curves_refuse_bad_arguments(run, tmp_path):
+    with pytest.raises(InputError, match="labels"):
+        figures.plot_energy([run], tmp_path / "a.png", labels=["a", "b"])
+    with pytest.raises(InputError, match="three coordinates"):
+        figures.plot_node_trajectories(run, tmp_path / "a.png", node_point=[0.0], labels=["a"])
+    with pytest.raises(InputError, match="ending in"):
+        figures.plot_energy(run, tmp_path / "a.what", labels=["a"])
+    with pytest.raises(OutputError, match=r"a\.png"):
+        figures.plot_energy(run, tmp_path / "none" / "a.png", labels=["a"])
+
+
+def test_plotting_leaves_the_users_backend_alone(run, tmp_path):
+    import matplotlib as mpl
+
+    before = mpl.rcParams._get_backend_or_none()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figures.plot_energy(run, tmp_path / "a.png", labels=["a"])
+    assert mpl.rcParams._get_backend_or_none() == before
+
+
+# --- is there a way to draw? -----------------------------------------------------------
+
+
+def test_drawing_is_probed_in_another_process(monkeypatch):
     assert figures.check_offscreen().startswith("ok (")
-    assert "libegl1" in figures.check_offscreen(timeout=0.01)
+    monkeypatch.setattr(figures, "_PROBE", "import os; os.abort()")
+    assert "libegl1" in figures.check_offscreen()
+    monkeypatch.setattr(figures, "_PROBE", "import time; time.sleep(30)")
+    assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)

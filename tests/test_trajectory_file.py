@@ -16,6 +16,7 @@ import pytest
 
 from motion import assert_same, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
+from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
 from pdcorrect.state import State, Status, StepResult
@@ -234,11 +235,16 @@ def child(script, *arguments):
 def test_a_killed_writer_leaves_every_complete_frame(run, tmp_path, ready):
     path = tmp_path / "run.h5"
     process = child(ENDLESS.format(ready=ready), path)
-    assert process.stdout.readline() == "ready\n"
-    if ready > 1:
-        assert len(load_trajectory(path)) >= ready - 1  # also while it is being written
-    process.kill()
-    process.wait()
+    try:
+        assert process.stdout.readline() == "ready\n"
+        if ready > 1:
+            assert len(load_trajectory(path)) >= ready - 1  # also while it is being written
+            if ready != 17:  # it adds statistics soon after, and opens the file again
+                with h5py.File(path, "r", swmr=True) as file:  # what other programs do
+                    assert len(file["times"]) >= ready - 1
+    finally:
+        process.kill()
+        process.wait()
     loaded = load_trajectory(path)
     assert len(loaded) >= ready - 1
     for k in range(1, len(loaded.times)):
@@ -272,6 +278,30 @@ def test_an_interruption_inside_a_frame_drops_only_that_frame(run, tmp_path, rea
         assert len(file["positions"]) == 3
         assert len(file["times"]) == (3 if reached == 4 else 2)
     assert load_trajectory(path).positions.tobytes() == run.positions[:2].tobytes()
+
+
+@pytest.mark.parametrize("write", range(9))
+def test_an_interruption_between_any_two_writes_drops_at_most_that_frame(
+    run, tmp_path, monkeypatch, write
+):
+    path = tmp_path / "run.h5"
+    real = GrowingFile._extend
+    left = [write]
+
+    def interrupted(self, name, entries):
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        real(self, name, entries)
+
+    values = {name: run.stats[name][0] for name in ("seconds", "status")}
+    with pytest.raises(KeyboardInterrupt), writer_of(path, run) as writer:  # noqa: PT012
+        monkeypatch.setattr(GrowingFile, "_extend", interrupted)
+        writer.append_values(run.state(1), values)  # five writes
+        writer.append_values(run.state(2), values)
+    loaded = load_trajectory(path)
+    assert len(loaded) == write // 5
+    assert loaded.positions.tobytes() == run.positions[: 1 + write // 5].tobytes()
 
 
 FULL = """

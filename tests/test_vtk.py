@@ -1,47 +1,141 @@
-"""What ParaView reads: VTU by pyvista (VTK's own reader), times in the PVD."""
+"""VTU and PVD files for ParaView, and meshes from files."""
 
 import xml.etree.ElementTree as ET
 
+import meshio
 import numpy as np
 import pytest
-import pyvista
 
-import pdcorrect as pc
-from conftest import cross
-from pdcorrect.errors import InputError, OutputError
+from motion import cross_mesh, trajectory
+from pdcorrect.errors import InputError, MeshError, OutputError
+from pdcorrect.fem.mesh_files import read_hex_mesh, write_vtu
+from pdcorrect.io.vtk import write_vtu_series
 
 
 @pytest.fixture(scope="module")
 def run():
-    return pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross())), 5)
+    return trajectory(frames=5)
 
 
-def test_the_series_is_read_back_as_it_was(run, tmp_path):
-    stress = np.arange(len(run.cells), dtype=float)
-    path = pc.write_vtu_series(
-        run, tmp_path / "out", every=2,
-        point_data=lambda frame: {"speed": np.linalg.norm(run.velocities[frame], axis=1)},
-        cell_data=lambda frame: {"number": stress + frame},
-    )  # fmt: skip
-    entries = ET.parse(path).getroot().findall("Collection/DataSet")
-    assert [float(e.get("timestep")) for e in entries] == list(run.times[::2])
-    for frame, entry in zip(range(0, 6, 2), entries, strict=True):
-        grid = pyvista.read(path.parent / entry.get("file"))
+def test_paraview_reads_back_every_frame(run, tmp_path):
+    pv = pytest.importorskip("pyvista")
+    path = write_vtu_series(run, tmp_path / "new" / "folder")
+    reader = pv.get_reader(path)
+    assert reader.time_values == run.times.tolist()
+    for frame, time in enumerate(run.times):
+        reader.set_active_time_value(time)
+        grid = reader.read()[0]
         np.testing.assert_array_equal(grid.points, run.positions[frame])
-        np.testing.assert_array_equal(grid.cells_dict[pyvista.CellType.HEXAHEDRON], run.cells)
+        np.testing.assert_array_equal(grid.cells_dict[pv.CellType.HEXAHEDRON], run.cells)
         np.testing.assert_array_equal(grid["displacement"], run.positions[frame] - run.points)
         np.testing.assert_array_equal(grid["velocity"], run.velocities[frame])
-        np.testing.assert_array_equal(grid["number"], stress + frame)
-        # VTK agrees that the cells are right way round
-        assert (grid.compute_cell_sizes()["Volume"] > 0).all()
-    assert len(list(path.parent.iterdir())) == 4
-    reader = pyvista.get_reader(path)
-    assert reader.time_values == list(run.times[::2])
+        if frame == 0:
+            # a wrong node order would show as negative volumes
+            volumes = grid.compute_cell_sizes()["Volume"]
+            np.testing.assert_allclose(volumes, 0.05**3, rtol=1e-12)
 
 
-def test_unwritable_folders_are_named(run, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        pc.write_vtu_series(run, tmp_path / "file" / "out")
+def test_the_collection_names_existing_files_with_exact_times(run, tmp_path):
+    path = write_vtu_series(run, tmp_path, every=2, name="cross")
+    entries = ET.parse(path).getroot().findall("Collection/DataSet")
+    assert [float(e.get("timestep")) for e in entries] == run.times[::2].tolist()
+    assert [e.get("file") for e in entries] == [f"cross_{k:04d}.vtu" for k in (0, 2, 4)]
+    assert {p.name for p in tmp_path.iterdir()} == {"cross.pvd", *(e.get("file") for e in entries)}
+
+
+def test_extra_fields_are_written(run, tmp_path):
+    write_vtu_series(
+        run, tmp_path, every=5,
+        point_data=lambda frame: {"error": np.full(len(run.points), 1.0 * frame)},
+        cell_data=lambda frame: {"number": np.arange(len(run.cells)) + frame},
+    )  # fmt: skip
+    mesh = meshio.read(tmp_path / "run_0005.vtu")
+    assert (mesh.point_data["error"] == 5.0).all()
+    np.testing.assert_array_equal(mesh.cell_data["number"][0], np.arange(len(run.cells)) + 5)
+
+
+def test_what_cannot_be_written_is_named(run, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    for folder in (blocked, blocked / "sub"):
+        with pytest.raises(OutputError, match="file"):
+            write_vtu_series(run, folder)
     with pytest.raises(InputError, match="every = 0"):
-        pc.write_vtu_series(run, tmp_path, every=0)
+        write_vtu_series(run, tmp_path, every=0)
+    with pytest.raises(OutputError, match=r"a\.vtu"):
+        write_vtu(tmp_path / "missing" / "a.vtu", run.points, run.cells)
+
+
+def test_a_failed_write_leaves_the_old_file(run, tmp_path, monkeypatch):
+    path = tmp_path / "a.vtu"
+    path.write_text("old")
+
+    def fails(name, *rest, **named):
+        with open(name, "w") as file:
+            file.write("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(meshio, "write", fails)
+    with pytest.raises(OutputError, match="No space left"):
+        write_vtu(path, run.points, run.cells)
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+# --- meshes from files -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".inp", ".msh"])
+def test_hexahedra_survive_the_formats(tmp_path, suffix):
+    mesh = cross_mesh()
+    path = tmp_path / f"mesh{suffix}"
+    options = {"file_format": "gmsh22", "binary": False} if suffix == ".msh" else {}
+    meshio.write(path, meshio.Mesh(mesh.positions, [("hexahedron", mesh.cells)]), **options)
+    found = read_hex_mesh(path, scale=2.0)
+    np.testing.assert_allclose(found.positions, 2 * mesh.positions, atol=1e-14)
+    np.testing.assert_array_equal(found.cells, mesh.cells)
+
+
+def test_other_dimensions_are_ignored_and_unused_nodes_dropped(tmp_path):
+    mesh = cross_mesh()
+    points = np.concatenate([[[9.0, 9.0, 9.0]], mesh.positions, [[8.0, 8.0, 8.0]]])
+    cells = [
+        ("quad", mesh.cells[:2, :4] + 1),
+        ("hexahedron", mesh.cells[:5] + 1),
+        ("line", [[0, 1]]),
+        ("hexahedron", mesh.cells[5:] + 1),
+        ("vertex", [[0]]),
+    ]
+    path = tmp_path / "mesh.vtu"
+    meshio.write(path, meshio.Mesh(points, cells))
+    found = read_hex_mesh(path)
+    np.testing.assert_array_equal(found.positions, mesh.positions)
+    np.testing.assert_array_equal(found.cells, mesh.cells)
+
+
+def test_files_without_usable_cells_are_refused(tmp_path, capfd):
+    cube = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
+    hexahedron = ("hexahedron", [[0, 1, 3, 2, 4, 5, 7, 6]])
+    for name, cells, words in (
+        ("flat", [("quad", [[0, 1, 3, 2]])], "quad"),
+        ("mixed", [hexahedron, ("tetra", [[0, 1, 2, 4]])], "tetra"),
+        ("inverted", [("hexahedron", [[4, 5, 7, 6, 0, 1, 3, 2]])], "inverted"),
+    ):
+        path = tmp_path / f"{name}.vtu"
+        meshio.write(path, meshio.Mesh(cube, cells))
+        capfd.readouterr()
+        with pytest.raises(MeshError, match=words):
+            read_hex_mesh(path)
+        assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("name", ["a.vtu", "a.msh", "a.inp", "a.xyz", "noname"])
+@pytest.mark.parametrize("text", ["", "nonsense\n1 2 3\n", "*NODE\n1, a, b\n$MeshFormat\n9 9 9\n"])
+def test_unreadable_files_are_refused_quietly(tmp_path, capfd, name, text):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(MeshError):
+        read_hex_mesh(path)
+    with pytest.raises(MeshError):
+        read_hex_mesh(tmp_path / ("no" + name))
+    assert capfd.readouterr() == ("", "")

@@ -37,7 +37,7 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     """
     path = Path(path)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             mesh = meshio.read(path)
     except SystemExit:
         raise MeshError(f"{path}: meshio cannot read it: expected .msh, .inp or .vtu.") from None

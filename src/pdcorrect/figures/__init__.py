@@ -1,0 +1,302 @@
+"""Off-screen pictures of bodies (pyvista) and plots of curves (matplotlib).
+
+Both libraries are loaded when a function needs them.  All panels of a picture
+share one camera (parallel projection), one colour scale and one length scale.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem.mesh import coincident_nodes
+from pdcorrect.figures.curves import (
+    plot_energy,
+    plot_error_against_time,
+    plot_error_over_time,
+    plot_node_trajectories,
+)
+from pdcorrect.figures.files import Image, replacing, write_film, write_png
+from pdcorrect.figures.panels import Body, Painter, View, shown_points
+from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
+from pdcorrect.state import Trajectory
+
+__all__ = [
+    "check_offscreen",
+    "plot_energy",
+    "plot_error_against_time",
+    "plot_error_over_time",
+    "plot_node_trajectories",
+    "render",
+]
+
+Colour = Literal["displacement", "error"]
+
+_COLOURINGS = {
+    "displacement": ("displacement", "viridis"),
+    "error": ("distance to the reference", "YlOrRd"),
+}
+"""Title of the colour bar, and colour map."""
+_STILL, _FILM = 1600, 1000
+"""Default widths of pictures and films, pixels."""
+
+
+def render(
+    trajectories: Sequence[Trajectory] | Trajectory,
+    output: str | Path,
+    *,
+    labels: Sequence[str] | None = None,
+    colour: Colour | None = "displacement",
+    reference: Trajectory | None = None,
+    frame: int | Sequence[int] | None = None,
+    fps: float = 25.0,
+    window: int | None = None,
+    scale: float = 1.0,
+) -> Path:
+    """Draw one run or several side by side, without a screen.
+
+    Runs are compared at the times that all of them have.
+
+    Parameters
+    ----------
+    trajectories : Trajectory or sequence of Trajectory
+    output : path
+        ``.png`` for a picture; ``.gif`` or ``.mp4`` for a film.
+    labels : sequence of str, optional
+        One for each run; may have several lines.
+    colour : {"displacement", "error"}, optional
+        Distance from rest, or from ``reference`` at the nodes that both have;
+        None draws plain bodies.  A run finer than the reference is drawn with
+        the reference's cells.
+    reference : Trajectory, optional
+        For ``colour = "error"``; its mesh may be finer or coarser.
+    frame : int or sequence of int, optional
+        Which of the common frames; negative ones count from the end.  By
+        default the last one in a picture, all in a film.  Several in a picture
+        are drawn in rows below each other, or side by side for a single run.
+    fps : float
+        Frames a second of a film.
+    window : int, optional
+        Width of the picture in pixels before ``scale``; the height follows.
+    scale : float
+        Size factor of everything, also of the text.
+
+    Returns
+    -------
+    Path
+        ``output``.
+
+    Raises
+    ------
+    InputError
+        If labels, frames, suffix, times or reference do not fit.
+    OutputError
+        If the file cannot be written.
+    MissingExtraError
+        Without the extra "view".
+    """
+    runs = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+    output = Path(output)
+    film = _check_arguments(runs, output, labels, colour, reference)
+    names = list(labels) if labels is not None else [""] * len(runs)
+    shared = _common_frames([*runs, reference] if colour == "error" and reference else runs)
+    chosen = shared[:, _choose(frame, shared.shape[1], film)]
+    bodies = [
+        _body(run, frames, colour, reference, chosen[-1])
+        for run, frames in zip(runs, chosen, strict=False)
+    ]
+    columns = len(runs) if film or len(runs) > 1 else chosen.shape[1]
+    width = (window or (_FILM if film else _STILL)) if columns > 1 else (window or 900)
+    picture = _Picture(bodies, names, colour, film, round(width * scale))
+    try:
+        with replacing(output) as part:
+            if film:
+                write_film(part, picture.pages(), fps)
+            else:
+                write_png(part, picture.whole())
+    finally:
+        picture.close()
+    return output
+
+
+class _Picture:
+    """Panels and the sheet they are on."""
+
+    def __init__(
+        self, bodies: list[Body], labels: list[str], colour: Colour | None, film: bool, width: int
+    ) -> None:
+        self._times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
+        count = len(bodies[0].frames)
+        strip = not film and len(bodies) == 1
+        columns = count if strip else len(bodies)
+        rows = 1 if film or strip else count
+        bar = None
+        if colour:
+            bodies, bar = _scaled(bodies, colour)
+        rest = _moves(bodies)
+        view = View.fitted(shown_points(bodies, rest), max(16, width // columns))
+        captions = labels + [""] * (columns - len(labels))
+        self._sheet = Sheet(view, captions, rows, bar, _font(width, columns))
+        palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
+        self._painter = Painter(bodies, view, palette, limit, rest)
+        self._panels = [(body, time) for time in range(count) for body in range(len(bodies))]
+        self._each = len(bodies)
+
+    def whole(self) -> Image:
+        """All panels on one page."""
+        return self._page(self._panels)
+
+    def pages(self) -> Iterator[Image]:
+        """One page for each time."""
+        for start in range(0, len(self._panels), self._each):
+            yield self._page(self._panels[start : start + self._each])
+
+    def close(self) -> None:
+        """Free the window."""
+        self._painter.close()
+
+    def _page(self, panels: list[tuple[int, int]]) -> Image:
+        images = [self._painter.image(body, time) for body, time in panels]
+        return self._sheet.page(images, [self._times[body][time] for body, time in panels])
+
+
+def _font(width: int, columns: int) -> float:
+    """Height of the text: a sixtieth of a picture of several panels."""
+    return width / 62 if columns > 2 else width / 50 if columns == 2 else width / 36
+
+
+def _check_arguments(
+    runs: list[Trajectory],
+    output: Path,
+    labels: Sequence[str] | None,
+    colour: Colour | None,
+    reference: Trajectory | None,
+) -> bool:
+    """Whether the output is a film."""
+    if not runs:
+        raise InputError("render: expected at least one trajectory.")
+    if labels is not None and len(labels) != len(runs):
+        raise InputError(f"{len(labels)} labels for {len(runs)} runs: expected as many.")
+    if colour not in (None, *_COLOURINGS):
+        raise InputError(f"colour = {colour!r}: expected 'displacement', 'error' or None.")
+    if colour == "error" and reference is None:
+        raise InputError("colour = 'error': expected a reference trajectory.")
+    suffix = output.suffix.lower()
+    if suffix not in (".png", ".gif", ".mp4"):
+        raise InputError(f"{output}: expected a name ending in .png, .gif or .mp4.")
+    return suffix != ".png"
+
+
+def _common_frames(runs: list[Trajectory]) -> NDArray[np.int64]:
+    """Frames (runs, n) of the times that all runs have."""
+    times = runs[0].times
+    tolerance = 1e-6 * float(np.diff(times).min()) if len(times) > 1 else 1e-9
+    frames = []
+    for run in runs:
+        after = np.clip(np.searchsorted(run.times, times), 1, max(1, len(run.times) - 1))
+        near = np.stack([after - 1, np.minimum(after, len(run.times) - 1)])
+        best = np.abs(run.times[near] - times).argmin(axis=0)
+        frames.append(near[best, np.arange(len(times))])
+    found = np.array(frames, dtype=np.int64)
+    gaps = np.array([np.abs(r.times[f] - times) for r, f in zip(runs, found, strict=True)])
+    common = found[:, (gaps <= tolerance).all(axis=0)]
+    if not common.shape[1]:
+        raise InputError("the runs have no time in common: expected some.")
+    return common
+
+
+def _choose(frame: int | Sequence[int] | None, count: int, film: bool) -> list[int]:
+    """Places among ``count`` common frames."""
+    if frame is None:
+        return list(range(count)) if film else [count - 1]
+    wanted = [frame] if isinstance(frame, (int, np.integer)) else list(frame)
+    if not wanted:
+        raise InputError("frame is an empty list: expected at least one frame.")
+    for number in wanted:
+        if not -count <= number < count:
+            raise InputError(f"frame {number}: expected {-count} to {count - 1}.")
+    return [int(number) % count for number in wanted]
+
+
+def _body(
+    run: Trajectory,
+    frames: NDArray[np.int64],
+    colour: Colour | None,
+    reference: Trajectory | None,
+    reference_frames: NDArray[np.int64],
+) -> Body:
+    if colour != "error" or reference is None:
+        moved = run.positions[frames] - run.points
+        return Body(run, frames, np.linalg.norm(moved, axis=2) if colour else None)
+    if len(run.points) > len(reference.points):  # its nodes at those of the reference
+        nodes = coincident_nodes(run.points, reference.points, _tolerance(reference))
+        run = replace(
+            run, positions=run.positions[:, nodes], velocities=run.velocities[:, nodes],
+            points=reference.points, cells=reference.cells,
+        )  # fmt: skip
+    nodes = coincident_nodes(reference.points, run.points, _tolerance(run))
+    difference = run.positions[frames] - reference.positions[reference_frames][:, nodes]
+    return Body(run, frames, np.linalg.norm(difference, axis=2))
+
+
+def _tolerance(run: Trajectory) -> float:
+    return 1e-6 * float(np.ptp(run.points[run.cells[0]], axis=0).max())
+
+
+def _scaled(bodies: list[Body], colour: Colour) -> tuple[list[Body], ColourBar]:
+    """Values in the unit in which the largest reads best."""
+    largest = max(float(b.values.max()) for b in bodies if b.values is not None)
+    factor, unit = length_unit(largest or 1e-3)
+    title, palette = _COLOURINGS[colour]
+    bar = ColourBar(f"{title} [{unit}]", palette, round_limit(factor * largest or 1.0))
+    return [replace(b, values=factor * b.values) for b in bodies if b.values is not None], bar
+
+
+def _moves(bodies: list[Body]) -> bool:
+    """Whether some body is seen away from rest, by a hundredth of its size."""
+    for body in bodies:
+        size = np.ptp(body.run.points, axis=0).max()
+        if np.abs(body.run.positions[body.frames] - body.run.points).max() > 0.01 * size:
+            return True
+    return False
+
+
+# --- is there a way to draw? -----------------------------------------------------------
+
+_PROBE = """
+import pyvista as pv
+plotter = pv.Plotter(off_screen=True, window_size=(64, 64))
+plotter.add_mesh(pv.Cube(), color="red")
+image = plotter.screenshot(return_img=True)
+assert image.reshape(-1, 3).std() > 0
+window = plotter.render_window
+lines = window.ReportCapabilities().splitlines() if window else []
+found = [line.split(":", 1)[1].strip() for line in lines if "renderer string" in line]
+print(pv.__version__, type(window).__name__, found[0] if found else "")
+"""
+
+
+def check_offscreen(timeout: float = 120.0) -> str:
+    """Draw a cube in another process, which may crash: "ok (...)" or what to install."""
+    remedy = (
+        "install EGL with `apt-get install libegl1 libgl1` (Debian, Ubuntu) or use a VTK built "
+        "with OSMesa"
+    )
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer in {timeout:g} s; {remedy}"
+    if probe.returncode == 0:
+        return f"ok ({' '.join(probe.stdout.split())})"
+    last = probe.stderr.strip().splitlines()[-1:] or [f"exit status {probe.returncode}"]
+    return f"failed ({last[0]}); {remedy}"

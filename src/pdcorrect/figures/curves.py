@@ -1,0 +1,165 @@
+"""Plots of curves with matplotlib, always with units and never on a screen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError, OutputError, require_extra
+from pdcorrect.state import Trajectory
+
+Array = NDArray[np.float64]
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_STYLES = ("-", "--", "-.", ":")
+_ENERGIES = {
+    "elastic_energy": "elastic [J]",
+    "kinetic_energy": "kinetic [J]",
+    "external_work": "work of the loads [J]",
+}
+
+
+def _axes(rows: int, height: float) -> tuple[Any, Any]:
+    figure = require_extra("matplotlib.figure", "view").Figure(
+        figsize=(7.5, height), layout="constrained"
+    )
+    axes = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
+    for axis in axes:
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _save(figure: Any, output: str | Path) -> Path:
+    require_extra("matplotlib.backends.backend_agg", "view").FigureCanvasAgg(figure)
+    suffix = Path(output).suffix[1:].lower()
+    known = figure.canvas.get_supported_filetypes()
+    if suffix not in known:
+        raise InputError(f"{output}: expected a name ending in .{', .'.join(sorted(known))}.")
+    try:
+        figure.savefig(output, dpi=150)
+    except OSError as error:
+        reason = error.strerror or error
+        raise OutputError(f"{output}: cannot be written ({reason}).") from error
+    return Path(output)
+
+
+def _labelled(
+    trajectories: Sequence[Trajectory] | Trajectory, labels: Sequence[str]
+) -> list[tuple[Trajectory, str]]:
+    runs = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
+    if not runs or len(labels) != len(runs):
+        raise InputError(f"{len(labels)} labels for {len(runs)} runs: expected as many, and some.")
+    return list(zip(runs, labels, strict=True))
+
+
+def _legend(figure: Any, axes: Sequence[Any]) -> None:
+    """Above the axes, so that it hides nothing."""
+    lines: dict[str, Any] = {}
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        lines |= dict(zip(labels, handles, strict=True))
+    figure.legend(
+        lines.values(), lines, loc="outside upper center", ncols=min(4, len(lines)),
+        frameon=False, fontsize=9,
+    )  # fmt: skip
+
+
+def _style(index: int) -> dict[str, Any]:
+    return {
+        "color": _COLOURS[index % len(_COLOURS)],
+        "linestyle": _STYLES[index % len(_STYLES)],
+        "linewidth": 1.8,
+    }
+
+
+def plot_node_trajectories(
+    trajectories: Sequence[Trajectory] | Trajectory,
+    output: str | Path,
+    *,
+    node_point: Sequence[float] | Array,
+    labels: Sequence[str],
+) -> Path:
+    """Displacement in x, y, z over time of the node nearest to a rest point (m), each run."""
+    runs, place = _labelled(trajectories, labels), np.asarray(node_point, dtype=np.float64)
+    if place.shape != (3,):
+        raise InputError(f"node_point has shape {place.shape}: expected three coordinates.")
+    figure, axes = _axes(3, 7.0)
+    for index, (run, label) in enumerate(runs):
+        node = int(np.linalg.norm(run.points - place, axis=1).argmin())
+        moved = 1e3 * (run.positions[:, node] - run.points[node])
+        for axis, values, name in zip(axes, moved.T, "xyz", strict=True):
+            axis.plot(run.times, values, label=label, **_style(index))
+            axis.set_ylabel(f"{name} displacement [mm]")
+    nearest = runs[0][0].points[np.linalg.norm(runs[0][0].points - place, axis=1).argmin()]
+    where = ", ".join(f"{x:.3g}" for x in nearest)
+    axes[0].set_title(f"node at rest at ({where}) m", fontsize=11)
+    _legend(figure, axes)
+    axes[-1].set_xlabel("time [s]")
+    return _save(figure, output)
+
+
+def plot_energy(
+    trajectories: Sequence[Trajectory] | Trajectory, output: str | Path, *, labels: Sequence[str]
+) -> Path:
+    """Elastic and kinetic energy and the work of the loads so far, over time, J.
+
+    Raises
+    ------
+    InputError
+        If no run has any of them among its statistics.
+    """
+    runs = _labelled(trajectories, labels)
+    names = {name: t for name, t in _ENERGIES.items() if any(name in r.stats for r, _ in runs)}
+    if not names:
+        raise InputError(f"no run has any of {', '.join(_ENERGIES)} among its statistics.")
+    figure, axes = _axes(len(names), 1.0 + 2.0 * len(names))
+    for axis, (name, title) in zip(axes, names.items(), strict=True):
+        axis.set_ylabel(title)
+        for index, (run, label) in enumerate(runs):
+            if name in run.stats:
+                values = np.asarray(run.stats[name], dtype=np.float64)
+                values = np.cumsum(values) if name == "external_work" else values
+                axis.plot(run.times[1:], values, label=label, **_style(index))
+    _legend(figure, axes)
+    axes[-1].set_xlabel("time [s]")
+    return _save(figure, output)
+
+
+def plot_error_over_time(errors: Mapping[str, Array], times: Array, output: str | Path) -> Path:
+    """RMS node distance (m) from the reference over time, one curve a label."""
+    for label, values in errors.items():
+        if values.shape != times.shape:
+            raise InputError(f"{label}: {values.shape} errors at {times.shape} times.")
+    figure, (axis,) = _axes(1, 4.0)
+    for index, (label, values) in enumerate(errors.items()):
+        axis.plot(times[1:], 1e3 * values[1:], label=label, **_style(index))
+    axis.set_ylabel("RMS distance from the reference [mm]")
+    axis.set_xlabel("time [s]")
+    axis.set_ylim(bottom=0)
+    _legend(figure, [axis])
+    return _save(figure, output)
+
+
+def plot_error_against_time(points: Mapping[str, tuple[float, float]], output: str | Path) -> Path:
+    """RMS error (m) against seconds a frame, both axes logarithmic, one mark a label."""
+    figure, (axis,) = _axes(1, 4.2)
+    for index, (label, (seconds, error)) in enumerate(points.items()):
+        axis.loglog(
+            1e3 * seconds, 1e3 * error, "o", markersize=9, label=label,
+            color=_COLOURS[index % len(_COLOURS)],
+        )  # fmt: skip
+    axis.set_xlabel("time a frame [ms]")
+    axis.set_ylabel("RMS error [mm]")
+    axis.margins(0.25)
+    ticker = require_extra("matplotlib.ticker", "view")
+    for direction in (axis.xaxis, axis.yaxis):
+        direction.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+        direction.set_major_formatter("{x:g}")
+        direction.set_minor_formatter(ticker.NullFormatter())
+    _legend(figure, [axis])
+    return _save(figure, output)

@@ -1,0 +1,227 @@
+"""One body in one picture: camera, surface, colours (pyvista, off-screen).
+
+All panels share a camera with parallel projection, so that lengths compare.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import require_extra
+from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
+from pdcorrect.state import Trajectory
+
+Array = NDArray[np.float64]
+
+_TO_CAMERA = np.array([-0.55, -1.0, 0.5])
+_MARGIN = 0.04  # of the panel's width, kept free on each side
+_SHAPES = 0.42, 1.25  # smallest and largest height of a panel, in widths
+_OVERSAMPLING = 2
+_LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
+"""Places (right, up, towards the camera) and strengths."""
+_PLAIN = "#7f9fc4"
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What a panel shows.
+
+    Attributes
+    ----------
+    run : Trajectory
+    frames : (n,) int
+        Its frame at each time that is drawn.
+    values : (n, N) or None
+        What colours the nodes at those times.
+    """
+
+    run: Trajectory
+    frames: NDArray[np.int64]
+    values: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Camera fitted to points.
+
+    Attributes
+    ----------
+    axes : (3, 3)
+        Rows: to the right, upwards, towards the camera.
+    low, high : (3,)
+        Corners of what is seen in these directions, m.
+    size : tuple of int
+        Pixels.
+    """
+
+    axes: Array
+    low: Array
+    high: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def fitted(cls, points: Array, width: int) -> View:
+        """Show all points (n, 3) in panels of ``width`` pixels."""
+        back = _TO_CAMERA / np.linalg.norm(_TO_CAMERA)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(back, right), back])
+        flat = points @ axes.T
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        extent = np.maximum(high - low, 1e-9 * np.abs(flat).max() + 1e-12)
+        free = 1 - 2 * _MARGIN
+        shape = float(np.clip(extent[1] / extent[0] * free + 2 * _MARGIN, *_SHAPES))
+        height = round(width * shape)
+        metres = max(extent[0] / free, extent[1] / (shape - 2 * _MARGIN))  # across the width
+        half = 0.5 * metres * np.array([1.0, height / width])
+        middle = 0.5 * (low + high)
+        low = np.array([*(middle[:2] - half), low[2]])
+        high = np.array([*(middle[:2] + half), high[2]])
+        return cls(axes, low, high, (width, height))
+
+    @property
+    def pixels_a_metre(self) -> float:
+        """Scale of the picture, 1/m."""
+        return float(self.size[0] / (self.high[0] - self.low[0]))
+
+    @property
+    def depth(self) -> float:
+        """Distance between the nearest and the farthest point that fits, m."""
+        return float(np.linalg.norm(self.high - self.low))
+
+    def aim(self, camera: Any) -> None:
+        """Point a pyvista camera."""
+        middle = 0.5 * (self.low + self.high) @ self.axes
+        camera.focal_point = middle
+        camera.position = middle + 3 * self.depth * self.axes[2]
+        camera.up = self.axes[1]
+        camera.parallel_projection = True
+        camera.parallel_scale = 0.5 * (self.high[1] - self.low[1])
+        camera.clipping_range = (0.5 * self.depth, 6 * self.depth)
+
+
+def shown_points(bodies: Sequence[Body], rest: bool) -> Array:
+    """All positions that a picture has to hold, (n, 3), with those at rest or without."""
+    clouds = [body.run.positions[body.frames].reshape(-1, 3) for body in bodies]
+    clouds += [body.run.points for body in bodies if rest]
+    return np.concatenate(clouds)
+
+
+class Painter:
+    """Draws bodies one by one into images of equal size.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+    view : View
+    palette : str
+        Name of a colour map.
+    limit : float
+        Value of its upper end; the lower one is 0.
+    rest : bool
+        Whether to draw the edges of the shape at rest behind the body.
+    """
+
+    def __init__(
+        self, bodies: Sequence[Body], view: View, palette: str, limit: float, rest: bool
+    ) -> None:
+        self._pv = _pyvista()
+        self._view = view
+        self._plotter = self._pv.Plotter(
+            off_screen=True,
+            window_size=tuple(_OVERSAMPLING * s for s in view.size),
+            lighting="none",
+        )
+        self._plotter.set_background("white")
+        for place, strength in _LIGHTS:
+            self._plotter.add_light(
+                self._pv.Light(position=place, light_type="camera light", intensity=strength)
+            )
+        self._bodies = list(bodies)
+        self._palette, self._limit = palette, limit
+        self._actors: list[list[Any]] = []
+        self._surfaces = [self._add(body, rest) for body in bodies]
+        view.aim(self._plotter.camera)
+
+    def image(self, body: int, time: int) -> NDArray[np.uint8]:
+        """RGB picture (height, width, 3) of a body at one of its times."""
+        for number, actors in enumerate(self._actors):
+            for actor in actors:
+                actor.visibility = number == body
+        shown, (surface, nodes) = self._bodies[body], self._surfaces[body]
+        surface.points = shown.run.positions[shown.frames[time]][nodes]
+        surface.cell_data.active_normals = _normals(surface.points[surface.regular_faces])
+        if shown.values is not None:
+            surface["value"] = shown.values[time][nodes]
+        self._plotter.render()
+        raw = np.asarray(self._plotter.screenshot(None, return_img=True), dtype=np.float64)
+        k = _OVERSAMPLING
+        raw = raw.reshape(raw.shape[0] // k, k, raw.shape[1] // k, k, 3).mean(axis=(1, 3))
+        return np.rint(raw).astype(np.uint8)
+
+    def close(self) -> None:
+        """Free the window."""
+        self._plotter.close()
+
+    def _add(self, body: Body, rest: bool) -> tuple[Any, NDArray[np.int64]]:
+        """Add a body's surface; returns it and the node of each of its points."""
+        nodes, faces = _surface(body.run)
+        surface = self._pv.PolyData.from_regular_faces(body.run.points[nodes], faces)
+        style: dict[str, Any] = {"color": _PLAIN}
+        if body.values is not None:
+            surface["value"] = np.zeros(len(nodes))
+            style = {
+                "scalars": "value",
+                "cmap": self._palette,
+                "clim": (0.0, self._limit),
+                "show_scalar_bar": False,
+            }
+        actors = [
+            self._plotter.add_mesh(surface, ambient=0.5, diffuse=0.55, specular=0.0, **style),
+        ]
+        actors[0].prop.edge_color = "#202020"
+        cell = self._view.pixels_a_metre * _edge_length(body.run)
+        if cell > 4:
+            actors[0].prop.show_edges = True
+            actors[0].prop.edge_opacity = float(np.clip(cell / 25, 0.15, 0.75))
+            actors[0].prop.line_width = 1.1 * _OVERSAMPLING
+        if rest:
+            outline = self._pv.PolyData.from_regular_faces(body.run.points[nodes], faces)
+            outline = outline.extract_feature_edges(30)
+            outline.points -= 1.5 * self._view.depth * self._view.axes[2]  # behind the body
+            width = 1.3 * _OVERSAMPLING
+            actors.append(self._plotter.add_mesh(outline, color="#c4c4c4", line_width=width))
+        self._actors.append(actors)
+        return surface, nodes
+
+
+def _surface(run: Trajectory) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Nodes (n,) of the boundary, and its faces (f, 4) in their numbering."""
+    faces, _ = boundary_faces(run.cells[:, :8])
+    nodes, local = np.unique(faces, return_inverse=True)
+    return nodes, local.reshape(faces.shape)
+
+
+def _normals(corners: Array) -> Array:
+    """One unit normal (f, 3) for each face (f, 4, 3), also for a warped one."""
+    normals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+
+
+def _edge_length(run: Trajectory) -> float:
+    """Median length of the cells' edges at rest, m."""
+    ends = run.points[run.cells[:, :8][:, VTK_EDGES]]  # (C, 12, 2, 3)
+    return float(np.median(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)))
+
+
+def _pyvista() -> Any:
+    """pyvista, without VTK's warning that there is no X server."""
+    pyvista = require_extra("pyvista", "view")
+    logger = require_extra("vtkmodules.vtkCommonCore", "view").vtkLogger
+    logger.SetStderrVerbosity(logger.VERBOSITY_ERROR)
+    return pyvista

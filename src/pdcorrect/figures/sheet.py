@@ -1,0 +1,195 @@
+"""The sheet on which panels are laid out: labels, times, colour bar, scale, axes.
+
+Text is drawn by matplotlib and has its own place, so that it never lies on a
+body; the panels are pasted between it, pixel by pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import require_extra
+from pdcorrect.figures.panels import View
+
+_INK, _GREY = "#111111", "#555555"
+_AXES = {"x": "#c0392b", "y": "#2e8b57", "z": "#2364aa"}
+_MARKS = {"nbins": 7, "steps": [1, 2, 2.5, 4, 5, 10]}
+_LINE = 1.3  # of the font size
+
+
+@dataclass(frozen=True)
+class ColourBar:
+    """Title, colour map and upper end of the shared colour scale."""
+
+    title: str
+    palette: str
+    limit: float
+
+
+class Sheet:
+    """Rows and columns of panels, a caption above each, a legend below them all.
+
+    Parameters
+    ----------
+    view : View
+        The panels' camera and size.
+    labels : sequence of str
+        One for each column, in the first row; may have several lines.
+    rows : int
+    bar : ColourBar or None
+    font : float
+        Height of the text, pixels.
+    """
+
+    def __init__(
+        self, view: View, labels: Sequence[str], rows: int, bar: ColourBar | None, font: float
+    ) -> None:
+        figure = require_extra("matplotlib.figure", "view")
+        agg = require_extra("matplotlib.backends.backend_agg", "view")
+        self._view, self._labels, self._rows, self._font = view, list(labels), rows, font
+        lines = max(len(label.splitlines()) for label in labels)
+        self._gap = round(0.5 * font)
+        self._captions = [round((lines + 1) * _LINE * font + 1.2 * self._gap)]
+        self._captions += [round(_LINE * font + 1.2 * self._gap)] * (rows - 1)
+        self._legend = round(4.2 * font)
+        width, height = view.size
+        total = sum(self._captions) + rows * height + self._legend
+        self.size = (_even(width * len(labels)), _even(total))
+        self._figure = figure.Figure(figsize=(self.size[0] / 100, self.size[1] / 100), dpi=100)
+        self._canvas = agg.FigureCanvasAgg(self._figure)
+        self._times: list[Any] = []
+        self._add_captions()
+        self._add_scale()
+        self._add_axes()
+        if bar:
+            self._add_bar(bar)
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def page(
+        self, images: Sequence[NDArray[np.uint8]], times: Sequence[float]
+    ) -> NDArray[np.uint8]:
+        """The whole picture (height, width, 3); images and times (s) row by row."""
+        self._canvas.restore_region(self._background)
+        for text, time in zip(self._times, times, strict=True):
+            text.set_text(f"t = {time:.3f} s")
+            self._figure.draw_artist(text)
+        page = np.array(self._canvas.buffer_rgba())[:, :, :3]
+        for number, image in enumerate(images):
+            left, top = self._corner(*divmod(number, len(self._labels)))
+            page[top : top + image.shape[0], left : left + image.shape[1]] = image
+        return page
+
+    def _corner(self, row: int, column: int) -> tuple[int, int]:
+        """Left and upper pixel of a panel."""
+        width, height = self._view.size
+        return column * width, sum(self._captions[: row + 1]) + row * height
+
+    def _text(self, x: float, y: float, text: str, size: float, **style: Any) -> Any:
+        """Text with its upper left corner at pixel (x, y) from the upper left."""
+        options = {"ha": "left", "va": "top", "color": _INK, **style}
+        return self._figure.text(
+            x / self.size[0], 1 - y / self.size[1], text, fontsize=0.72 * size, **options
+        )
+
+    def _add_captions(self) -> None:
+        pad, room = 2 * self._gap, self._view.size[0] - 3 * self._gap
+        texts = []
+        for column, label in enumerate(self._labels):
+            x = self._corner(0, column)[0] + pad
+            for line, words in enumerate(label.splitlines()):
+                style = {"weight": "bold"} if line == 0 else {"color": _GREY}
+                y = self._gap + line * _LINE * self._font
+                texts.append(self._text(x, y, words, self._font, **style))
+        widest = max((t.get_window_extent().width for t in texts), default=0.0)
+        font = self._font * min(1.0, room / max(widest, 1.0))
+        for text in texts:
+            text.set_fontsize(0.72 * font)
+        for row in range(self._rows):
+            for column in range(len(self._labels)):
+                x, y = self._corner(row, column)
+                y -= round(_LINE * self._font + 0.2 * self._gap)
+                time = self._text(x + pad, y, "", font, color=_GREY, animated=True)
+                self._times.append(time)
+
+    def _add_scale(self) -> None:
+        """A bar of round length, true in the plane of the picture."""
+        pixels = self._view.pixels_a_metre
+        length = round_length(0.8 * 7 * self._font / pixels)
+        left, y = 6.5 * self._font, self.size[1] - 1.2 * self._font
+        self._line([left, left + length * pixels], [y, y], _INK, 0.16 * self._font)
+        for x in (left, left + length * pixels):
+            self._line([x, x], [y - 0.3 * self._font, y + 0.3 * self._font], _INK, 1.5)
+        self._text(
+            left + 0.5 * length * pixels, y - 0.5 * self._font, length_text(length), self._font,
+            ha="center", va="bottom",
+        )  # fmt: skip
+
+    def _add_axes(self) -> None:
+        """The directions x, y, z as the camera sees them."""
+        origin = np.array([2.3 * self._font, self.size[1] - 1.7 * self._font])
+        for index in np.argsort(self._view.axes[2]):  # the one pointing at the viewer last
+            name = "xyz"[index]
+            arrow = 1.75 * self._font * self._view.axes[:2, index] * [1, -1]
+            tip, mark = origin + arrow, origin + 1.38 * arrow
+            self._line([origin[0], tip[0]], [origin[1], tip[1]], _AXES[name], 0.11 * self._font)
+            style = {"color": _AXES[name], "ha": "center", "va": "center"}
+            self._text(mark[0], mark[1], name, 0.9 * self._font, **style)
+
+    def _line(self, x: list[float], y: list[float], colour: str, width: float) -> None:
+        lines = require_extra("matplotlib.lines", "view")
+        places = (np.array(x) / self.size[0], 1 - np.array(y) / self.size[1])
+        self._figure.add_artist(
+            lines.Line2D(*places, color=colour, linewidth=0.72 * width, solid_capstyle="butt")
+        )
+
+    def _add_bar(self, bar: ColourBar) -> None:
+        cm = require_extra("matplotlib.cm", "view")
+        colors = require_extra("matplotlib.colors", "view")
+        ticker = require_extra("matplotlib.ticker", "view")
+        width, height, font = *self.size, self._font
+        left = max(0.3 * width, 14.5 * font)
+        right = max(0.72 * width, min(width - 2 * font, left + 18 * font))
+        axes = self._figure.add_axes(
+            (left / width, 1.75 * font / height, (right - left) / width, 0.75 * font / height)
+        )
+        mapping = cm.ScalarMappable(colors.Normalize(0.0, bar.limit), bar.palette)
+        drawn = self._figure.colorbar(mapping, cax=axes, orientation="horizontal")
+        drawn.set_ticks(ticker.MaxNLocator(**_MARKS).tick_values(0.0, bar.limit))
+        axes.tick_params(labelsize=0.72 * 0.9 * font, length=0.25 * font, width=1, pad=2)
+        drawn.outline.set_visible(False)
+        self._text(left, height - 2.75 * font, bar.title, font, va="bottom")
+
+
+def round_limit(largest: float) -> float:
+    """The end of a scale with round marks that holds 0 to ``largest``."""
+    ticker = require_extra("matplotlib.ticker", "view")
+    return float(ticker.MaxNLocator(**_MARKS).tick_values(0.0, largest)[-1])
+
+
+def round_length(length: float) -> float:
+    """The largest 1, 2 or 5 times a power of ten that is not above ``length`` (m)."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-12)))
+
+
+def length_text(length: float) -> str:
+    """A length in m, mm or µm, whichever reads best."""
+    factor, unit = length_unit(length)
+    return f"{factor * length:.6g} {unit}"
+
+
+def length_unit(length: float) -> tuple[float, str]:
+    """Factor and name of the unit in which a length in m reads best."""
+    if length >= 1.0:
+        return 1.0, "m"
+    return (1e3, "mm") if length >= 1e-3 else (1e6, "µm")
+
+
+def _even(size: int) -> int:
+    return size + size % 2  # films need it
