@@ -97,6 +97,7 @@ def compare(
     figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
 ) -> None:
     """Run coarse, intermediate and fine PD and Newton; report error and run time."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
@@ -123,9 +124,10 @@ def compare(
 
     from pdcorrect import report
 
-    table = Table(title=loaded.name)
+    table = Table(title=loaded.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in report.HEADINGS:
-        table.add_column(heading, justify="left" if heading == "solver" else "right")
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.columns[0].justify = "left"
     for row in report.table(comparison):
         table.add_row(*row)
     _say("drawing the figures ..." if figures else "")

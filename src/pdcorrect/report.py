@@ -17,7 +17,7 @@ from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import largest_displacement
 
 HEADINGS = (
-    "solver", "nodes", "RMS [mm]", "worst [mm]", "corrected", "ms/frame", "speed-up", "iterations",
+    "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
 )  # fmt: skip
 
 
@@ -33,7 +33,7 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 str(row.nodes),
                 "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
-                "" if np.isnan(row.omega) else f"{row.omega:.1f} %",
+                "" if np.isnan(row.omega) else f"{round(row.omega, 1) + 0.0:.1f} %",
                 f"{1e3 * row.seconds_a_frame:.3g}",
                 f"{slowest / row.seconds_a_frame:.3g}x",
                 f"{row.iterations_a_frame:.1f}",
