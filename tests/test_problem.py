@@ -22,7 +22,7 @@ def distorted_problem(poisson=0.4):
     materials = Materials.from_moduli(
         scene.material, np.linspace(2e5, 4e5, count), np.full(count, poisson), np.full(count, 1e3)
     )
-    return _build(scene, 1, "hex8", "lumped", mesh, space, space.quadrature(), materials, 0.05)
+    return _build(scene, 1, mesh, space, space.quadrature(), materials, 0.05)
 
 
 @pytest.mark.parametrize("make", [lambda: pc.discretise(cross()), distorted_problem])

@@ -34,7 +34,6 @@ class Problem:
     scene : Scene
     refine : int
         Each coarse cell is cut into ``refine ** 3``.
-    element, mass_rule : str
     space : Space
         The scalar finite element space.
     mesh : HexMesh
@@ -53,8 +52,6 @@ class Problem:
 
     scene: Scene
     refine: int
-    element: str
-    mass_rule: str
     mesh: HexMesh
     space: Space
     quadrature: Quadrature
@@ -71,6 +68,16 @@ class Problem:
         )
 
     # --- names of the contract --------------------------------------------------
+
+    @property
+    def element(self) -> str:
+        """Name of the element."""
+        return self.scene.solver.element
+
+    @property
+    def mass_rule(self) -> str:
+        """Name of the mass rule."""
+        return self.scene.solver.mass
 
     @property
     def positions(self) -> Array:
@@ -199,8 +206,8 @@ class Problem:
         """
         materials = self.materials.changed(self.scene.material, young, poisson, density)
         return _build(
-            self.scene, self.refine, self.element, self.mass_rule, self.mesh, self.space,
-            self.quadrature, materials, self.cell_size,
+            self.scene, self.refine, self.mesh, self.space, self.quadrature, materials,
+            self.cell_size,
         )  # fmt: skip
 
     # --- internals ----------------------------------------------------------------
@@ -237,27 +244,29 @@ def discretise(
     mesh = refine_mesh(coarse, refine)
     space = Space(mesh, scene.solver.element)
     cell_size = float(np.cbrt(Space(coarse).volumes().mean()))
-    return _build(
-        scene, refine, scene.solver.element, scene.solver.mass, mesh, space, space.quadrature(),
-        Materials.from_scene(scene, Selector(mesh, space.positions, cell_size), len(mesh.cells)),
-        cell_size,
-    )  # fmt: skip
+    selector = Selector(mesh, space.positions, cell_size)
+    materials = Materials.from_scene(scene, selector, len(mesh.cells))
+    return _build(scene, refine, mesh, space, space.quadrature(), materials, cell_size)
 
 
 def _build(
-    scene: Scene, refine: int, element: str, mass_rule: str, mesh: HexMesh, space: Space,
-    quadrature: Quadrature, materials: Materials, cell_size: float,
-) -> Problem:  # fmt: skip
+    scene: Scene,
+    refine: int,
+    mesh: HexMesh,
+    space: Space,
+    quadrature: Quadrature,
+    materials: Materials,
+    cell_size: float,
+) -> Problem:
     selector = Selector(mesh, space.positions, cell_size)
-    matrix = mass_matrix(mass_rule, space, materials.density)
+    matrix = mass_matrix(scene.solver.mass, space, materials.density)
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
     _freeze(space.positions, space.cells, clamps.free, quadrature.gradients, quadrature.weights)
     _freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
-        scene, refine, element, mass_rule, mesh, space, quadrature, materials, clamps, loads,
-        matrix, cell_size,
-    )  # fmt: skip
+        scene, refine, mesh, space, quadrature, materials, clamps, loads, matrix, cell_size
+    )
 
 
 def _coarse_mesh(scene: Scene) -> HexMesh:
