@@ -28,6 +28,7 @@ ORDER = [
     "fem.decomposition",
     "fem.energies",
     "fem.kernels",
+    "fem.conjugate_gradients",
     "fem.factorisation",
     "fem.selection",
     "fem.loads",

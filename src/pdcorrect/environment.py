@@ -112,7 +112,7 @@ def _factorisations() -> list[Check]:
         except ImportError as error:
             remedy = f"missing ({error}); pip install {backend.replace('amg', 'pyamg')}"
             checks.append(Check(f"factorisation {backend}", remedy, backend == "amg"))
-    checks.append(Check("factorisation used for G", choose_backend(10, 28)))
+    checks.append(Check("factorisation used for G", choose_backend(10)))
     return checks
 
 

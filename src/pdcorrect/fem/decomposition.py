@@ -116,7 +116,31 @@ def signed_svd_lanes(F, U, s, V, B, S):  # type: ignore[no-untyped-def]
     _order(B, V, 0, 1)
     _order(B, V, 0, 2)
     _order(B, V, 1, 2)
+    _polish(B, V)
+    _order(B, V, 1, 2)
     _orthonormalise(B, V, U, s)
+
+
+@njit(inline="always", **OPTIONS)
+def _polish(B, V):  # type: ignore[no-untyped-def]
+    """Make columns 1 and 2 of B orthogonal to their own size, which F^T F cannot resolve."""
+    for l in range(B.shape[1]):
+        x0, x1, x2 = B[1, l], B[4, l], B[7, l]
+        y0, y1, y2 = B[2, l], B[5, l], B[8, l]
+        a, b = x0 * x0 + x1 * x1 + x2 * x2, y0 * y0 + y1 * y1 + y2 * y2
+        d = x0 * y0 + x1 * y1 + x2 * y2
+        gap = b - a
+        tangent = math.copysign(2.0, gap) * d
+        tangent /= abs(gap) + math.sqrt(gap * gap + 4.0 * d * d) + 1e-300
+        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+        sine = tangent * cosine
+        for i in range(3):
+            x, y = B[3 * i + 1, l], B[3 * i + 2, l]
+            B[3 * i + 1, l] = cosine * x - sine * y
+            B[3 * i + 2, l] = sine * x + cosine * y
+            x, y = V[3 * i + 1, l], V[3 * i + 2, l]
+            V[3 * i + 1, l] = cosine * x - sine * y
+            V[3 * i + 2, l] = sine * x + cosine * y
 
 
 @njit(**OPTIONS)
@@ -150,7 +174,7 @@ def _orthonormalise(B, V, U, s):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _complete_basis(V, U, s, l):  # type: ignore[no-untyped-def]
     """Rank 0 or 1: the missing left vectors are the right ones, turned as little as needed."""
-    if not s[0, l] > 0.0:
+    if s[0, l] == 0.0:
         for i in range(9):
             U[i, l] = V[i, l]
         s[0, l], s[1, l], s[2, l] = 0.0, 0.0, 0.0

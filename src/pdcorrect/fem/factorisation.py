@@ -10,8 +10,10 @@ from __future__ import annotations
 import importlib.util
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Literal, Protocol
 
 import numpy as np
@@ -20,11 +22,13 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "cholespy", "splu", "amg"]
 
 _AMG_TOLERANCE = 1e-12
+_AMG_STEPS = 500
 _MEMORY_SHARE = 0.5
 """Share of the free memory that a factor may be expected to take."""
 
@@ -107,17 +111,25 @@ class MultigridSolver:
         self._cycle = self._hierarchy.aspreconditioner(cycle="V")
 
     def solve(self, b: Array) -> Array:
-        columns = np.asarray(b, dtype=np.float64).reshape(len(b), -1)
+        b = np.asarray(b, dtype=np.float64)
+        columns = b.reshape(len(b), -1)
         out = np.empty_like(columns)
         for i, column in enumerate(columns.T):
-            out[:, i], status = spla.cg(
-                self._matrix, column, rtol=_AMG_TOLERANCE, maxiter=500, M=self._cycle
+            found = conjugate_gradients(
+                self._matrix.__matmul__,
+                column,
+                self._cycle.matvec,
+                tolerance=_AMG_TOLERANCE,
+                max_steps=_AMG_STEPS,
             )
-            if status:
+            if not found.convex:
+                raise NotPositiveDefinite("multigrid-preconditioned CG met negative curvature")
+            if not found.converged:
                 raise NotPositiveDefinite(
-                    f"multigrid-preconditioned CG did not converge in {status} iterations"
+                    f"multigrid-preconditioned CG did not converge in {found.steps} steps"
                 )
-        return out.reshape(np.shape(b))
+            out[:, i] = found.x
+        return out.reshape(b.shape)
 
 
 _BACKENDS: dict[str, Callable[[sp.csc_matrix], Factor]] = {
@@ -127,7 +139,7 @@ _BACKENDS: dict[str, Callable[[sp.csc_matrix], Factor]] = {
 }
 
 
-def factorise(matrix: sp.spmatrix, backend: Backend = "auto") -> Factor:
+def factorise(matrix: sp.spmatrix, backend: Backend = "auto", unknowns: int = 1) -> Factor:
     """Factorise a symmetric positive definite matrix.
 
     Parameters
@@ -136,45 +148,69 @@ def factorise(matrix: sp.spmatrix, backend: Backend = "auto") -> Factor:
     backend : {"auto", "cholespy", "splu", "amg"}
         "auto" takes a direct factor where it is expected to fit into memory
         (cholespy if installed), otherwise multigrid.
+    unknowns : int
+        For each node: 1 for G, 3 for a tangent.
 
     Raises
     ------
     NotPositiveDefinite
         If a pivot is not positive.
     """
+    check_backend(backend)
     if backend == "auto":
-        backend = choose_backend(matrix.shape[0], matrix.nnz)
-    if backend not in _BACKENDS:
-        raise InputError(f"backend {backend!r}: expected auto, {', '.join(_BACKENDS)}.")
+        backend = choose_backend(matrix.shape[0], unknowns)
     return _BACKENDS[backend](sp.csc_matrix(matrix))
 
 
-def choose_backend(size: int, nonzeros: int, memory: float | None = None) -> Backend:
-    """The back end for a matrix of this size; ``memory`` (bytes) defaults to what is free."""
-    memory = free_memory() if memory is None else memory
-    if factor_bytes(size, nonzeros) > _MEMORY_SHARE * memory:
+def check_backend(backend: str) -> None:
+    """Refuse a name that is none of the back ends or "auto"."""
+    if backend != "auto" and backend not in _BACKENDS:
+        raise InputError(f"backend {backend!r}: expected auto, {', '.join(_BACKENDS)}.")
+
+
+def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) -> Backend:
+    """The back end for a matrix of ``size`` rows.
+
+    ``memory`` (bytes) defaults to what is available.
+    """
+    memory = available_memory() if memory is None else memory
+    if factor_bytes(size, unknowns) > _MEMORY_SHARE * memory:
         return "amg"
     return "cholespy" if importlib.util.find_spec("cholespy") else "splu"
 
 
-def factor_bytes(size: int, nonzeros: int) -> float:
+def factor_bytes(size: int, unknowns: int = 1) -> float:
     """Expected bytes of a Cholesky factor of a three-dimensional mesh's matrix.
 
-    A compact 3-D mesh with n nodes fills about 12 n^(4/3) entries; a matrix of
-    three unknowns a node has nine times as many.  Within a factor of three for
-    blocks and beams of 700 to 18 000 nodes (``benchmarks``, case factor_size).
+    A compact 3-D mesh with n nodes fills about 12 n^(4/3) entries of 12 bytes; a
+    matrix of three unknowns a node has nine times as many.  Within a factor of
+    three for blocks and beams of 700 to 18 000 nodes (``benchmarks``, case
+    factor_size).
     """
-    unknowns = 3 if nonzeros > 45 * size else 1
-    nodes = size / unknowns
-    return 12.0 * nodes ** (4 / 3) * unknowns**2 * 12.0
+    return 12.0 * 12.0 * (size / unknowns) ** (4 / 3) * unknowns**2
 
 
-def free_memory() -> float:
-    """Free physical memory in bytes; infinite where the system does not tell."""
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (ValueError, OSError, AttributeError):
-        return float("inf")
+def available_memory() -> float:
+    """Bytes that a process may still take: the system's word, or the control group's if less."""
+    limits = [_available_memory_of_system()]
+    group = Path("/sys/fs/cgroup")
+    with suppress(OSError, ValueError):
+        limit = int((group / "memory.max").read_text())
+        limits.append(limit - int((group / "memory.current").read_text()))
+    return float(min(limits))
+
+
+def _available_memory_of_system() -> float:
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024.0 * float(line.split()[1])
+    with suppress(OSError, ValueError, AttributeError):
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    return float("inf")
+
+
+_REDIRECTION = threading.Lock()
 
 
 @contextmanager
@@ -183,17 +219,19 @@ def _silent_stdout() -> Iterator[None]:
 
     The exception says the same, and standard output belongs to the user.
     """
-    sys.stdout.flush()
-    try:
-        kept = os.dup(1)
-    except OSError:  # no standard output at all
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 1)
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(sink)
-        os.close(kept)
+    with _REDIRECTION:  # the descriptor belongs to the process, not to a thread
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        try:
+            kept = os.dup(1)
+        except OSError:  # no standard output at all
+            yield
+            return
+        sink = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(sink, 1)
+            yield
+        finally:
+            os.dup2(kept, 1)
+            os.close(sink)
+            os.close(kept)

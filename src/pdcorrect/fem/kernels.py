@@ -27,12 +27,12 @@ _CHUNK = 16
 
 
 @njit(**OPTIONS)
-def _deformation_gradient(u, nodes, gradients, F):  # type: ignore[no-untyped-def]
-    """F = I + sum_k u_k grad N_k, (9, Q), from nodal displacements u (N, 3)."""
+def _gradient(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-def]
+    """Diagonal I + sum_k u_k grad N_k, (9, Q), for nodal vectors u (N, 3); F for diagonal 1."""
     for i in range(3):
         for j in range(3):
             for q in range(F.shape[1]):
-                F[3 * i + j, q] = 1.0 if i == j else 0.0
+                F[3 * i + j, q] = diagonal if i == j else 0.0
     for k in range(nodes.shape[0]):
         node = nodes[k]
         for i in range(3):
@@ -88,7 +88,7 @@ def cell_energy_and_forces(u, cells, gradients, weights, mu, omega, energy, forc
         s, v = np.empty((3, lanes)), np.empty((3, lanes))
         k, density = np.empty(lanes), np.empty(lanes)
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _deformation_gradient(u, cells[c], gradients[c], F)
+            _gradient(u, cells[c], gradients[c], 1.0, F)
             signed_svd_lanes(F, U, s, V, B, S)
             if omega[c] > 0.0:
                 nearest_volume_lanes(s, v, k)
@@ -111,7 +111,7 @@ def linearise_cells(  # type: ignore[no-untyped-def]
         F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
         s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _deformation_gradient(u, cells[c], gradients[c], F)
+            _gradient(u, cells[c], gradients[c], 1.0, F)
             signed_svd_lanes(F, left[c], s, right[c], B, S)
             if omega[c] > 0.0:
                 nearest_volume_lanes(s, v, k)
@@ -128,10 +128,7 @@ def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: i
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         D, A, one = np.empty((9, lanes)), np.empty((9, lanes)), np.ones(lanes)
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _deformation_gradient(x, cells[c], gradients[c], D)
-            for i in range(3):
-                for q in range(lanes):
-                    D[4 * i, q] -= 1.0  # the gradient of x, without the identity
+            _gradient(x, cells[c], gradients[c], 0.0, D)
             _transform(left[c], D, right[c], A, True)
             _tangent_product(tangent[c], A)
             _transform(left[c], A, right[c], D, False)

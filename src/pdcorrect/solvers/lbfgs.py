@@ -22,6 +22,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.state import Status
 
 Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ _ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
 _BACKTRACKS = 30
+_ESTIMATE_STEPS = 1000
 _FIRST_CHECK = 0.15
 """Length of the loop's own step, of the tolerance, at which the estimate is first made.
 
@@ -178,8 +180,9 @@ def minimise(
 
     The loop watches the length of its own step.  When that is small, the
     remaining displacement is estimated by conjugate gradients on the true
-    Hessian; if the estimate is too large the loop goes on, having learnt how
-    far its own measure was off.
+    Hessian.  If that is too large the loop goes on, with the Newton step just
+    found as its next one (L-BFGS) and having learnt how far its own measure was
+    off.
     """
     p = start
     value, gradient = objective.value_and_gradient(p)
@@ -195,11 +198,13 @@ def minimise(
         direction = history.direction(gradient.ravel(), x.ravel()).reshape(p.shape)
         length = largest_displacement(direction)
         if length <= threshold:
-            estimate = remaining_displacement(objective, p, gradient, solve, direction)
+            exact, estimate = newton_step(objective, p, gradient, solve, direction)
             if estimate <= options.tolerance:
                 status = Status.CONVERGED
                 break
-            threshold = 0.5 * length * min(1.0, options.tolerance / estimate)
+            threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
+            if options.history and math.isfinite(estimate):
+                direction = exact
         if iteration == options.max_iterations:
             break
         found = line_search(objective, p, value, gradient, direction, bool(options.history))
@@ -267,43 +272,23 @@ def largest_displacement(x: Array) -> float:
     return float(np.sqrt(np.einsum("ni,ni->n", x, x).max()))
 
 
-def remaining_displacement(
-    objective: Objective,
-    p: Array,
-    gradient: Array,
-    solve: Solve,
-    guess: Array,
-    steps: int = 40,
-) -> float:
-    """Estimate of the largest node distance from p to the minimum, m.
+def newton_step(
+    objective: Objective, p: Array, gradient: Array, solve: Solve, guess: Array
+) -> tuple[Array, float]:
+    """-(d2 gamma)^-1 grad gamma (N, 3), m, and its largest node norm: the estimated error.
 
-    The Newton step (d2 gamma)^-1 grad gamma, by conjugate gradients
-    preconditioned with G and started from ``guess`` (minus the Newton step, as
-    the quasi-Newton direction is).  Infinite on negative curvature.
+    By conjugate gradients preconditioned with G, started from ``guess``, until
+    the length has settled to a tenth.  The estimate is infinite where that does
+    not happen or a direction of negative curvature is met.
     """
-    product = objective.hessian_operator(p)
-    x = -guess
-    r = gradient - product(x)
-    z = solve(r)
-    r_z = float(np.vdot(r, z))
-    target = 1e-2 * r_z
-    d = z
-    largest = largest_displacement(x)
-    for _ in range(steps):
-        if r_z <= 0.0 or not math.isfinite(r_z):
-            break
-        h_d = product(d)
-        curvature = float(np.vdot(d, h_d))
-        if curvature <= 0.0:
-            return math.inf
-        step = r_z / curvature
-        x = x + step * d
-        change = largest_displacement(step * d)
-        largest = largest_displacement(x)
-        r = r - step * h_d
-        z = solve(r)
-        r_z, old = float(np.vdot(r, z)), r_z
-        if r_z <= target and change <= 0.1 * largest:
-            break
-        d = z + (r_z / old) * d
-    return largest
+    found = conjugate_gradients(
+        objective.hessian_operator(p),
+        -gradient,
+        solve,
+        tolerance=0.1,
+        max_steps=_ESTIMATE_STEPS,
+        start=guess,
+        settled=lambda x, change: largest_displacement(change) <= 0.1 * largest_displacement(x),
+    )
+    exact = found.converged and found.convex
+    return found.x, largest_displacement(found.x) if exact else math.inf

@@ -77,7 +77,7 @@ class Newton(ImplicitStepper):
         for project in (False, True):
             matrix = objective.hessian(p, project)[self._free][:, self._free]
             try:
-                factor = factorise(matrix, self._backend)
+                factor = factorise(matrix, self._backend, unknowns=3)
                 step = factor.solve(g.ravel()[self._free])
             except NotPositiveDefinite:
                 if project:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.solvers.lbfgs import (
     MinimiserOptions,
     Minimum,
@@ -76,26 +77,8 @@ def newton_cg(
 
 
 def _direction(objective: Objective, p: Array, gradient: Array, solve: Solve) -> tuple[Array, bool]:
-    """The (truncated) Newton direction, and whether no negative curvature was met."""
-    product = objective.hessian_operator(p)
-    x = np.zeros_like(p)
-    r = -gradient
-    z = solve(r)
-    d, r_z = z, float(np.vdot(r, z))
-    if r_z <= 0.0:
-        return x, True
-    target = 1e-6 * r_z
-    for step in range(_INNER_STEPS):
-        h_d = product(d)
-        curvature = float(np.vdot(d, h_d))
-        if curvature <= 0.0:
-            return (z if step == 0 else x), False
-        alpha = r_z / curvature
-        x = x + alpha * d
-        r = r - alpha * h_d
-        z = solve(r)
-        r_z, old = float(np.vdot(r, z)), r_z
-        if r_z <= target:
-            break
-        d = z + (r_z / old) * d
-    return x, True
+    """The (truncated) Newton direction, and whether it is one of the exact, positive Hessian."""
+    found = conjugate_gradients(
+        objective.hessian_operator(p), -gradient, solve, tolerance=1e-3, max_steps=_INNER_STEPS
+    )
+    return found.x, found.converged and found.convex
