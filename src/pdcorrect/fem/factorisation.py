@@ -107,6 +107,8 @@ class MultigridSolver:
         import pyamg
 
         self._matrix = sp.csr_matrix(matrix)
+        if not (self._matrix.diagonal() > 0).all():
+            raise NotPositiveDefinite("the matrix has diagonal entries that are not positive")
         self._hierarchy = pyamg.smoothed_aggregation_solver(self._matrix)
         self._cycle = self._hierarchy.aspreconditioner(cycle="V")
 
