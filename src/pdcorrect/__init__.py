@@ -29,6 +29,7 @@ _HOME = {
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
     "Newton": "pdcorrect.solvers.newton",
     "rollout": "pdcorrect.solvers.rollout",
+    "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
     "load_trajectory": "pdcorrect.io.trajectory",
     "save_trajectory": "pdcorrect.io.trajectory",
@@ -51,6 +52,7 @@ __all__ = [  # noqa: RUF022
     "ProjectiveDynamics",
     "Newton",
     "rollout",
+    "march",
     "restrict",
     "load_trajectory",
     "save_trajectory",
@@ -76,7 +78,7 @@ if TYPE_CHECKING:
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.newton import Newton
     from pdcorrect.solvers.projective import ProjectiveDynamics
-    from pdcorrect.solvers.rollout import restrict, rollout
+    from pdcorrect.solvers.rollout import march, restrict, rollout
     from pdcorrect.state import State, Status, Stepper, StepResult, Trajectory
 
 

@@ -13,7 +13,7 @@ from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
-    from pdcorrect.state import Stepper, StepResult, Trajectory
+    from pdcorrect.state import Stepper, StepResult
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -59,32 +59,33 @@ def simulate(
     overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
 ) -> None:
     """Run one scene and write its trajectory, frame by frame."""
-    from pdcorrect.io.trajectory import TrajectoryWriter
+    from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory
+    from pdcorrect.report import make_folder
     from pdcorrect.scene import Scene
-    from pdcorrect.solvers.rollout import rollout, run_attributes
+    from pdcorrect.solvers.rollout import StepLog, march, run_attributes
 
     loaded = Scene.load(scene)
+    if vtu:
+        make_folder(vtu)
     stepper = _make_stepper(loaded, solver, refine)
     count = frames or loaded.time.frames
-    start = stepper.problem.rest_state()
     writer = TrajectoryWriter(
-        output, stepper.problem.positions, stepper.problem.cells, start,
+        output, stepper.problem.positions, stepper.problem.cells, stepper.problem.rest_state(),
         scene_toml=loaded.to_toml(), attributes=run_attributes(stepper), overwrite=overwrite,
     )  # fmt: skip
+    log = StepLog()
     with writer, _progress() as progress:
         task = progress.add_task(f"{loaded.name}", total=count)
-
-        def on_step(result: StepResult, seconds: float) -> None:
-            writer.append(result, seconds)
+        for result, elapsed in march(stepper, count):
+            writer.append(result, elapsed)
+            log.add(result, elapsed)
             progress.advance(task)
-
-        run = rollout(stepper, count, on_step=on_step)
-    _summary(run, stepper)
+    _summary(log.arrays(), stepper)
     _say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
-        _say(f"wrote {write_vtu_series(run, vtu)}")
+        _say(f"wrote {write_vtu_series(load_trajectory(output), vtu)}")
 
 
 @app.command()
@@ -101,7 +102,7 @@ def compare(
     from rich.console import Console
     from rich.table import Table
 
-    from pdcorrect import evaluate
+    from pdcorrect import evaluate, report
     from pdcorrect.errors import require_extra
     from pdcorrect.scene import Scene
 
@@ -110,6 +111,7 @@ def compare(
         require_extra("matplotlib", "view")
     loaded = Scene.load(scene)
     count = frames or loaded.time.frames
+    report.make_folder(output)
     with _progress() as progress:
         tasks = {
             c.label: progress.add_task(c.label, total=count, start=False) for c in evaluate.CASES
@@ -122,20 +124,17 @@ def compare(
 
         comparison = evaluate.compare(loaded, count, on_step=on_step)
 
-    from pdcorrect import report
-
     table = Table(title=loaded.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in report.HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)
     table.columns[0].justify = "left"
     for row in report.table(comparison):
         table.add_row(*row)
-    _say("drawing the figures ..." if figures else "")
-    path = report.write_report(comparison, output, draw=figures)
     Console().print(table)
     for note in report.notes(comparison):
         _say("- " + note)
-    _say(f"report: {path}")
+    _say("drawing the figures ..." if figures else "")
+    _say(f"report: {report.write_report(comparison, output, draw=figures)}")
 
 
 @app.command()
@@ -145,7 +144,7 @@ def render(
     label: Annotated[Optional[list[str]], typer.Option(help="Title of each run, in order.")] = None,
     colour: Annotated[Colour, typer.Option(help="What to colour by.")] = Colour.displacement,
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
-    fps: Annotated[float, typer.Option(help="Frames a second of a .gif or .mp4.")] = 25.0,
+    fps: Annotated[float, typer.Option(help="Frames a second of a film.", min=0.1)] = 25.0,
 ) -> None:
     """Draw one run or several side by side; errors are against the last run given."""
     from pdcorrect import figures
@@ -189,21 +188,20 @@ def _make_stepper(scene: Scene, solver: SolverName, refine: int) -> Stepper:
     return make_stepper(scene, solver.value, refine)
 
 
-def _summary(run: Trajectory, stepper: Stepper) -> None:
+def _summary(stats: dict[str, Any], stepper: Stepper) -> None:
     """Frames, time, iterations, residual, energy, and what solved them."""
-    stats = run.stats
-    seconds = stats["seconds"].sum()
-    trouble = [s for s in stats["status"].tolist() if s != "CONVERGED"]
-    problem = stepper.problem
+    count, seconds = len(stats["seconds"]), stats["seconds"].sum()
+    problem, status = stepper.problem, stats["status"].tolist()
+    ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     _say(
-        f"{len(run)} frames of {stepper.describe()['time_step']} s on {len(run.points)} nodes and "
-        f"{len(run.cells)} cells ({problem.element}, {problem.mass_rule} mass) in {seconds:.2f} s: "
-        f"{1e3 * seconds / max(len(run), 1):.3g} ms a frame"
+        f"{count} frames of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
+        f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
+        f"{seconds:.2f} s: {1e3 * seconds / count:.3g} ms a frame"
     )
     _say(", ".join(f"{k}: {v}" for k, v in stepper.describe().items()))
     _say(
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
-        f"{stats['iterations'].max()}; recovered frames: {len(trouble)}"
+        f"{stats['iterations'].max()}; frames: {ends}"
     )
     _say(
         f"worst residual {stats['residual'].max():.2g} N, worst estimated distance from the step's "

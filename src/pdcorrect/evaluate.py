@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdcorrect import metrics
+from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import discretise
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
-from pdcorrect.state import Stepper, StepResult, Trajectory
+from pdcorrect.state import Status, Stepper, StepResult, Trajectory
 
 OnStep = Callable[[str, int, StepResult], None]
 """Called with a case's label, its frame, and the step's result."""
@@ -45,7 +46,8 @@ class Row:
     Errors are node distances on the coarse nodes over all frames, against the
     reference case, in metres; ``omega`` is eq. 7-2 with the first case on the
     coarse mesh as its zero.  Times are medians for one frame; ``setup_seconds``
-    covers meshing, assembly and the first factorisation.
+    covers meshing, assembly and the first factorisation.  ``unusual_frames``
+    converged only by a fallback (see `Status`).
     """
 
     label: str
@@ -59,6 +61,7 @@ class Row:
     seconds_a_frame: float
     setup_seconds: float
     iterations_a_frame: float
+    unusual_frames: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +80,9 @@ class Comparison:
         Label of the case that errors are measured against.
     solver_error : float or None
         Largest node distance between PD and Newton on the coarse mesh, m: they
-        minimise the same energy, so this is solver error alone.
+        minimise the same energy, so this is solver error, unless the body
+        buckles and they take different branches.  None without both, or if a
+        frame needed a fallback.
     """
 
     scene: Scene
@@ -99,9 +104,10 @@ class Comparison:
 
 def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
     """A stepper by name, ``"pd"`` or ``"newton"``, factorised and with its kernels compiled."""
-    problem = discretise(scene, refine=refine)
-    stepper = ProjectiveDynamics(problem) if solver == "pd" else Newton(problem)
-    return stepper.prepare()
+    kinds = {"pd": ProjectiveDynamics, "newton": Newton}
+    if solver not in kinds:
+        raise InputError(f"solver {solver!r}: expected one of {', '.join(kinds)}.")
+    return kinds[solver](discretise(scene, refine=refine)).prepare()
 
 
 def compare(
@@ -122,6 +128,8 @@ def compare(
     on_step : callable, optional
         For progress.
     """
+    if not cases:
+        raise InputError("cases is empty: expected at least the reference.")
     coarse = discretise(scene)
     runs, on_coarse, setup = {}, {}, {}
     for case in cases:
@@ -153,6 +161,7 @@ def compare(
                 seconds_a_frame=float(np.median(run.stats["seconds"])),
                 setup_seconds=setup[case.label],
                 iterations_a_frame=float(np.mean(run.stats["iterations"])),
+                unusual_frames=int((run.stats["status"] != Status.CONVERGED.name).sum()),
             )
         )
     return Comparison(
@@ -175,6 +184,8 @@ def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float
 
 def _solver_error(cases: tuple[Case, ...], runs: dict[str, Trajectory]) -> float | None:
     coarse = {case.solver: runs[case.label] for case in cases if case.refine == 1}
-    if {"pd", "newton"} <= set(coarse):
-        return metrics.largest_error(coarse["pd"], coarse["newton"])
-    return None
+    if not {"pd", "newton"} <= set(coarse):
+        return None
+    if any((run.stats["status"] != Status.CONVERGED.name).any() for run in coarse.values()):
+        return None
+    return metrics.largest_error(coarse["pd"], coarse["newton"])

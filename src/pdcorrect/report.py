@@ -23,7 +23,9 @@ HEADINGS = (
 
 def table(comparison: Comparison) -> list[tuple[str, ...]]:
     """The comparison as rows of text under `HEADINGS`."""
-    slowest = next(r for r in comparison.rows if r.label == comparison.reference).seconds_a_frame
+    reference_seconds = next(
+        r for r in comparison.rows if r.label == comparison.reference
+    ).seconds_a_frame
     lines: list[tuple[str, ...]] = []
     for row in comparison.rows:
         is_reference = row.label == comparison.reference
@@ -35,7 +37,7 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
                 "" if np.isnan(row.omega) else f"{round(row.omega, 1) + 0.0:.1f} %",
                 f"{1e3 * row.seconds_a_frame:.3g}",
-                f"{slowest / row.seconds_a_frame:.3g}x",
+                f"{reference_seconds / row.seconds_a_frame:.3g}x",
                 f"{row.iterations_a_frame:.1f}",
             )
         )
@@ -63,9 +65,15 @@ def notes(comparison: Comparison) -> list[str]:
     if comparison.solver_error is not None:
         out.append(
             f"PD and Newton on the coarse mesh differ by at most "
-            f"{1e3 * comparison.solver_error:.2g} mm: that is PD's solver error; the rest of their "
-            "error is the mesh's."
+            f"{1e3 * comparison.solver_error:.2g} mm (solver error); the rest of their error is "
+            "the mesh's."
         )
+    out += [
+        f"{row.label}: {row.unusual_frames} of {frames} frames converged only by a fallback "
+        "(Newton-CG or smaller steps), which changes their time error."
+        for row in comparison.rows
+        if row.unusual_frames
+    ]
     return out
 
 
@@ -92,16 +100,18 @@ def to_csv(comparison: Comparison) -> str:
 
 def to_json(comparison: Comparison) -> str:
     """Numbers, scene and environment."""
-    return json.dumps(
-        {
-            "scene": comparison.scene.to_toml(),
-            "reference": comparison.reference,
-            "solver_error": comparison.solver_error,
-            "rows": [dataclasses.asdict(row) for row in comparison.rows],
-            "environment": environment(),
-        },
-        indent=2,
-    ).replace("NaN", "null")
+    rows = [
+        {k: None if v != v else v for k, v in dataclasses.asdict(row).items()}
+        for row in comparison.rows
+    ]
+    record = {
+        "scene": comparison.scene.to_toml(),
+        "reference": comparison.reference,
+        "solver_error": comparison.solver_error,
+        "rows": rows,
+        "environment": environment(),
+    }
+    return json.dumps(record, indent=2, allow_nan=False)
 
 
 def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) -> Path:
@@ -117,16 +127,30 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
     OutputError
         If the folder cannot be written.
     """
-    folder = Path(folder)
+    folder = make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        pictures = draw_figures(comparison, folder) if draw else []
         (folder / "report.csv").write_text(to_csv(comparison), encoding="utf-8")
         (folder / "report.json").write_text(to_json(comparison), encoding="utf-8")
-        (folder / "report.md").write_text(to_markdown(comparison, pictures), encoding="utf-8")
+        (folder / "report.md").write_text(to_markdown(comparison, []), encoding="utf-8")
+        if draw:
+            pictures = draw_figures(comparison, folder)
+            (folder / "report.md").write_text(to_markdown(comparison, pictures), encoding="utf-8")
     except OSError as error:
-        raise OutputError(f"{folder}: the report cannot be written ({error}).") from error
+        raise _not_written(folder, error) from error
     return folder / "report.md"
+
+
+def make_folder(folder: str | Path) -> Path:
+    """Create the folder of a report, or say why it cannot be."""
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _not_written(Path(folder), error) from error
+    return Path(folder)
+
+
+def _not_written(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"{folder}: the report cannot be written ({error.strerror or error}).")
 
 
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:

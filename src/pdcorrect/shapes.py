@@ -8,17 +8,31 @@ thesis.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import SceneError
 
+_MOST_CELLS = 10**8
+
 Occupancy = tuple[NDArray[np.bool_], tuple[int, int, int]]
+
+
+def _grid(cells: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """Empty grid, if it is of a size that can be meant."""
+    if math.prod(cells) > _MOST_CELLS:
+        raise SceneError(
+            f"body: a grid of {cells[0]} x {cells[1]} x {cells[2]} cells: expected at most "
+            f"{_MOST_CELLS:.0e} in all."
+        )
+    return np.zeros(cells, dtype=bool)
 
 
 def beam(cells: tuple[int, int, int]) -> Occupancy:
     """Solid block of ``cells`` cells with one corner at the origin."""
-    return np.ones(cells, dtype=bool), (0, 0, 0)
+    return _grid(cells) | True, (0, 0, 0)
 
 
 def cross(
@@ -45,7 +59,7 @@ def cross(
             f"the {nx} cells of the beam along x. Move the arms or lengthen the beam."
         )
     side = arm_length if arms == 4 else 0
-    solid = np.zeros((nx, ny + 2 * side, nz + 2 * arm_length), dtype=bool)
+    solid = _grid((nx, ny + 2 * side, nz + 2 * arm_length))
     beam_y, beam_z = slice(side, side + ny), slice(arm_length, arm_length + nz)
     arm_x = slice(arm_start, arm_start + arm_width)
     solid[:, beam_y, beam_z] = True
@@ -89,13 +103,19 @@ def weight(
     px, py, pz = pendulum_cells
     wx, wy, wz = weight_cells
     _check_weight(support_cells, pendulum_start, pendulum_cells, weight_start, weight_cells)
+    for name, size in (("pendulum_cells[1]", py), ("second_support_length", second_support_length)):
+        if size and (size - sy) % 2:
+            raise SceneError(
+                f"body.{name} = {size}: expected the support's {sy} cells along y plus or minus an "
+                "even number, so that it is centred."
+            )
 
     half_x = (wx - px) // 2
     left = max(0, half_x - pendulum_start)
     right = max(0, pendulum_start + px + half_x - sx)
     second = max(second_support_length, 0)
     width = max(sy, py, wy, second)
-    solid = np.zeros((left + sx + right, width, sz + pz), dtype=bool)
+    solid = _grid((left + sx + right, width, sz + pz))
 
     def centred(size: int) -> slice:
         start = (width - size) // 2

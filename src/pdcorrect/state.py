@@ -6,6 +6,7 @@ Newton and (later) the corrected solver are interchangeable because of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -56,6 +57,8 @@ class State:
             if array.ndim != 2 or array.shape[1] != 3:
                 raise InputError(f"{name}: expected shape (N, 3), got {array.shape}.")
             object.__setattr__(self, name, array)
+        if not math.isfinite(self.time):
+            raise InputError(f"time = {self.time}: expected a finite number of seconds.")
         if self.positions.shape != self.velocities.shape:
             raise InputError(
                 f"positions {self.positions.shape} and velocities {self.velocities.shape}: "

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect.errors import InputError
 from pdcorrect.fem import kernels
 from pdcorrect.fem.operators import Quadrature
 
@@ -24,6 +25,11 @@ class Assembly:
         flat = cells.ravel()
         self._start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
         self._slots = np.argsort(flat, kind="stable")
+
+    def check(self, x: Array) -> None:
+        """Refuse a nodal vector that is not (N, 3)."""
+        if np.shape(x) != (self._count, 3):
+            raise InputError(f"x {np.shape(x)}: expected ({self._count}, 3), one row a node.")
 
     def vector(self, by_cell: Array) -> Array:
         """Sum cell-wise nodal values (C, K, 3) into (N, 3)."""
@@ -70,6 +76,7 @@ class Linearisation:
 
     def apply(self, x: Array) -> Array:
         """Tangent times x, both (N, 3), without assembling."""
+        self.assembly.check(x)
         by_cell = np.empty((*self.assembly.cells.shape, 3))
         kernels.apply_linearised(
             x, self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,

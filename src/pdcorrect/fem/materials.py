@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import Material, Scene
+from pdcorrect.scene.materials import lame
 
 Array = NDArray[np.float64]
 
@@ -36,8 +37,7 @@ class Materials:
 
         ``rule`` gives the energy's terms and the volume weight.
         """
-        mu = young / (2 * (1 + poisson))
-        lam = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+        mu, lam = lame(young, poisson)
         omega = lam if rule.volume_weight == "published" else 3 * lam
         return cls(
             mu=np.zeros_like(mu) if rule.energy == "volume-only" else mu,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +48,8 @@ class Problem:
     cell_size : float
         Coarse cell size (cube root of the mean cell volume), m: the unit of
         tolerances at every refinement.
+    material_changed : bool
+        Whether the materials are no longer those of ``scene``.
     """
 
     scene: Scene
@@ -60,6 +62,7 @@ class Problem:
     loads: tuple[NodalLoad, ...]
     mass_matrix: sp.csr_matrix
     cell_size: float
+    material_changed: bool = False
 
     def __repr__(self) -> str:
         return (
@@ -205,15 +208,20 @@ class Problem:
         ``young`` and ``poisson`` are given together (Pa; dimensionless).
         """
         materials = self.materials.changed(self.scene.material, young, poisson, density)
-        return _build(
+        changed = _build(
             self.scene, self.refine, self.mesh, self.space, self.quadrature, materials,
             self.cell_size,
         )  # fmt: skip
+        return replace(changed, material_changed=True)
 
     # --- internals ----------------------------------------------------------------
 
     def _displacement(self, positions: Array) -> Array:
         """Positions minus rest positions: gradients of it do not depend on the origin."""
+        if np.shape(positions) != self.positions.shape:
+            raise InputError(
+                f"positions {np.shape(positions)}: expected {self.positions.shape}, one row a node."
+            )
         return np.subtract(positions, self.positions)
 
 
@@ -235,7 +243,7 @@ def discretise(
     SceneError, MeshError
         Naming the key or the cell.
     """
-    if not isinstance(refine, int) or refine < 1:
+    if isinstance(refine, bool) or not isinstance(refine, (int, np.integer)) or refine < 1:
         raise InputError(f"refine = {refine!r}: expected a whole number of at least 1.")
     changes = {k: v for k, v in {"mass": mass, "element": element}.items() if v is not None}
     if changes:
@@ -243,7 +251,7 @@ def discretise(
     coarse = _coarse_mesh(scene)
     mesh = refine_mesh(coarse, refine)
     space = Space(mesh, scene.solver.element)
-    cell_size = float(np.cbrt(Space(coarse).volumes().mean()))
+    cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
     selector = Selector(mesh, space.positions, cell_size)
     materials = Materials.from_scene(scene, selector, len(mesh.cells))
     return _build(scene, refine, mesh, space, space.quadrature(), materials, cell_size)
@@ -274,7 +282,7 @@ def _coarse_mesh(scene: Scene) -> HexMesh:
     if isinstance(body, MeshFile):
         from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
 
-        return read_hex_mesh(scene.resolve(body.path), body.scale)
+        return read_hex_mesh(body.path, body.scale)
     return voxel_mesh(*body.occupancy(), body.cell_size, body.origin)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from pdcorrect import shapes
-from pdcorrect.scene.regions import Cells, Positive, PositiveCount, Strict, Vector
+from pdcorrect.scene.regions import Cells, Count, Positive, PositiveCount, Strict, Vector
 
 
 class _VoxelBody(Strict):
@@ -34,7 +34,7 @@ class Cross(_VoxelBody):
     shape: Literal["cross"]
     cells: Cells
     arms: Literal[2, 4] = 4
-    arm_start: Annotated[int, Field(ge=0)]
+    arm_start: Count
     arm_width: PositiveCount = 2
     arm_length: PositiveCount
 
@@ -48,10 +48,10 @@ class Weight(_VoxelBody):
 
     shape: Literal["weight"]
     support_cells: Cells
-    second_support_length: Annotated[int, Field(ge=0)] = 0
-    pendulum_start: Annotated[int, Field(ge=0)]
+    second_support_length: Count = 0
+    pendulum_start: Count
     pendulum_cells: Cells
-    weight_start: Annotated[int, Field(ge=0)]
+    weight_start: Count
     weight_cells: Cells
 
     def occupancy(self) -> shapes.Occupancy:

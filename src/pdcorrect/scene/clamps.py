@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from pdcorrect.scene.regions import Axis, Region, Strict, Vector
+from pdcorrect.scene.regions import Axis, Number, Region, Strict, Vector
 
 
 class Motion(Strict):
@@ -22,9 +22,9 @@ class Motion(Strict):
         One angle (degrees) for each time, about ``axis`` through ``centre``.
     """
 
-    times: tuple[float, ...] = Field(min_length=1)
+    times: tuple[Number, ...] = Field(min_length=1)
     displacement: tuple[Vector, ...] | None = None
-    rotation: tuple[float, ...] | None = None
+    rotation: tuple[Number, ...] | None = None
     axis: Axis = "x"
     centre: Vector = (0.0, 0.0, 0.0)
 

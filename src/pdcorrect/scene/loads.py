@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Union
 
 from pydantic import Field, model_validator
 
-from pdcorrect.scene.regions import NonNegative, Region, Strict, Vector
+from pdcorrect.scene.regions import NonNegative, Number, Region, Strict, Vector
 
 
 class _Load(Strict):
@@ -20,14 +20,16 @@ class _Load(Strict):
     the step size.
     """
 
-    window: tuple[float, float] | None = None
+    window: tuple[Number, Number] | None = None
     ramp: NonNegative = 0.0
-    table: tuple[tuple[float, float], ...] | None = None
+    table: tuple[tuple[Number, Number], ...] | None = None
 
     @model_validator(mode="after")
     def _amplitude(self) -> _Load:
         if self.window is not None and self.window[0] >= self.window[1]:
             raise ValueError(f"expected window = [start, end] with start < end, got {self.window}")
+        if self.window is not None and self.window[1] <= 0:
+            raise ValueError(f"expected a window that ends after time 0, got {self.window}")
         if self.table is not None:
             if self.window is not None or self.ramp:
                 raise ValueError("expected either table, or window and ramp, not both")
@@ -83,7 +85,7 @@ class Pressure(_Load):
     """
 
     kind: Literal["pressure"]
-    pressure: float
+    pressure: Number
     region: Region
     follower: bool = False
 
@@ -101,9 +103,9 @@ class Torsion(_Load):
     """
 
     kind: Literal["torsion"]
-    strength: float
-    attraction: float = 0.0
-    stretch: float = 0.0
+    strength: Number
+    attraction: Number = 0.0
+    stretch: Number = 0.0
     centre: Vector | None = None
     region: Region = Region(everywhere=True)
     distribution: Literal["consistent", "nodal"] = "consistent"

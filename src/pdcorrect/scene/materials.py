@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal, TypeVar
 
-from pydantic import Field
+import numpy as np
+from numpy.typing import NDArray
 
-from pdcorrect.scene.regions import Positive, Region, Strict
+from pdcorrect.scene.regions import Poisson, Positive, Region, Strict
+
+Moduli = TypeVar("Moduli", float, NDArray[np.float64])
+
+
+def lame(young: Moduli, poisson: Moduli) -> tuple[Moduli, Moduli]:
+    """Lame parameters (mu, lambda), Pa, of Young's modulus (Pa) and Poisson's ratio."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 class EffectiveModuli(Strict):
@@ -37,18 +45,18 @@ class Material(Strict):
     energy: Literal["corotated", "corotated-only", "volume-only"] = "corotated"
     volume_weight: Literal["lame", "published"] = "lame"
     young: Positive
-    poisson: Annotated[float, Field(ge=0, lt=0.5)]
+    poisson: Poisson
     density: Positive
 
     @property
     def mu(self) -> float:
         """Shear modulus, Pa."""
-        return self.young / (2 * (1 + self.poisson))
+        return lame(self.young, self.poisson)[0]
 
     @property
     def lam(self) -> float:
         """First Lame parameter, Pa."""
-        return self.young * self.poisson / ((1 + self.poisson) * (1 - 2 * self.poisson))
+        return lame(self.young, self.poisson)[1]
 
     @property
     def effective(self) -> EffectiveModuli:
@@ -71,5 +79,5 @@ class MaterialRegion(Strict):
 
     region: Region
     young: Positive | None = None
-    poisson: Annotated[float, Field(ge=0, lt=0.5)] | None = None
+    poisson: Poisson | None = None
     density: Positive | None = None

@@ -11,11 +11,14 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pdcorrect.errors import SceneError
 
 Axis = Literal["x", "y", "z"]
-Vector = tuple[float, float, float]
-PositiveCount = Annotated[int, Field(ge=1)]
+Number = Annotated[float, Field(strict=True, ge=-1e30, le=1e30)]
+Count = Annotated[int, Field(strict=True, ge=0, le=10**9)]
+PositiveCount = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Positive = Annotated[float, Field(strict=True, gt=0, le=1e30)]
+NonNegative = Annotated[float, Field(strict=True, ge=0, le=1e30)]
+Poisson = Annotated[float, Field(strict=True, ge=0, lt=0.5)]
+Vector = tuple[Number, Number, Number]
 Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
 
 
 class Strict(BaseModel):
@@ -43,11 +46,11 @@ class Region(Strict):
     """
 
     plane: Axis | None = None
-    at: Annotated[float | Literal["min", "max"] | None, Field(union_mode="left_to_right")] = None
+    at: Annotated[Number | Literal["min", "max"] | None, Field(union_mode="left_to_right")] = None
     box: tuple[Vector, Vector] | None = None
     sphere: Vector | None = None
     radius: Positive | None = None
-    nodes: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    nodes: tuple[Count, ...] | None = None
     everywhere: Literal[True] | None = None
 
     @model_validator(mode="after")

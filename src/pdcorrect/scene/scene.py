@@ -6,11 +6,12 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tomli_w
-from pydantic import Field, PrivateAttr, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator
 
 from pdcorrect.errors import SceneError
-from pdcorrect.scene.bodies import Body
+from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
@@ -42,7 +43,7 @@ class Solver(Strict):
 
     mass: Literal["lumped", "averaged", "consistent", "per-node"] = "lumped"
     element: Literal["hex8"] = "hex8"
-    tolerance: Annotated[float, Field(gt=0, lt=0.1)] = 1e-5
+    tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
 
 
 class Scene(Strict):
@@ -69,14 +70,12 @@ class Scene(Strict):
     clamps: tuple[Clamp, ...] = ()
     loads: tuple[Load, ...] = ()
     solver: Solver = Solver()
-    _folder: Path = PrivateAttr(default=Path())
 
-    def __init__(self, **data: Any) -> None:
-        source = data.pop("__source__", "scene")
+    def __init__(self, /, **data: Any) -> None:
         try:
-            super().__init__(**data)
+            super().__init__(**{key: _plain(value) for key, value in data.items()})
         except ValidationError as error:
-            raise SceneError(_explain(error, source)) from None
+            raise SceneError(f"scene: {_explain(error)}") from None
 
     @field_validator("name")
     @classmethod
@@ -101,7 +100,9 @@ class Scene(Strict):
             reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
             raise SceneError(f"{path}: cannot be read ({reason}).") from None
         scene = cls.from_toml(text, source=str(path))
-        scene._folder = path.parent
+        if isinstance(scene.body, MeshFile):  # relative to the scene file, from now on absolute
+            found = (path.parent / scene.body.path).resolve()
+            scene = scene.with_changes(body={"path": found})
         return scene
 
     @classmethod
@@ -111,16 +112,15 @@ class Scene(Strict):
             data = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise SceneError(f"{source}: not valid TOML: {error}.") from None
-        return cls(**data, __source__=source)
+        try:
+            return cls(**data)
+        except SceneError as error:
+            raise SceneError(str(error).replace("scene:", f"{source}:", 1)) from None
 
     def to_toml(self) -> str:
         """The scene as TOML, with every default written out."""
         data = self.model_dump(mode="json", exclude_none=True, by_alias=True)
         return tomli_w.dumps(data)
-
-    def resolve(self, path: Path) -> Path:
-        """A path of this scene, relative ones from the scene file's folder."""
-        return path if path.is_absolute() else self._folder / path
 
     def with_changes(self, **sections: Any) -> Scene:
         """The same scene with some sections' keys replaced.
@@ -135,12 +135,21 @@ class Scene(Strict):
                 data[section] = {**data[section], **change}
             else:
                 data[section] = change
-        changed = Scene(**data)
-        changed._folder = self._folder
-        return changed
+        return Scene(**data)
 
 
-def _explain(error: ValidationError, source: str) -> str:
+def _plain(value: Any) -> Any:
+    """NumPy numbers and arrays as Python ones, at any depth."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return value
+
+
+def _explain(error: ValidationError) -> str:
     """One paragraph: each wrong key, its value, and what was expected."""
     sentences: list[str] = []
     for item in error.errors():
@@ -154,7 +163,7 @@ def _explain(error: ValidationError, source: str) -> str:
             value = repr(item["input"])
             value = value if len(value) < 80 else value[:77] + "..."
             sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")
-    return " ".join(f"{source}: {' '.join(dict.fromkeys(sentences))}".split())
+    return " ".join(" ".join(dict.fromkeys(sentences)).split())
 
 
 def _key(location: tuple[int | str, ...]) -> str:

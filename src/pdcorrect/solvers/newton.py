@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Self
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, factorise
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.implicit import ImplicitStepper
+from pdcorrect.solvers.implicit import ImplicitStepper, whole
 from pdcorrect.solvers.lbfgs import Minimum
 from pdcorrect.solvers.newton_loop import newton_loop
 from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]
+
+_SHIFTS = (1e-10, 1e-6, 1e-2)
+"""Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
 
 
 class Newton(ImplicitStepper):
@@ -24,7 +29,7 @@ class Newton(ImplicitStepper):
     The exact tangent is assembled cell by cell and factorised in each
     iteration.  Where it is not positive definite, the tangent with negative
     eigenvalues raised to zero at each quadrature point (Teran et al. 2005) takes
-    its place for that iteration.
+    its place for that iteration, with a shift if it is singular.
 
     Parameters
     ----------
@@ -50,7 +55,9 @@ class Newton(ImplicitStepper):
         recover: bool = True,
     ) -> None:
         super().__init__(problem, tolerance, time_step, backend, recover)
-        self._options = replace(self._options, max_iterations=max_iterations)
+        self._options = replace(
+            self._options, max_iterations=whole("max_iterations", max_iterations)
+        )
         self._free = np.flatnonzero(problem.free.ravel())
         self._used_backend = "none yet"
 
@@ -74,17 +81,24 @@ class Newton(ImplicitStepper):
 
     def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:
         """Minus the Newton step, and whether the exact tangent was used."""
-        for project in (False, True):
-            matrix = objective.hessian(p, project)[self._free][:, self._free]
+        direction = np.zeros(p.size)
+        for matrix, exact in self._candidates(objective, p):
             try:
                 factor = factorise(matrix, self._backend, unknowns=3)
-                step = factor.solve(g.ravel()[self._free])
+                direction[self._free] = -factor.solve(g.ravel()[self._free])
             except NotPositiveDefinite:
-                if project:
-                    raise
                 continue
             self._used_backend = factor.backend
-            direction = np.zeros(p.size)
-            direction[self._free] = -step
-            return direction.reshape(p.shape), not project
-        raise AssertionError("unreachable: the projected tangent is positive definite")
+            return direction.reshape(p.shape), exact
+        return direction.reshape(p.shape), False  # no descent: the line search says so
+
+    def _candidates(
+        self, objective: StepObjective, p: Array
+    ) -> Iterator[tuple[sp.csr_matrix, bool]]:
+        """The exact tangent, the projected one, and that with a growing shift."""
+        yield objective.hessian(p)[self._free][:, self._free], True
+        matrix = objective.hessian(p, project=True)[self._free][:, self._free]
+        yield matrix, False
+        for shift in _SHIFTS:
+            size = shift * matrix.diagonal().max()
+            yield sp.csr_matrix(matrix + size * sp.eye_array(matrix.shape[0])), False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Literal
 
 import numpy as np
@@ -12,10 +12,46 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.implicit import whole
 from pdcorrect.state import State, Stepper, StepResult, Trajectory
 
 Array = NDArray[np.float64]
 OnStep = Callable[[StepResult, float], None]
+OnFailure = Literal["raise", "stop", "continue"]
+
+
+def march(
+    stepper: Stepper,
+    frames: int | None = None,
+    *,
+    state: State | None = None,
+    forces: Callable[[State], Array] | None = None,
+    on_failure: OnFailure = "raise",
+) -> Iterator[tuple[StepResult, float]]:
+    """Apply a stepper again and again, keeping nothing: yields each result and its seconds.
+
+    Parameters are those of `rollout`.
+
+    Raises
+    ------
+    ConvergenceError
+        At the first step that failed, unless told otherwise.
+    """
+    if on_failure not in ("raise", "stop", "continue"):
+        raise InputError(f"on_failure = {on_failure!r}: expected 'raise', 'stop' or 'continue'.")
+    problem = stepper.problem
+    frames = whole("frames", problem.scene.time.frames if frames is None else frames)
+    current = problem.rest_state() if state is None else state
+    for frame in range(1, frames + 1):
+        started = time.perf_counter()
+        result = stepper(current, forces(current) if forces else None)
+        elapsed = time.perf_counter() - started
+        if not result.status.ok and on_failure != "continue":
+            if on_failure == "stop":
+                return
+            raise ConvergenceError(_failure(frame, result), result=result)
+        current = result.state
+        yield result, elapsed
 
 
 def rollout(
@@ -25,9 +61,9 @@ def rollout(
     state: State | None = None,
     forces: Callable[[State], Array] | None = None,
     on_step: OnStep | None = None,
-    on_failure: Literal["raise", "stop", "continue"] = "raise",
+    on_failure: OnFailure = "raise",
 ) -> Trajectory:
-    """Apply a stepper again and again.
+    """Apply a stepper again and again and keep every frame.
 
     Parameters
     ----------
@@ -41,8 +77,7 @@ def rollout(
     forces : callable, optional
         Extra nodal forces (N, 3), N, for the step from a state.
     on_step : callable, optional
-        Called with each `StepResult` and its wall-clock seconds, also with the
-        one that failed if the rollout goes on: for progress and files.
+        Called with each `StepResult` and its wall-clock seconds: for progress.
     on_failure : {"raise", "stop", "continue"}
         What to do after a step that failed: raise `ConvergenceError` (which
         carries the frames so far), return the frames so far, or go on from the
@@ -53,35 +88,19 @@ def rollout(
     Trajectory
         ``frames + 1`` frames, the first one the initial state.
     """
-    if on_failure not in ("raise", "stop", "continue"):
-        raise InputError(f"on_failure = {on_failure!r}: expected 'raise', 'stop' or 'continue'.")
-    problem = stepper.problem
-    frames = problem.scene.time.frames if frames is None else frames
-    if frames < 0:
-        raise InputError(f"frames = {frames}: expected 0 or more.")
-    current = problem.rest_state() if state is None else state
-    states = [current]
-    results: list[StepResult] = []
-    seconds: list[float] = []
-    for frame in range(1, frames + 1):
-        started = time.perf_counter()
-        result = stepper(current, forces(current) if forces else None)
-        elapsed = time.perf_counter() - started
-        if not result.status.ok and on_failure != "continue":
-            if on_failure == "stop":
-                break
-            raise ConvergenceError(
-                _failure(frame, result),
-                trajectory=_trajectory(stepper, states, results, seconds),
-                result=result,
-            )
-        current = result.state
-        states.append(current)
-        results.append(result)
-        seconds.append(elapsed)
-        if on_step:
-            on_step(result, elapsed)
-    return _trajectory(stepper, states, results, seconds)
+    states = [stepper.problem.rest_state() if state is None else state]
+    log = StepLog()
+    steps = march(stepper, frames, state=states[0], forces=forces, on_failure=on_failure)
+    try:
+        for result, elapsed in steps:
+            states.append(result.state)
+            log.add(result, elapsed)
+            if on_step:
+                on_step(result, elapsed)
+    except ConvergenceError as error:
+        error.trajectory = _trajectory(stepper, states, log)
+        raise
+    return _trajectory(stepper, states, log)
 
 
 def _failure(frame: int, result: StepResult) -> str:
@@ -93,30 +112,47 @@ def _failure(frame: int, result: StepResult) -> str:
     )
 
 
-def _trajectory(
-    stepper: Stepper, states: list[State], results: list[StepResult], seconds: list[float]
-) -> Trajectory:
+def _trajectory(stepper: Stepper, states: list[State], log: StepLog) -> Trajectory:
     problem = stepper.problem
-    stats: dict[str, NDArray[Any]] = {
-        "status": np.array([r.status.name for r in results], dtype=str),
-        "iterations": np.array([r.iterations for r in results], dtype=np.int64),
-        "residual": np.array([r.residual for r in results], dtype=np.float64),
-        "error_estimate": np.array([r.error_estimate for r in results], dtype=np.float64),
-        "seconds": np.array(seconds, dtype=np.float64),
-    }
-    for name in results[0].stats if results else ():
-        stats[name] = np.array([r.stats[name] for r in results])
     return Trajectory(
         positions=np.stack([s.positions for s in states]),
         velocities=np.stack([s.velocities for s in states]),
         times=np.array([s.time for s in states]),
-        stats=stats,
+        stats=log.arrays(),
         points=problem.positions,
         cells=problem.cells,
         scene_toml=problem.scene.to_toml(),
         attributes=run_attributes(stepper),
         problem=problem,
     )
+
+
+class StepLog:
+    """Statistics of a run, one row a step, without its states."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, Any]] = []
+
+    def add(self, result: StepResult, seconds: float) -> None:
+        """Note a step and its wall-clock seconds."""
+        self._rows.append(
+            {
+                "status": result.status.name,
+                "iterations": result.iterations,
+                "residual": result.residual,
+                "error_estimate": result.error_estimate,
+                "seconds": seconds,
+                **result.stats,
+            }
+        )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """The ``stats`` of a `Trajectory`: (T,) arrays by name."""
+        names = self._rows[0] if self._rows else _NO_STEPS
+        return {name: np.array([row[name] for row in self._rows]) for name in names}
+
+
+_NO_STEPS = ("status", "iterations", "residual", "error_estimate", "seconds")
 
 
 def run_attributes(stepper: Stepper) -> dict[str, str]:
@@ -126,6 +162,7 @@ def run_attributes(stepper: Stepper) -> dict[str, str]:
         "refine": str(problem.refine),
         "element": problem.element,
         "mass": problem.mass_rule,
+        "material": "changed after the scene" if problem.material_changed else "the scene's",
         **stepper.describe(),
     }
 

@@ -14,9 +14,9 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.assembly import Linearisation
-from pdcorrect.fem.factorisation import Backend, Factor, factorise
+from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
 
@@ -121,9 +121,20 @@ class GlobalSolver:
         for i in range(columns.shape[1]):
             nodes = np.flatnonzero(columns[:, i])
             if len(nodes):
-                factor = factorise(matrix[nodes][:, nodes], backend)
+                factor = self._factorise(matrix[nodes][:, nodes], backend, time_step)
                 self._parts.append((factor, nodes, np.flatnonzero(group.ravel() == i)))
         self._all_free = bool(problem.free.all())
+
+    @staticmethod
+    def _factorise(matrix: sp.csr_matrix, backend: Backend, time_step: float) -> Factor:
+        try:
+            return factorise(matrix, backend)
+        except NotPositiveDefinite as error:
+            raise ConvergenceError(
+                f"the global matrix of a step of {time_step:g} s is singular to working precision "
+                f"({error}): expected clamps, or inertia that matters beside the stiffness. Use a "
+                "smaller time step, more density or clamps."
+            ) from None
 
     @property
     def backend(self) -> str:
