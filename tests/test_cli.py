@@ -63,7 +63,9 @@ def test_simulate_refines_and_takes_either_solver(run, scene_file, tmp_path, sol
     assert status == 0
     loaded = pc.load_trajectory(output)
     assert loaded.positions.shape == (3, 9 * 5 * 3, 3)
-    assert solver in loaded.attributes["solver"].lower() or "projective" in out
+    method = {"pd": "projective dynamics (lbfgs)", "newton": "Newton"}[solver]
+    assert loaded.attributes["solver"] == method
+    assert method in out
     assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
 
 
@@ -160,7 +162,8 @@ def test_compare_writes_its_report(run, tmp_path):
         100 * (1 - (errors[1] / errors[0]) ** 2)
     )
     record = json.loads((folder / "report.json").read_text())
-    assert record["solver_error"] < 1e-2 * errors[0]
+    assert 0 < record["solver_error"] < 1e-2 * errors[0]
+    assert all(row["unusual_frames"] == 0 for row in record["rows"])
     assert record["environment"]["threads"]
     text = (folder / "report.md").read_text()
     for name in ("comparison.png", "node.png", "energy.png", "error_over_time.png"):
@@ -215,3 +218,45 @@ def test_help_names_every_command():
             env={**os.environ, "COLUMNS": "100"},
         ).stdout  # fmt: skip
         assert "Usage" in help_text
+
+
+def test_an_output_that_cannot_be_written_is_found_before_the_work(run, scene_file, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    for arguments in (
+        ("compare", scene_file, "-o", blocked),
+        ("simulate", scene_file, "-o", tmp_path / "a.h5", "--vtu", blocked / "vtu"),
+    ):
+        status, out, err = run(*arguments)
+        assert status == cli.FAILED
+        assert "file" in err
+        assert "frames of" not in out
+    assert not (tmp_path / "a.h5").exists()
+
+
+def test_a_name_that_reads_nan_survives_the_report(tmp_path):
+    from pdcorrect import report
+
+    scene = beam((2, 1, 1), name="NaN study", time={"frames": 1})
+    comparison = pc.compare(scene, cases=pc.evaluate.CASES[2:3])
+    record = json.loads(report.to_json(comparison))
+    assert "NaN study" in record["scene"]
+    assert record["rows"][0]["omega"] is None
+    with pytest.raises(pc.errors.InputError, match="cases is empty"):
+        pc.compare(scene, cases=())
+
+
+def test_frames_that_needed_a_fallback_are_reported(monkeypatch):
+    from dataclasses import replace
+
+    from pdcorrect import report
+
+    real = pc.Newton.__call__
+    monkeypatch.setattr(
+        pc.Newton,
+        "__call__",
+        lambda self, *args: replace(real(self, *args), status=pc.Status.SUBSTEPPED),
+    )
+    comparison = pc.compare(beam((3, 1, 1), time={"frames": 2}))
+    assert comparison.solver_error is None
+    assert any("coarse Newton: 2 of 2 frames" in note for note in report.notes(comparison))

@@ -92,6 +92,12 @@ def test_signed_svd_reproduces_any_matrix_with_proper_rotations(rng):
     assert (s[:, 1] >= np.abs(s[:, 2]) - 1e-12 * s[:, 0]).all()
 
 
+@pytest.mark.parametrize("small", [1e-3, 1e-5, 1e-7])
+def test_rotations_of_cells_squeezed_to_a_line_are_accurate(small):
+    F = R @ np.diag([1.0, small, 0.5 * small]) @ Q
+    np.testing.assert_allclose(energies.nearest_rotation(F), R @ Q, atol=1e-14 / small)
+
+
 def test_projections_are_idempotent(rng):
     F = rng.normal(size=(100, 3, 3))
     rotations = energies.nearest_rotation(F)

@@ -91,6 +91,7 @@ def test_shapes_have_the_cells_they_promise():
         (lambda: shapes.weight((4, 2, 2), 0, 3, (2, 2, 4), 0, (2, 2, 2)), "at most the 4"),
         (lambda: shapes.weight((8, 2, 2), 0, 3, (2, 2, 4), 3, (2, 2, 2)), "at most the 4"),
         (lambda: shapes.weight((8, 2, 2), 0, 3, (2, 2, 4), 0, (3, 2, 2)), "even number"),
+        (lambda: shapes.weight((8, 2, 2), 5, 3, (2, 2, 4), 0, (2, 2, 2)), "second_support_length"),
         (lambda: shapes.voxels(np.zeros((2, 2, 2))), "at least one 1"),
     ],
 )

@@ -398,6 +398,44 @@ def test_a_problem_cannot_be_changed_behind_its_factors_back():
             array[0] = 0
 
 
+def test_nan_positions_give_nan_energy_and_forces():
+    problem = pc.discretise(beam())
+    p = problem.positions.copy()
+    p[4, 1] = np.nan
+    energy, forces = problem.energy_and_forces(p)
+    assert np.isnan(energy)
+    assert np.isnan(forces[4]).any()
+
+
+def test_the_applied_tangent_is_linear_to_the_last_digits(rng):
+    problem = pc.discretise(beam())
+    tangent = problem.linearise(disturbed(problem, 0.2))
+    x = rng.normal(size=problem.positions.shape)
+    full = tangent.apply(x)
+    for scale in (1e-10, 1e-16, 1e8):
+        np.testing.assert_allclose(
+            tangent.apply(scale * x) / scale, full, atol=1e-12 * abs(full).max()
+        )
+
+
+def test_runs_say_when_their_material_is_not_the_scenes():
+    problem = pc.discretise(beam())
+    changed = problem.with_material(young=5e6, poisson=0.1)
+    for one, words in ((problem, "the scene's"), (changed, "changed after the scene")):
+        run = pc.rollout(pc.ProjectiveDynamics(one), 1)
+        assert run.attributes["material"] == words
+
+
+def test_the_default_torsion_axis_is_the_middle_of_the_body():
+    problem = pc.discretise(beam(clamps=[], loads=[{"kind": "torsion", "strength": 1e4}]))
+    forces = problem.external_forces(0.0)
+    np.testing.assert_allclose(forces.sum(axis=0), 0, atol=1e-12)
+    middle = problem.positions.mean(axis=0)
+    torque = np.cross(problem.positions - middle, forces).sum(axis=0)
+    assert torque[0] > 0
+    np.testing.assert_allclose(torque[1:], 0, atol=1e-12)
+
+
 def test_other_materials_make_another_problem():
     problem = pc.discretise(beam(poisson=0.3))
     other = problem.with_material(young=2e6, poisson=0.3, density=500.0)

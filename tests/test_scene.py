@@ -112,6 +112,13 @@ def changed(old, new):
         (changed("kind = ", "ramp = 1.0\ntable = [[0, 1], [1, 2]]\nkind = "), ["not both"]),
         (changed("name = ", "name = ["), ["not valid TOML"]),
         (changed('"gravity beam"', '" "'), ["name", "not empty"]),
+        (changed("poisson = 0.45", "poisson = false"), ["material.poisson = False", "number"]),
+        (changed("young = 1.0e6", 'young = "1e6"'), ["material.young = '1e6'", "number"]),
+        (changed("frames = 50", "frames = true"), ["time.frames = True", "integer"]),
+        (changed("step = 0.01", "step = 1e300"), ["time.step", "1e+30"]),
+        (changed("name = ", "self = 1\nname = "), ["self: unknown key"]),
+        (changed("name = ", "__source__ = 1\nname = "), ["__source__: unknown key"]),
+        (changed("kind = ", "window = [-2, -1]\nkind = "), ["ends after time 0"]),
     ],
 )
 def test_wrong_scenes_are_refused_in_one_paragraph(text, words):
@@ -148,6 +155,19 @@ def test_unreadable_files_are_named(tmp_path):
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(SceneError, match="not a UTF-8"):
         pc.Scene.load(tmp_path / "binary.toml")
+
+
+def test_numpy_numbers_are_numbers():
+    plain = beam((3, 2, 1))
+    numbers = np.array([3, 2, 1])
+    scene = beam((3, 2, 1), body={"cells": numbers}, time={"frames": np.int64(20)})
+    assert scene.to_toml() == plain.to_toml()
+
+
+def test_absurd_grids_are_refused_by_name():
+    for cells in ([10**20, 1, 1], [10**6, 10**6, 1]):
+        with pytest.raises(SceneError, match="cells"):
+            pc.discretise(beam(cells))
 
 
 def test_changes_keep_the_rest():

@@ -106,6 +106,8 @@ def render(
     runs = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     output = Path(output)
     film = _check_arguments(runs, output, labels, colour, reference)
+    if not (0 < fps < 1000 and 0 < scale < 100):
+        raise InputError(f"fps = {fps}, scale = {scale}: expected positive numbers.")
     names = list(labels) if labels is not None else [""] * len(runs)
     shared = _common_frames([*runs, reference] if colour == "error" and reference else runs)
     chosen = shared[:, _choose(frame, shared.shape[1], film)]
