@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -51,6 +52,44 @@ def steps() -> list[dict[str, Any]]:
             [sys.executable, str(script), str(threads)], check=True, capture_output=True, text=True
         )
         rows += json.loads(out.stdout.splitlines()[-1])
+    return rows
+
+
+def threads() -> list[dict[str, Any]]:
+    """Milliseconds a step by what idle threads do: OpenMP's spinning and BLAS's threads."""
+    script = str(Path(__file__).parent / "threads.py")
+    rows = []
+    for refine, spin, blas, busy in (
+        (2, "2000", "1", False),
+        (2, "300000", "1", False),
+        (2, "2000", "1", True),
+        (2, "300000", "1", True),
+        (4, "2000", "1", False),
+        (4, "2000", "all", False),
+        (4, "300000", "all", False),
+    ):
+        other = subprocess.Popen([sys.executable, "-c", "while True: pass"]) if busy else None
+        try:
+            out = subprocess.run(
+                [sys.executable, script, str(refine), blas],
+                env={**os.environ, "GOMP_SPINCOUNT": spin},
+                check=True,
+                capture_output=True,
+                text=True,
+            )
+        finally:
+            if other:
+                other.kill()
+                other.wait()
+        rows.append(
+            {
+                "refine": refine,
+                "GOMP_SPINCOUNT": spin,
+                "BLAS threads": blas,
+                "another busy process": busy,
+                "milliseconds_a_frame": json.loads(out.stdout.splitlines()[-1]),
+            }
+        )
     return rows
 
 
@@ -133,6 +172,7 @@ def _mean_iterations(problem: pc.Problem, motion: str, scale: float) -> float:
 CASES: dict[str, Callable[[], Any]] = {
     "start_up": start_up,
     "steps": steps,
+    "threads": threads,
     "first_hessian": first_hessian,
     "factor_size": factor_size,
 }

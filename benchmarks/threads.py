@@ -1,0 +1,32 @@
+"""Median milliseconds of a step of the twisted cross; prints JSON.
+
+Usage: threads.py REFINE BLAS_THREADS, with GOMP_SPINCOUNT in the environment.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+
+import pdcorrect as pc
+from pdcorrect.evaluate import make_stepper
+from pdcorrect.solvers import implicit
+
+SCENE = Path(__file__).parent.parent / "examples" / "twisted_cross.toml"
+
+
+def main() -> None:
+    """Time six frames."""
+    refine, blas = int(sys.argv[1]), sys.argv[2]
+    if blas == "all":
+        implicit._quiet_blas = nullcontext
+    run = pc.rollout(make_stepper(pc.Scene.load(SCENE), "pd", refine), frames=6)
+    print(json.dumps(1e3 * float(np.median(run.stats["seconds"]))))
+
+
+if __name__ == "__main__":
+    main()
