@@ -59,7 +59,8 @@ def notes(comparison: Comparison) -> list[str]:
         f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
         f"E = {effective.young:.4g} Pa and {effective.poisson:.4g} "
         f"(volume weight '{scene.material.volume_weight}').",
-        f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD. "
+        f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
+        "Newton. "
         "'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2).",
     ]
     if comparison.solver_error is not None:

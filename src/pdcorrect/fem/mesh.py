@@ -38,14 +38,11 @@ class HexMesh:
     ----------
     coarse_nodes : (Nc,) int
         For each node of the unrefined mesh, the node at the same place here.
-    coarse_cells : (C,) int
-        For each cell, the unrefined cell that it is a part of.
     """
 
     positions: NDArray[np.float64]
     cells: NDArray[np.int64]
     coarse_nodes: NDArray[np.int64]
-    coarse_cells: NDArray[np.int64]
 
     @classmethod
     def create(cls, positions: NDArray[np.float64], cells: NDArray[np.int64]) -> HexMesh:
@@ -86,7 +83,7 @@ class HexMesh:
                 f"(smallest corner Jacobian {jacobian[cell]:.3g} m3): expected VTK node order and "
                 "a convex cell."
             )
-        return cls(positions, cells, np.arange(len(positions)), np.arange(len(cells)))
+        return cls(positions, cells, np.arange(len(positions)))
 
     @property
     def centres(self) -> NDArray[np.float64]:
@@ -195,7 +192,6 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
         positions,
         np.ascontiguousarray(cells, dtype=np.int64),
         coarse_nodes[mesh.coarse_nodes],
-        np.repeat(mesh.coarse_cells, k**3),
     )
 
 

@@ -54,13 +54,10 @@ class Quadrature:
         one cell's quadrature points are neighbours in memory.
     weights : (C, Q)
         Rest volume of each point, m3.
-    points : (C, Q, 3)
-        Rest position of each point, m.
     """
 
     gradients: Array
     weights: Array
-    points: Array
 
     @property
     def lanes(self) -> Array:
@@ -122,14 +119,12 @@ class Space:
         )
 
     def quadrature(self) -> Quadrature:
-        """Gradients, volumes and positions of the quadrature points."""
+        """Gradients and volumes at the quadrature points."""
         local = [self._basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, C, Q)
         lanes = np.ascontiguousarray(np.transpose(np.stack(local), (2, 0, 1, 3)))  # (C, K, 3, Q)
-        points = np.moveaxis(np.asarray(self._basis.global_coordinates()), 0, -1)
         return Quadrature(
             gradients=np.moveaxis(lanes, 3, 1),
             weights=np.ascontiguousarray(self._basis.dx),
-            points=np.ascontiguousarray(points),
         )
 
     def mass(self, density: Array) -> sp.csr_matrix:
