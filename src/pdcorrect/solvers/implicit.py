@@ -217,8 +217,8 @@ def _threadpools() -> ThreadpoolController:
 def _quiet_blas() -> AbstractContextManager[Any]:
     """BLAS on one thread: idle BLAS threads spin and take the kernels' cores.
 
-    The products here are too small to gain from threads; without this a step of
-    an 8000-node problem took three times as long on two cores.
+    The products here are too small to gain from threads (``benchmarks``, case
+    threads).
     """
     return _threadpools().limit(limits=1, user_api="blas")
 
