@@ -260,3 +260,29 @@ def test_frames_that_needed_a_fallback_are_reported(monkeypatch):
     comparison = pc.compare(beam((3, 1, 1), time={"frames": 2}))
     assert comparison.solver_error is None
     assert any("coarse Newton: 2 of 2 frames" in note for note in report.notes(comparison))
+
+
+def test_an_interrupted_run_says_what_it_kept(run, scene_file, tmp_path, monkeypatch):
+    real = pc.ProjectiveDynamics.__call__
+
+    def interrupted(self, state, *rest):
+        if state.time > 0.015:
+            raise KeyboardInterrupt
+        return real(self, state, *rest)
+
+    monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", interrupted)
+    status, _, err = run("simulate", scene_file, "-o", tmp_path / "run.h5")
+    assert status == cli.INTERRUPTED
+    assert "2 of 4 frames are in" in err
+    assert len(pc.load_trajectory(tmp_path / "run.h5")) == 2
+
+
+def test_render_refuses_what_would_mislead(run, scene_file, tmp_path):
+    run("simulate", scene_file, "-o", tmp_path / "a.h5")
+    for more, words in (
+        (("--colour", "error", "-o", tmp_path / "x.png"), "two runs"),
+        (("--frame", "1", "-o", tmp_path / "x.gif"), "all frames"),
+    ):
+        status, _, err = run("render", tmp_path / "a.h5", *more)
+        assert status == cli.BAD_INPUT
+        assert words in err

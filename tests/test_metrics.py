@@ -65,6 +65,8 @@ def test_momenta_of_a_turning_pair():
 def test_wrong_input_is_named(reference):
     with pytest.raises(InputError, match="restrict"):
         metrics.rms_error(reference, reference[:, :3])
+    with pytest.raises(InputError, match="5 and 3 frames"):
+        metrics.rms_error(reference, reference[:3])
     with pytest.raises(InputError, match="as many"):
         metrics.error_corrected([reference], [reference, reference], [reference])
     with pytest.raises(InputError, match="equals the reference"):

@@ -474,6 +474,23 @@ def test_a_singular_problem_is_named_not_a_traceback():
             assert result.status in pc.Status
 
 
+def test_stiff_bodies_move_even_below_the_tolerance():
+    problem = pc.discretise(beam(material={"young": 1e12}))
+    result = pc.ProjectiveDynamics(problem)(problem.rest_state())
+    exact = pc.Newton(problem)(problem.rest_state()).state.positions - problem.positions
+    moved = result.state.positions - problem.positions
+    assert np.abs(exact).max() < 0.1 * 1e-5 * problem.cell_size
+    np.testing.assert_allclose(moved, exact, atol=0.2 * np.abs(exact).max())
+
+
+def test_a_body_at_rest_without_loads_stays_there():
+    for clamps in ([], CLAMPED):
+        problem = pc.discretise(beam(loads=[], clamps=clamps))
+        run = pc.rollout(pc.ProjectiveDynamics(problem), 3)
+        np.testing.assert_array_equal(run.positions[-1], problem.positions)
+        assert (run.stats["iterations"] == 0).all()
+
+
 def test_an_overflowing_state_fails_by_name():
     problem = pc.discretise(beam((2, 1, 1)))
     velocities = np.full_like(problem.positions, 1e200)
@@ -518,6 +535,11 @@ def test_wrong_shapes_and_options_are_refused():
             pc.ProjectiveDynamics(problem, **options)
     with pytest.raises(InputError, match="time_step = -1"):
         pc.ProjectiveDynamics(problem)(problem.rest_state(), time_step=-1)
+    for wrong in (problem, pc.ProjectiveDynamics):
+        with pytest.raises(InputError, match="expected a stepper"):
+            pc.rollout(wrong)
+    with pytest.raises(InputError, match="expected Scene"):
+        pc.discretise("scene.toml")
     for bad in ({"frames": -1}, {"frames": 2.5}, {"on_failure": "pray"}):
         with pytest.raises(InputError, match="expected"):
             pc.rollout(pc.ProjectiveDynamics(problem), **bad)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
+from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
@@ -22,7 +22,7 @@ app = typer.Typer(
     help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
 )
 
-FAILED, BAD_INPUT = 1, 2
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 
 class SolverName(StrEnum):
@@ -50,7 +50,7 @@ Frames = Annotated[
 def simulate(
     scene: SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
-    refine: Annotated[int, typer.Option(help="Cut each coarse cell into K^3.", min=1)] = 1,
+    refine: Annotated[int, typer.Option(help="Cut each coarse cell into REFINE^3.", min=1)] = 1,
     solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
     frames: Frames = None,
     vtu: Annotated[
@@ -76,10 +76,15 @@ def simulate(
     log = StepLog()
     with writer, _progress() as progress:
         task = progress.add_task(f"{loaded.name}", total=count)
-        for result, elapsed in march(stepper, count):
-            writer.append(result, elapsed)
-            log.add(result, elapsed)
-            progress.advance(task)
+        try:
+            for result, elapsed in march(stepper, count):
+                writer.append(result, elapsed)
+                log.add(result, elapsed)
+                progress.advance(task)
+        except KeyboardInterrupt:
+            done = len(log.arrays()["status"])
+            typer.echo(f"stopped: {done} of {count} frames are in {output}", err=True)
+            raise typer.Exit(INTERRUPTED) from None
     _summary(log.arrays(), stepper)
     _say(f"wrote {output}")
     if vtu:
@@ -146,10 +151,17 @@ def render(
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a film.", min=0.1)] = 25.0,
 ) -> None:
-    """Draw one run or several side by side; errors are against the last run given."""
+    """Draw one run or several side by side; errors are against the last run given.
+
+    A .png shows one frame, a .gif or .mp4 all frames that the runs share.
+    """
     from pdcorrect import figures
     from pdcorrect.io.trajectory import load_trajectory
 
+    if colour is Colour.error and len(runs) < 2:
+        raise InputError("--colour error: expected two runs or more, the last is the reference.")
+    if frame is not None and output.suffix.lower() != ".png":
+        raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
     loaded = [load_trajectory(path) for path in runs]
     by_value: figures.Colour = "error" if colour is Colour.error else "displacement"
     still = output.suffix.lower() == ".png"
@@ -210,7 +222,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper) -> None:
     _say(
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
-        f"{stats['external_work'].sum():.4g} J"
+        f"over the run {stats['external_work'].sum():.4g} J"
     )
 
 

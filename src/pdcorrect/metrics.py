@@ -23,6 +23,8 @@ def _positions(run: Any) -> Array:
 
 def _pair(a: Any, b: Any) -> tuple[Array, Array]:
     x, y = _positions(a), _positions(b)
+    if x.ndim == y.ndim == 3 and len(x) != len(y) and x.shape[1:] == y.shape[1:]:
+        raise InputError(f"{len(x)} and {len(y)} frames: expected as many of both runs.")
     if x.shape != y.shape or x.ndim != 3 or x.shape[-1] != 3:
         raise InputError(
             f"positions of shapes {x.shape} and {y.shape}: expected equal (T+1, N, 3). Bring both "

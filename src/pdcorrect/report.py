@@ -15,6 +15,7 @@ from pdcorrect.environment import environment
 from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import largest_displacement
+from pdcorrect.state import Trajectory
 
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
@@ -35,13 +36,17 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 str(row.nodes),
                 "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
-                "" if np.isnan(row.omega) else f"{round(row.omega, 1) + 0.0:.1f} %",
+                "ref." if is_reference else _percent(row.omega),
                 f"{1e3 * row.seconds_a_frame:.3g}",
                 f"{reference_seconds / row.seconds_a_frame:.3g}x",
                 f"{row.iterations_a_frame:.1f}",
             )
         )
     return lines
+
+
+def _percent(share: float) -> str:
+    return "" if np.isnan(share) else f"{round(share, 1) + 0.0:.1f} %"  # no minus zero
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -63,6 +68,12 @@ def notes(comparison: Comparison) -> list[str]:
         "Newton. "
         "'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2).",
     ]
+    lost = _lost_share(comparison.runs[comparison.reference])
+    if lost is not None:
+        out.append(
+            f"Backward Euler at this step dissipates {100 * lost:.0f} % of the work that the loads "
+            "do on the reference (time error, which all rows share)."
+        )
     if comparison.solver_error is not None:
         out.append(
             f"PD and Newton on the coarse mesh differ by at most "
@@ -76,6 +87,16 @@ def notes(comparison: Comparison) -> list[str]:
         if row.unusual_frames
     ]
     return out
+
+
+def _lost_share(run: Trajectory) -> float | None:
+    """Share of the loads' work that is neither elastic nor kinetic at the end; None if unclear."""
+    problem = run.problem
+    if problem is None or problem.clamps.moving:  # moving clamps do work as well
+        return None
+    work = float(run.stats["external_work"].sum())
+    stored = float(run.stats["elastic_energy"][-1] + run.stats["kinetic_energy"][-1])
+    return (work - stored) / work if work > stored > 0 else None
 
 
 def to_markdown(comparison: Comparison, pictures: list[str]) -> str:

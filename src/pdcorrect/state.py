@@ -65,6 +65,9 @@ class State:
                 "expected the same shape."
             )
 
+    def __repr__(self) -> str:
+        return f"State({len(self.positions)} nodes, t = {self.time:g} s)"
+
 
 @dataclass(frozen=True, eq=False)
 class StepResult:
@@ -92,6 +95,12 @@ class StepResult:
     residual: float
     error_estimate: float
     stats: Mapping[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return (
+            f"StepResult({self.status.value}, {self.iterations} iterations, estimated error "
+            f"{self.error_estimate:.2g} m, {self.state!r})"
+        )
 
 
 class Stepper(Protocol):
@@ -143,6 +152,12 @@ class Trajectory:
     scene_toml: str = ""
     attributes: Mapping[str, str] = field(default_factory=dict)
     problem: Problem | None = None
+
+    def __repr__(self) -> str:
+        return (
+            f"Trajectory({len(self)} steps to t = {self.times[-1]:g} s, {len(self.points)} nodes, "
+            f"{len(self.cells)} cells)"
+        )
 
     def __len__(self) -> int:
         """Number of steps T (there are T + 1 frames)."""

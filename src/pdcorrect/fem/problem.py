@@ -243,6 +243,8 @@ def discretise(
     SceneError, MeshError
         Naming the key or the cell.
     """
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene is a {type(scene).__name__}: expected Scene.load(path).")
     if isinstance(refine, bool) or not isinstance(refine, (int, np.integer)) or refine < 1:
         raise InputError(f"refine = {refine!r}: expected a whole number of at least 1.")
     changes = {k: v for k, v in {"mass": mass, "element": element}.items() if v is not None}

@@ -228,7 +228,10 @@ def _check_target(path: Path, overwrite: bool) -> None:
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; create it first.")
     if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists already; allow overwriting or choose another name.")
+        raise OutputError(
+            f"{path}: exists already; overwrite it with --overwrite (overwrite=True) or choose "
+            "another name."
+        )
 
 
 def _save(data: bytes, path: Path, overwrite: bool) -> None:

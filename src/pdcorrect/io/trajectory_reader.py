@@ -228,7 +228,10 @@ def _intact(dataset: Any, index: int, size: int) -> bool:
 
 
 def _truncation(block: Superblock, intact: int, frames: int) -> str:
-    kept = f"{intact} of its {frames} frames are intact; salvage reads them"
+    kept = (
+        f"{intact} of its {frames} frames are intact; load_trajectory(path, salvage=True) reads "
+        "them"
+    )
     return f"truncated: expected {block.end} bytes, got {block.size}; " + (
         kept if intact else f"none of its {frames} frames is intact"
     )

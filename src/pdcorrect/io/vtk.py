@@ -30,7 +30,8 @@ def write_vtu_series(
     """Write ``name_0000.vtu`` … and ``name.pvd``; open the latter in ParaView.
 
     Points are the current positions; ``displacement`` (m) and ``velocity``
-    (m/s) are point data.
+    (m/s) are point data.  An older series of the same name in the folder is
+    replaced.
 
     Parameters
     ----------
@@ -59,6 +60,8 @@ def write_vtu_series(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from error
+    for stale in folder.glob(f"{name}_[0-9][0-9][0-9][0-9]*.vtu"):
+        stale.unlink()
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
     for frame in range(0, len(trajectory.times), every):

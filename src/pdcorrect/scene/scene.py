@@ -159,7 +159,8 @@ def _explain(error: ValidationError) -> str:
         elif item["type"] == "missing":
             sentences.append(f"{key}: missing; a value is required.")
         else:
-            message = item["msg"].removeprefix("Value error, ")
+            message = item["msg"].removeprefix("Value error, ").replace("tuple", "list")
+            message = message.replace("Input tag", "kind").replace("tags", "kinds")
             value = repr(item["input"])
             value = value if len(value) < 80 else value[:77] + "..."
             sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")

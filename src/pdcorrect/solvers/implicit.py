@@ -124,6 +124,9 @@ class ImplicitStepper:
             self.problem.linearise(rest).apply(rest)
         return self
 
+    def __repr__(self) -> str:
+        return f"{self.name} of {self.problem!r}, tolerance {self.tolerance:g}"
+
     def describe(self) -> dict[str, str]:
         """Method, tolerance, step and factorisation in use."""
         return {

@@ -33,6 +33,11 @@ _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
 _BACKTRACKS = 30
 _ESTIMATE_STEPS = 1000
+_NO_MOTION = 1e-6
+"""Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
+
+Otherwise stiff bodies would not move at all where the motion is below the tolerance.
+"""
 _FIRST_CHECK = 0.15
 """Length of the loop's own step, of the tolerance, at which the estimate is first made.
 
@@ -180,9 +185,9 @@ def minimise(
 
     The loop watches the length of its own step.  When that is small, the
     remaining displacement is estimated by conjugate gradients on the true
-    Hessian.  If that is too large the loop goes on, with the Newton step just
-    found as its next one (L-BFGS) and having learnt how far its own measure was
-    off.
+    Hessian.  If that is too large, or nothing has moved yet, the loop goes on,
+    with the Newton step just found as its next one (L-BFGS) and having learnt
+    how far its own measure was off.
     """
     p = start
     value, gradient = objective.value_and_gradient(p)
@@ -199,7 +204,7 @@ def minimise(
         length = largest_displacement(direction)
         if length <= threshold:
             exact, estimate = newton_step(objective, p, gradient, solve, direction)
-            if estimate <= options.tolerance:
+            if estimate <= (options.tolerance if iteration else _NO_MOTION * options.tolerance):
                 status = Status.CONVERGED
                 break
             threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
@@ -213,7 +218,8 @@ def minimise(
             if len(history):
                 history.clear()
                 continue
-            status = Status.LINE_SEARCH
+            close = estimate <= options.tolerance  # an unmoved start, refused above
+            status = Status.CONVERGED if close else Status.LINE_SEARCH
             break
         x_new = solve(found.gradient)
         if options.history:
