@@ -17,7 +17,7 @@ from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_sv
 from pdcorrect.fem.energies import density_and_stress_lanes, tangent_lanes
 
 # GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
-# takes several times as long as soon as other processes want the cores (benchmarks, case threads).
+# takes longer as soon as other processes want the cores (benchmarks, case threads).
 os.environ.setdefault("GOMP_SPINCOUNT", "2000")
 
 PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}

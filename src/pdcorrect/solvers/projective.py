@@ -18,9 +18,10 @@ FirstHessian = Literal["auto", "G", "G-scaled"]
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
-G overestimates the stiffness of the volume term where it acts.  In twist, bending and free flight
-a quarter took 30 to 55 per cent fewer iterations than 1 and was the best or within a tenth of it at
-Poisson's ratio 0.3 and 0.45 (``benchmarks``, case first_hessian).
+G overestimates the stiffness of the volume term where it acts.  In twist,
+bending and free flight at Poisson's ratio 0.3 and 0.45 a quarter took 23 to 45
+per cent fewer iterations than 1, and was the best or within a tenth of it
+(``benchmarks``, case first_hessian).
 """
 
 
