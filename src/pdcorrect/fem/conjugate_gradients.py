@@ -47,6 +47,7 @@ def conjugate_gradients(
     tolerance: float,
     max_steps: int,
     start: Array | None = None,
+    residual_share: float = math.inf,
     settled: Callable[[Array, Array], bool] | None = None,
 ) -> Solution:
     """Solve A x = b for symmetric A.
@@ -62,6 +63,9 @@ def conjugate_gradients(
     max_steps : int
     start : array, optional
         First iterate; zero by default.
+    residual_share : float
+        Largest Euclidean norm of the residual, of b's: the preconditioner's norm
+        hides modes that the preconditioner takes for much stiffer than they are.
     settled : callable, optional
         (x, last change of x) -> whether x is good enough; a further condition.
     """
@@ -70,6 +74,7 @@ def conjugate_gradients(
     z = precondition(r)
     r_z = float(np.vdot(r, z))
     target, direction = tolerance**2 * r_z, z
+    limit = (residual_share**2) * float(np.vdot(b, b))
     for step in range(1, max_steps + 1):
         if not r_z > 0.0 or not math.isfinite(r_z):
             return Solution(x, r_z == 0.0, not r_z < 0.0, step - 1)
@@ -83,7 +88,8 @@ def conjugate_gradients(
         r = r - alpha * image
         z = precondition(r)
         r_z, old = float(np.vdot(r, z)), r_z
-        if r_z <= target and (settled is None or settled(x, change)):
+        small = float(np.vdot(r, r)) <= limit
+        if small and r_z <= target and (settled is None or settled(x, change)):
             return Solution(x, True, True, step)
         direction = z + (r_z / old) * direction
     return Solution(x, False, True, max_steps)

@@ -294,6 +294,7 @@ def newton_step(
         tolerance=0.1,
         max_steps=_ESTIMATE_STEPS,
         start=guess,
+        residual_share=0.03,
         settled=lambda x, change: largest_displacement(change) <= 0.1 * largest_displacement(x),
     )
     exact = found.converged and found.convex
