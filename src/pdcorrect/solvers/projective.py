@@ -19,7 +19,7 @@ VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
 G overestimates the stiffness of the volume term where it acts.  In twist,
-bending and free flight at Poisson's ratio 0.3 and 0.45 a quarter took 23 to 45
+bending and free flight at Poisson's ratio 0.3 and 0.45 a quarter took 21 to 46
 per cent fewer iterations than 1, and was the best or within a tenth of it
 (``benchmarks``, case first_hessian).
 """
