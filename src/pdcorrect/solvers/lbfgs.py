@@ -207,7 +207,8 @@ def minimise(
             if estimate <= (options.tolerance if iteration else _NO_MOTION * options.tolerance):
                 status = Status.CONVERGED
                 break
-            threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
+            if estimate > options.tolerance:
+                threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
             if options.history and math.isfinite(estimate):
                 direction = exact
         if iteration == options.max_iterations:
@@ -218,7 +219,8 @@ def minimise(
             if len(history):
                 history.clear()
                 continue
-            close = estimate <= options.tolerance  # an unmoved start, refused above
+            # only of the unmoved start is the estimate within the tolerance, and still its own
+            close = iteration == 0 and estimate <= options.tolerance
             status = Status.CONVERGED if close else Status.LINE_SEARCH
             break
         x_new = solve(found.gradient)
