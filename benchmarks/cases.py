@@ -15,6 +15,7 @@ import numpy as np
 
 import pdcorrect as pc
 from pdcorrect.fem.factorisation import factor_bytes, factorise
+from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
 from pdcorrect.solvers.step import GlobalSolver, StepObjective
 
@@ -150,7 +151,7 @@ def _beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12, 2, 2))
 
 
 def _mean_iterations(problem: pc.Problem, motion: str, scale: float) -> float:
-    solve = GlobalSolver(problem, 0.01, volume_scale=scale)
+    solve = GlobalSolver(problem, (1e4, 1.0), volume_scale=scale)
     state = problem.rest_state()
     if motion == "flight":
         spin = np.cross([5.0, 3.0, 2.0], state.positions - 0.03)
@@ -160,7 +161,7 @@ def _mean_iterations(problem: pc.Problem, motion: str, scale: float) -> float:
     counts = []
     for _ in range(8):
         loads = problem.external_forces(state.time, state.time + 0.01)
-        objective = StepObjective(problem, state, 0.01, loads)
+        objective = StepObjective(problem, state, backward_euler(problem, state, 0.01), loads)
         found = minimise(objective, objective.start, solve, options)
         counts.append(found.iterations)
         velocities = (found.positions - state.positions) / 0.01

@@ -84,7 +84,7 @@ def test_the_scene_page_names_every_key():
         scene_module.MeshFile, scene_module.Material, scene_module.Region, scene_module.Clamp,
         scene_module.Motion, scene_module.Gravity, scene_module.BodyForce, scene_module.Force,
         scene_module.Traction, scene_module.Pressure, scene_module.Torsion, scene_module.Time,
-        scene_module.Solver, scene_module.Scene,
+        scene_module.Solver, scene_module.Damping, scene_module.Scene,
     ]  # fmt: skip
     for model in models:
         for name, field in model.model_fields.items():

@@ -50,6 +50,7 @@ class State:
     positions: Array
     velocities: Array
     time: float = 0.0
+    memory: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("positions", "velocities"):

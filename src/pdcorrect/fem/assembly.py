@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem import kernels
-from pdcorrect.fem.operators import Quadrature
+from pdcorrect.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ class Linearisation:
     left, right : (C, 9, Q)
         Factors of the signed SVD of F.
     tangent : (C, 12, Q)
-        Tangent in their frame times the volumes, N m.
+        Tangent in their frame times the volumes, J.
     """
 
     assembly: Assembly
@@ -86,9 +86,13 @@ class Linearisation:
 
     def assemble(self) -> sp.csr_matrix:
         """The tangent as a sparse matrix (3N, 3N), N/m."""
-        count, nodes = self.assembly.cells.shape
-        blocks = np.empty((count, nodes, nodes, 3, 3))
+        return self.assembly.matrix(self.blocks())
+
+    def blocks(self) -> Array:
+        """The tangent of each cell, (C, L, L, 3, 3), N/m."""
+        count, width = self.assembly.cells.shape
+        blocks = np.empty((count, width, width, 3, 3))
         kernels.cell_stiffness(
             self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
         )
-        return self.assembly.matrix(blocks)
+        return blocks

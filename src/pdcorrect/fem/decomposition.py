@@ -196,14 +196,17 @@ def _complete_basis(V, U, s, l):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def nearest_volume_lanes(s, v, k):  # type: ignore[no-untyped-def]
-    """Nearest stretch of unit volume v (3, L) and multiplier k (L,) for s (3, L)."""
+def nearest_volume_lanes(s, v, k, first):  # type: ignore[no-untyped-def]
+    """Nearest stretch of unit volume v (3, L) and multiplier k (L,) for s (3, L).
+
+    Only lanes from ``first`` on are computed.
+    """
     lanes = s.shape[1]
-    for l in range(lanes):
+    for l in range(first, lanes):
         v[2, l] = 1.0
     for _ in range(_NEWTON_STEPS):
         change = 0.0
-        for l in range(lanes):
+        for l in range(first, lanes):
             c = v[2, l]
             kappa = c * (c - s[2, l])
             root_a = math.sqrt(abs(s[0, l] * s[0, l] + 4.0 * kappa))
@@ -220,7 +223,7 @@ def nearest_volume_lanes(s, v, k):  # type: ignore[no-untyped-def]
             v[0, l], v[1, l], v[2, l], k[l] = a, b, c_new, kappa
         if not change > 1e-14:
             break
-    for l in range(lanes):
+    for l in range(first, lanes):
         volume = s[0, l] * s[1, l] * s[2, l]
         if volume > _LARGE_VOLUME:
             c = _smallest_stretch_large(s[0, l], s[1, l], s[2, l])

@@ -1,5 +1,7 @@
 """The corotated energy with a volume term: density, stress and tangent.
 
+Pointwise functions on NumPy arrays serve these and the other energies.
+
     Psi(F) = mu |F - R|^2 + omega/2 |F - V|^2
 
 R is the nearest rotation and V the nearest matrix of unit determinant.  Both
@@ -29,6 +31,12 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, scratch, signed_svd_lanes
+from pdcorrect.fem.hyperelasticity import (
+    COROTATED,
+    energy_code,
+    hyperelastic_lanes,
+    hyperelastic_tangent_lanes,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,58 +46,78 @@ _KINK = 1e-9
 
 
 @njit(**OPTIONS)
-def density_and_stress_lanes(U, s, V, v, k, mu, omega, density, P):  # type: ignore[no-untyped-def]
-    """Energy density (L,) and first Piola-Kirchhoff stress P (9, L) from the decompositions.
+def corotated_lanes(s, v, k, mu, omega, first, density, t):  # type: ignore[no-untyped-def]
+    """Energy density (L,) and principal stresses t (3, L) from the decompositions.
 
-    With ``omega = 0`` the arrays v and k are not read.
+    ``mu`` and ``omega`` are (L,).  In lanes below ``first`` there is no volume
+    term, and v and k are not read.
     """
     for l in range(s.shape[1]):
         e0, e1, e2 = s[0, l] - 1.0, s[1, l] - 1.0, s[2, l] - 1.0
-        density[l] = mu * (e0 * e0 + e1 * e1 + e2 * e2)
-        t0, t1, t2 = 2.0 * mu * e0, 2.0 * mu * e1, 2.0 * mu * e2
-        if omega > 0.0:
-            g0, g1, g2 = k[l] / v[0, l], k[l] / v[1, l], k[l] / v[2, l]
-            density[l] += 0.5 * omega * (g0 * g0 + g1 * g1 + g2 * g2)
-            t0, t1, t2 = t0 - omega * g0, t1 - omega * g1, t2 - omega * g2
+        density[l] = mu[l] * (e0 * e0 + e1 * e1 + e2 * e2)
+        t[0, l], t[1, l], t[2, l] = 2.0 * mu[l] * e0, 2.0 * mu[l] * e1, 2.0 * mu[l] * e2
+    for l in range(first, s.shape[1]):
+        g0, g1, g2 = k[l] / v[0, l], k[l] / v[1, l], k[l] / v[2, l]
+        density[l] += 0.5 * omega[l] * (g0 * g0 + g1 * g1 + g2 * g2)
+        t[0, l] -= omega[l] * g0
+        t[1, l] -= omega[l] * g1
+        t[2, l] -= omega[l] * g2
+
+
+@njit(**OPTIONS)
+def stress_lanes(U, t, V, P):  # type: ignore[no-untyped-def]
+    """First Piola-Kirchhoff stress P (9, L) = U diag(t) V^T."""
+    for l in range(t.shape[1]):
         for i in range(3):
-            x, y, z = U[3 * i, l] * t0, U[3 * i + 1, l] * t1, U[3 * i + 2, l] * t2
+            x = U[3 * i, l] * t[0, l]
+            y = U[3 * i + 1, l] * t[1, l]
+            z = U[3 * i + 2, l] * t[2, l]
             for j in range(3):
                 P[3 * i + j, l] = x * V[3 * j, l] + y * V[3 * j + 1, l] + z * V[3 * j + 2, l]
 
 
 @njit(**OPTIONS)
-def tangent_lanes(s, v, k, mu, omega, project, T):  # type: ignore[no-untyped-def]
-    """Tangent in the frame of the SVD, T (12, L).
+def corotated_tangent_lanes(s, v, k, mu, omega, first, T):  # type: ignore[no-untyped-def]
+    """Tangent in the frame of the SVD, T (12, L), for the arguments of `corotated_lanes`.
 
     Rows 0-5: the diagonal block 00 11 22 01 02 12; rows 6-8 and 9-11: for the
-    pairs 01 02 12 the factors p, m of P_ij = p F_ij + m F_ji.  ``project``
-    raises negative eigenvalues to zero.
+    pairs 01 02 12 the eigenvalues of the symmetric and the antisymmetric mode.
     """
     for l in range(s.shape[1]):
         for i in range(3):
-            T[i, l] = 2.0 * mu
+            T[i, l] = 2.0 * mu[l]
             T[3 + i, l] = 0.0
-        if omega > 0.0:
-            _volume_diagonal(s, v, l, omega, T)
+            T[6 + i, l] = 2.0 * mu[l]
+            a, b = i // 2, 1 + (i + 1) // 2
+            total = s[a, l] + s[b, l]
+            kink = not total > _KINK * (s[0, l] + 1e-300)
+            T[9 + i, l] = 0.0 if kink else 2.0 * mu[l] * (total - 2.0) / total
+    for l in range(first, s.shape[1]):
+        _volume_diagonal(s, v, l, omega[l], T)
         for pair in range(3):
-            i, j = pair // 2, 1 + (pair + 1) // 2
-            total = s[i, l] + s[j, l]
-            symmetric, antisymmetric = 2.0 * mu, 0.0
-            if total > _KINK * (s[0, l] + 1e-300):
-                antisymmetric = 2.0 * mu * (total - 2.0) / total
-                if omega > 0.0:
-                    vv = v[i, l] * v[j, l]
-                    antisymmetric -= omega * k[l] / (vv - k[l])
-            if omega > 0.0:
-                vv = v[i, l] * v[j, l]
-                if abs(vv + k[l]) > _KINK * vv:
-                    symmetric += omega * k[l] / (vv + k[l])
+            a, b = pair // 2, 1 + (pair + 1) // 2
+            vv = v[a, l] * v[b, l]
+            if s[a, l] + s[b, l] > _KINK * (s[0, l] + 1e-300):
+                T[9 + pair, l] -= omega[l] * k[l] / (vv - k[l])
+            if abs(vv + k[l]) > _KINK * vv:
+                T[6 + pair, l] += omega[l] * k[l] / (vv + k[l])
+
+
+@njit(**OPTIONS)
+def finish_tangent_lanes(T, project):  # type: ignore[no-untyped-def]
+    """Turn rows 6-11 of T (12, L) from eigenvalues into factors p, m of P_ij = p F_ij + m F_ji.
+
+    ``project`` raises negative eigenvalues to zero before.
+    """
+    for l in range(T.shape[1]):
+        if project:
+            _project_diagonal(T, l)
+        for pair in range(3):
+            symmetric, antisymmetric = T[6 + pair, l], T[9 + pair, l]
             if project:
                 symmetric, antisymmetric = max(symmetric, 0.0), max(antisymmetric, 0.0)
             T[6 + pair, l] = 0.5 * (symmetric + antisymmetric)
             T[9 + pair, l] = 0.5 * (symmetric - antisymmetric)
-        if project:
-            _project_diagonal(T, l)
 
 
 @njit(**OPTIONS)
@@ -155,22 +183,28 @@ def nearest_unit_determinant(F: Array) -> Array:
     return scaled @ np.swapaxes(_from_lanes(V, shape), -1, -2)
 
 
-def energy_density(F: Array, mu: float, omega: float) -> Array:
-    """Psi(F), (...), J/m3, for F (..., 3, 3) and weights in Pa."""
-    return _density_and_stress(F, mu, omega)[0]
+def energy_density(F: Array, mu: float, omega: float, energy: str = "corotated") -> Array:
+    """Psi(F), (...), J/m3, for F (..., 3, 3) and weights in Pa; ``energy`` as in `Material`."""
+    return _density_and_stress(F, mu, omega, energy)[0]
 
 
-def first_piola(F: Array, mu: float, omega: float) -> Array:
+def first_piola(F: Array, mu: float, omega: float, energy: str = "corotated") -> Array:
     """P = dPsi/dF, (..., 3, 3), Pa."""
-    return _density_and_stress(F, mu, omega)[1]
+    return _density_and_stress(F, mu, omega, energy)[1]
 
 
-def elasticity(F: Array, mu: float, omega: float, project: bool = False) -> Array:
+def elasticity(
+    F: Array, mu: float, omega: float, project: bool = False, energy: str = "corotated"
+) -> Array:
     """dP/dF, (..., 3, 3, 3, 3), Pa; ``project`` makes it positive semi-definite."""
     flat, shape = _to_lanes(F)
     U, s, V, _, _, v, k = _decompose(flat)
-    T = np.empty((12, flat.shape[1]))
-    tangent_lanes(s, v, k, float(mu), float(omega), project, T)
+    T, weights = np.empty((12, flat.shape[1])), _weights(mu, omega, flat.shape[1])
+    if energy_code(energy) == COROTATED:
+        corotated_tangent_lanes(s, v, k, *weights, 0, T)
+    else:
+        hyperelastic_tangent_lanes(energy_code(energy), s, *weights, T)
+    finish_tangent_lanes(T, project)
     C = np.zeros((flat.shape[1], 3, 3, 3, 3))  # in the frame of the SVD
     for i in range(3):
         C[:, i, i, i, i] = T[i]
@@ -183,19 +217,28 @@ def elasticity(F: Array, mu: float, omega: float, project: bool = False) -> Arra
     return out.reshape(*shape, 3, 3, 3, 3)
 
 
-def _density_and_stress(F: Array, mu: float, omega: float) -> tuple[Array, Array]:
+def _density_and_stress(F: Array, mu: float, omega: float, energy: str) -> tuple[Array, Array]:
     flat, shape = _to_lanes(F)
     U, s, V, _, _, v, k = _decompose(flat)
-    density, P = np.empty(flat.shape[1]), np.empty_like(flat)
-    density_and_stress_lanes(U, s, V, v, k, float(mu), float(omega), density, P)
+    weights = _weights(mu, omega, flat.shape[1])
+    density, t, P = np.empty(flat.shape[1]), np.empty_like(s), np.empty_like(flat)
+    if energy_code(energy) == COROTATED:
+        corotated_lanes(s, v, k, *weights, 0, density, t)
+    else:
+        hyperelastic_lanes(energy_code(energy), s, *weights, density, t)
+    stress_lanes(U, t, V, P)
     return density.reshape(shape), _from_lanes(P, shape)
+
+
+def _weights(mu: float, omega: float, count: int) -> tuple[Array, Array]:
+    return np.full(count, float(mu)), np.full(count, float(omega))
 
 
 def _decompose(flat: Array) -> tuple[Array, ...]:
     work = scratch(flat.shape[1])
     U, s, V, B, S, v, k = work
     signed_svd_lanes(flat, U, s, V, B, S)
-    nearest_volume_lanes(s, v, k)
+    nearest_volume_lanes(s, v, k, 0)
     return work
 
 

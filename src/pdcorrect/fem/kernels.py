@@ -14,7 +14,17 @@ import numpy as np
 from numba import njit, prange
 
 from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_svd_lanes
-from pdcorrect.fem.energies import density_and_stress_lanes, tangent_lanes
+from pdcorrect.fem.energies import (
+    corotated_lanes,
+    corotated_tangent_lanes,
+    finish_tangent_lanes,
+    stress_lanes,
+)
+from pdcorrect.fem.hyperelasticity import (
+    COROTATED,
+    hyperelastic_lanes,
+    hyperelastic_tangent_lanes,
+)
 
 # GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
 # takes longer as soon as other processes want the cores (benchmarks, case threads).
@@ -27,7 +37,7 @@ _CHUNK = 16
 
 
 @njit(**OPTIONS)
-def _gradient(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-def]
+def deformation(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-def]
     """Diagonal I + sum_k u_k grad N_k, (9, Q), for nodal vectors u (N, 3); F for diagonal 1."""
     for i in range(3):
         for j in range(3):
@@ -43,11 +53,8 @@ def _gradient(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-def]
 
 
 @njit(**_REDUCE)
-def _nodal_forces(P, weights, gradients, out):  # type: ignore[no-untyped-def]
-    """out[k, i] = -sum_q w_q P_ij dN_k/dx_j for P (9, Q)."""
-    for row in range(9):
-        for q in range(P.shape[1]):
-            P[row, q] *= weights[q]
+def nodal_forces(P, gradients, sign, out):  # type: ignore[no-untyped-def]
+    """out[k, i] = sign sum_q P_ij dN_k/dx_j for P (9, Q), weights included."""
     for k in range(out.shape[0]):
         for i in range(3):
             total = 0.0
@@ -57,68 +64,80 @@ def _nodal_forces(P, weights, gradients, out):  # type: ignore[no-untyped-def]
                     + P[3 * i + 1, q] * gradients[k, 1, q]
                     + P[3 * i + 2, q] * gradients[k, 2, q]
                 )
-            out[k, i] = -total
+            out[k, i] = sign * total
 
 
-@njit(**OPTIONS)
-def _dot(a, b):  # type: ignore[no-untyped-def]
-    total = 0.0
+@njit(**_REDUCE)
+def total(a):  # type: ignore[no-untyped-def]
+    """Sum of a vector."""
+    out = 0.0
     for i in range(a.shape[0]):
-        total += a[i] * b[i]
-    return total
+        out += a[i]
+    return out
 
 
 @njit(**PARALLEL)
-def cell_energy_and_forces(u, cells, gradients, weights, mu, omega, energy, forces):  # type: ignore[no-untyped-def]
+def cell_energy_and_forces(  # type: ignore[no-untyped-def]
+    model, u, cells, gradients, shear, volume, first, energy, forces
+):
     """Elastic energy (C,), J, and nodal forces (C, K, 3), N, of each cell.
 
     Parameters
     ----------
+    model : int
+        See `energy_code`.
     u : (N, 3)
         Displacements, m.
-    cells : (C, K), gradients : (C, K, 3, Q), weights : (C, Q)
-    mu, omega : (C,)
-        Weights of the two terms, Pa; where omega is zero no volume projection
-        is computed.
+    cells : (C, K), gradients : (C, K, 3, Q)
+    shear, volume : (C, Q)
+        Weights of the two terms times rest volume, J.
+    first : int
+        Lanes below it have no volume term, and no volume projection is computed
+        for them.
     """
-    count, lanes = cells.shape[0], weights.shape[1]
+    count, lanes = cells.shape[0], shear.shape[1]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
         U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        s, v = np.empty((3, lanes)), np.empty((3, lanes))
+        s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
         k, density = np.empty(lanes), np.empty(lanes)
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _gradient(u, cells[c], gradients[c], 1.0, F)
+            deformation(u, cells[c], gradients[c], 1.0, F)
             signed_svd_lanes(F, U, s, V, B, S)
-            if omega[c] > 0.0:
-                nearest_volume_lanes(s, v, k)
-            density_and_stress_lanes(U, s, V, v, k, mu[c], omega[c], density, P)
-            energy[c] = _dot(density, weights[c])
-            _nodal_forces(P, weights[c], gradients[c], forces[c])
+            if model == COROTATED:
+                start = first if volume[c, lanes - 1] > 0.0 else lanes
+                nearest_volume_lanes(s, v, k, start)
+                corotated_lanes(s, v, k, shear[c], volume[c], start, density, t)
+            else:
+                hyperelastic_lanes(model, s, shear[c], volume[c], density, t)
+            stress_lanes(U, t, V, P)
+            energy[c] = total(density)
+            nodal_forces(P, gradients[c], -1.0, forces[c])
 
 
 @njit(**PARALLEL)
 def linearise_cells(  # type: ignore[no-untyped-def]
-    u, cells, gradients, weights, mu, omega, project, left, right, tangent
+    model, u, cells, gradients, shear, volume, first, project, left, right, tangent
 ):
     """Everything the tangent needs at displacements u, for each cell.
 
     Writes ``left`` and ``right`` (C, 9, Q), the factors U and V of the signed
-    SVD, and ``tangent`` (C, 12, Q), `tangent_lanes` times the weights.
+    SVD, and ``tangent`` (C, 12, Q), see `finish_tangent_lanes`, in J.
     """
-    count, lanes = cells.shape[0], weights.shape[1]
+    count, lanes = cells.shape[0], shear.shape[1]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
         s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _gradient(u, cells[c], gradients[c], 1.0, F)
+            deformation(u, cells[c], gradients[c], 1.0, F)
             signed_svd_lanes(F, left[c], s, right[c], B, S)
-            if omega[c] > 0.0:
-                nearest_volume_lanes(s, v, k)
-            tangent_lanes(s, v, k, mu[c], omega[c], project, tangent[c])
-            for row in range(12):
-                for q in range(lanes):
-                    tangent[c, row, q] *= weights[c, q]
+            if model == COROTATED:
+                start = first if volume[c, lanes - 1] > 0.0 else lanes
+                nearest_volume_lanes(s, v, k, start)
+                corotated_tangent_lanes(s, v, k, shear[c], volume[c], start, tangent[c])
+            else:
+                hyperelastic_tangent_lanes(model, s, shear[c], volume[c], tangent[c])
+            finish_tangent_lanes(tangent[c], project)
 
 
 @njit(**PARALLEL)
@@ -126,16 +145,13 @@ def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: i
     """Tangent times x (N, 3), written by cell to ``out`` (C, K, 3)."""
     count, lanes = cells.shape[0], tangent.shape[2]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        D, A, one = np.empty((9, lanes)), np.empty((9, lanes)), np.ones(lanes)
+        D, A = np.empty((9, lanes)), np.empty((9, lanes))
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            _gradient(x, cells[c], gradients[c], 0.0, D)
+            deformation(x, cells[c], gradients[c], 0.0, D)
             _transform(left[c], D, right[c], A, True)
             _tangent_product(tangent[c], A)
             _transform(left[c], A, right[c], D, False)
-            _nodal_forces(D, one, gradients[c], out[c])
-            for k in range(out.shape[1]):
-                for i in range(3):
-                    out[c, k, i] = -out[c, k, i]
+            nodal_forces(D, gradients[c], 1.0, out[c])
 
 
 @njit(**OPTIONS)
@@ -170,39 +186,46 @@ def _tangent_product(T, A):  # type: ignore[no-untyped-def]
 
 @njit(**PARALLEL)
 def cell_stiffness(cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
-    """Tangent stiffness of each cell as node blocks, out (C, K, K, 3, 3), N/m.
+    """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
+    count = cells.shape[0]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            add_stiffness(gradients[c], left[c], right[c], tangent[c], out[c])
 
-    In the frame of the SVD, with g_k = V^T grad N_k, the block of nodes k, l is
+
+@njit(**OPTIONS)
+def add_stiffness(gradients, U, V, T, out):  # type: ignore[no-untyped-def]
+    """Tangent stiffness of one cell, out (L, L, 3, 3), from gradients (L, 3, Q).
+
+    In the frame of the SVD, with g_k = V^T grad N_k, the block of functions k, l is
 
         K_ab = A_ab g_ka g_lb + [a = b] sum_c p_ac g_kc g_lc + [a != b] m_ab g_kb g_la
 
     and U K U^T is added to the result.
     """
-    count, nodes, lanes = cells.shape[0], cells.shape[1], tangent.shape[2]
-    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
-        g = np.empty((nodes, 3))
-        A, p, m = np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-        block, half = np.empty((3, 3)), np.empty((3, 3))
-        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            out[c] = 0.0
-            for q in range(lanes):
-                _unpack(tangent[c], q, A, p, m)
-                for k in range(nodes):
-                    for a in range(3):
-                        g[k, a] = (
-                            right[c, a, q] * gradients[c, k, 0, q]
-                            + right[c, 3 + a, q] * gradients[c, k, 1, q]
-                            + right[c, 6 + a, q] * gradients[c, k, 2, q]
-                        )
-                for k in range(nodes):
-                    for l in range(k + 1):
-                        _node_block(g[k], g[l], A, p, m, block)
-                        _add_rotated(left[c], q, block, half, out[c, k, l])
-            for k in range(nodes):
-                for l in range(k):
-                    for a in range(3):
-                        for b in range(3):
-                            out[c, l, k, a, b] = out[c, k, l, b, a]
+    nodes = gradients.shape[0]
+    g = np.empty((nodes, 3))
+    A, p, m = np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    block, half = np.empty((3, 3)), np.empty((3, 3))
+    out[:] = 0.0
+    for q in range(gradients.shape[2]):
+        _unpack(T, q, A, p, m)
+        for k in range(nodes):
+            for a in range(3):
+                g[k, a] = (
+                    V[a, q] * gradients[k, 0, q]
+                    + V[3 + a, q] * gradients[k, 1, q]
+                    + V[6 + a, q] * gradients[k, 2, q]
+                )
+        for k in range(nodes):
+            for l in range(k + 1):
+                _node_block(g[k], g[l], A, p, m, block)
+                _add_rotated(U, q, block, half, out[k, l])
+    for k in range(nodes):
+        for l in range(k):
+            for a in range(3):
+                for b in range(3):
+                    out[l, k, a, b] = out[k, l, b, a]
 
 
 @njit(**OPTIONS)

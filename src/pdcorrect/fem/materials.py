@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.hyperelasticity import COROTATED, energy_code
 from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import Material, Scene
 from pdcorrect.scene.materials import lame
 
 Array = NDArray[np.float64]
+
+_NO_VOLUME = ("corotated-only", "arap")
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +28,14 @@ class Materials:
         Weights of the two energy terms, Pa; zero where a term is left out.
     density : (C,)
         kg/m3.
+    model : int
+        The energy, see `energy_code`.
     """
 
     mu: Array
     volume_weight: Array
     density: Array
+    model: int = COROTATED
 
     @classmethod
     def from_moduli(cls, rule: Material, young: Array, poisson: Array, density: Array) -> Materials:
@@ -41,8 +47,9 @@ class Materials:
         omega = lam if rule.volume_weight == "published" else 3 * lam
         return cls(
             mu=np.zeros_like(mu) if rule.energy == "volume-only" else mu,
-            volume_weight=np.zeros_like(lam) if rule.energy == "corotated-only" else omega,
+            volume_weight=np.zeros_like(lam) if rule.energy in _NO_VOLUME else omega,
             density=density,
+            model=energy_code(rule.energy),
         )
 
     @classmethod

@@ -6,25 +6,51 @@ corners; both are converted here and nowhere else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from skfem import Basis, BilinearForm, ElementHex1, FacetBasis, LinearForm, MeshHex1
+from skfem import Basis, BilinearForm, ElementHex1, ElementHex2, FacetBasis, LinearForm, MeshHex1
 from skfem.element import Element
-from skfem.helpers import dot, grad
 
 from pdcorrect.errors import SceneError
-from pdcorrect.fem.mesh import VTK_CORNERS, HexMesh
+from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
+from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature
 
 Array = NDArray[np.float64]
 
-_ELEMENTS: dict[str, tuple[type[Element], Array, int]] = {
-    # name: (scikit-fem element, its nodes in VTK order, polynomial order of the quadrature)
-    "hex8": (ElementHex1, VTK_CORNERS.astype(float), 3),
+_VTK_NODES = np.concatenate(
+    [
+        VTK_CORNERS,
+        VTK_CORNERS[VTK_EDGES].mean(axis=1),
+        VTK_CORNERS[VTK_FACES].mean(axis=1),
+        [[0.5, 0.5, 0.5]],
+    ]
+)
+"""Nodes of VTK's 27-node hexahedron on the unit cell."""
+
+
+class _Element(NamedTuple):
+    """An element: scikit-fem's shape functions and what is added to them.
+
+    ``order`` and ``mass_order`` are the polynomial orders of the quadrature.
+    """
+
+    shape: type[Element]
+    order: int
+    mass_order: int
+    mean_volume: bool = False
+    bubbles: bool = False
+
+
+_ELEMENTS = {
+    "hex8": _Element(ElementHex1, 3, 5),
+    "hex8-mean": _Element(ElementHex1, 3, 5, mean_volume=True),
+    "hex8-bubble": _Element(ElementHex1, 3, 5, bubbles=True),
+    "hex8-bubble-mean": _Element(ElementHex1, 3, 5, mean_volume=True, bubbles=True),
+    "hex27": _Element(ElementHex2, 5, 7),
 }
-_MASS_ORDER = 5  # exact for trilinear shape functions on any parallelepiped
 
 
 @BilinearForm
@@ -32,60 +58,9 @@ def _density_product(u, v, w):  # type: ignore[no-untyped-def]
     return w.density * u * v
 
 
-@BilinearForm
-def _gradient_product(u, v, w):  # type: ignore[no-untyped-def]
-    return w.coefficient * dot(grad(u), grad(v))
-
-
 @LinearForm
 def _load_component(v, w):  # type: ignore[no-untyped-def]
     return w.load * v
-
-
-@dataclass(frozen=True, eq=False)
-class Quadrature:
-    """Shape-function gradients and volumes at the quadrature points.
-
-    Attributes
-    ----------
-    gradients : (C, Q, K, 3)
-        Gradient of each node's shape function with respect to rest
-        coordinates, 1/m.  A view of a lane-ordered (C, K, 3, Q) array, in which
-        one cell's quadrature points are neighbours in memory.
-    weights : (C, Q)
-        Rest volume of each point, m3.
-    """
-
-    gradients: Array
-    weights: Array
-
-    @property
-    def lanes(self) -> Array:
-        """The gradients as stored, (C, K, 3, Q), C-contiguous."""
-        return np.moveaxis(self.gradients, 1, 3)
-
-
-@dataclass(frozen=True, eq=False)
-class FaceQuadrature:
-    """The same on boundary faces, with what surface loads need.
-
-    Attributes
-    ----------
-    cells : (n,)
-        Owner of each face.
-    values : (n, Qf, K), gradients : (n, Qf, K, 3)
-        Shape functions of the owner's nodes, 1 and 1/m.
-    weights : (n, Qf)
-        Rest area, m2.
-    normals : (n, Qf, 3)
-        Outward unit normals at rest.
-    """
-
-    cells: NDArray[np.int64]
-    values: Array
-    gradients: Array
-    weights: Array
-    normals: Array
 
 
 class Space:
@@ -97,12 +72,17 @@ class Space:
         Rest positions of the element's nodes, m.
     cells : (C, K)
         Node numbers, VTK order.
+    local : (C, L)
+        Numbers of all shape functions of a cell: its nodes, then its internal
+        modes, which are numbered from N on.
+    internal : int
+        Number of internal modes of all cells.
     """
 
     def __init__(self, mesh: HexMesh, element: str = "hex8") -> None:
-        kind, vtk_nodes, order = _ELEMENTS[element]
-        self._element = kind()
-        self._order = order
+        self._kind = _ELEMENTS[element]
+        self._element = self._kind.shape()
+        vtk_nodes = _VTK_NODES[: self._element.doflocs.shape[0]]
         # position of each VTK node in scikit-fem's list of local nodes
         distance = np.abs(vtk_nodes[:, None] - self._element.doflocs[None]).max(axis=-1)
         self._to_vtk = distance.argmin(axis=1)
@@ -112,35 +92,36 @@ class Space:
         self._mesh = MeshHex1(
             np.ascontiguousarray(mesh.positions.T), np.ascontiguousarray(skfem_cells.T)
         )
-        self._basis = Basis(self._mesh, self._element, intorder=order)
+        self._corners = mesh.positions[mesh.cells]
+        self._basis = Basis(self._mesh, self._element, intorder=self._kind.order)
         self.positions: Array = np.ascontiguousarray(self._basis.doflocs.T)
         self.cells: NDArray[np.int64] = np.ascontiguousarray(
             self._basis.element_dofs[self._to_vtk].T, dtype=np.int64
         )
+        self.local, self.internal = self.cells, 0
+        if self._kind.bubbles:
+            self.internal = 3 * len(self.cells)
+            modes = len(self.positions) + np.arange(self.internal).reshape(-1, 3)
+            self.local = np.concatenate([self.cells, modes], axis=1)
 
     def quadrature(self) -> Quadrature:
         """Gradients and volumes at the quadrature points."""
         local = [self._basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, C, Q)
         lanes = np.ascontiguousarray(np.transpose(np.stack(local), (2, 0, 1, 3)))  # (C, K, 3, Q)
-        return Quadrature(
-            gradients=np.moveaxis(lanes, 3, 1),
-            weights=np.ascontiguousarray(self._basis.dx),
-        )
+        out = Quadrature.create(lanes, np.ascontiguousarray(self._basis.dx))
+        if self._kind.bubbles:
+            out = out.with_incompatible_modes(self._corners, self._basis.quadrature[0].T)
+        return out.with_mean_volume() if self._kind.mean_volume else out
 
     def mass(self, density: Array) -> sp.csr_matrix:
         """Consistent mass, integral of density u v, (N, N), kg; ``density`` is (C,)."""
-        basis = Basis(self._mesh, self._element, intorder=_MASS_ORDER)
+        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
         per_point = np.broadcast_to(density[:, None], basis.dx.shape)
         return sp.csr_matrix(_density_product.assemble(basis, density=per_point))
 
     def volumes(self) -> Array:
         """Rest volume of each cell, (C,), m3."""
         return np.asarray(self._basis.dx.sum(axis=1))
-
-    def laplacian(self, coefficient: Array) -> sp.csr_matrix:
-        """Integral of coefficient grad u . grad v, (N, N); ``coefficient`` is (C,)."""
-        per_point = np.broadcast_to(coefficient[:, None], self._basis.dx.shape)
-        return sp.csr_matrix(_gradient_product.assemble(self._basis, coefficient=per_point))
 
     def body_load(self, density: Array) -> Array:
         """Nodal forces (N, 3), N, of a force density (C, Q, 3), N/m3, at the quadrature points."""
@@ -159,7 +140,7 @@ class Space:
         """Quadrature on the boundary faces with corner nodes ``faces`` (n, 4)."""
         key = {tuple(f): i for i, f in enumerate(np.sort(self._mesh.facets, axis=0).T.tolist())}
         numbers = np.array([key[tuple(sorted(f))] for f in faces.tolist()], dtype=np.int64)
-        basis = FacetBasis(self._mesh, self._element, facets=numbers, intorder=self._order)
+        basis = FacetBasis(self._mesh, self._element, facets=numbers, intorder=self._kind.order)
         values = [
             np.broadcast_to(np.asarray(basis.basis[k][0]), basis.dx.shape) for k in self._to_vtk
         ]

@@ -1,4 +1,10 @@
-"""`Problem`: a scene on a mesh, with everything a stepper needs; `discretise` makes it."""
+"""`Problem`: a scene on a mesh, with everything a stepper needs; `discretise` makes it.
+
+Elements with internal modes (hex8-bubble) have more unknowns than nodes.  A
+*configuration* is an array (N + B, 3) of the nodes' positions followed by the
+amplitudes of the B modes, m; for other elements B is 0 and it is just the positions.
+Solvers work on configurations; users see positions.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +16,23 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem import kernels
+from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, Linearisation
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
-from pdcorrect.fem.operators import Quadrature, Space, lumped, mass_matrix
+from pdcorrect.fem.operators import Space, lumped, mass_matrix
+from pdcorrect.fem.quadrature import Quadrature
 from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import MeshFile, Scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+_RELAXED = 1e-13
+"""Of the cell size: change of an internal mode at which its equilibrium is found."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +49,7 @@ class Problem:
     mesh : HexMesh
         Corners, for pictures and refinement.
     quadrature : Quadrature
-        Gradients (C, Q, K, 3), 1/m, and weights (C, Q), m3.
+        Gradients (C, Q, L, 3), 1/m, and weights (C, Q), m3.
     materials : Materials
     clamps : Clamps
     loads : tuple of NodalLoad
@@ -99,8 +109,8 @@ class Problem:
 
     @cached_property
     def assembly(self) -> Assembly:
-        """Sums cell-wise results into nodal ones."""
-        return Assembly(self.cells, len(self.positions))
+        """Sums cell-wise results into configurations."""
+        return Assembly(self.space.local, self.unknowns)
 
     @cached_property
     def mass(self) -> Array:
@@ -113,10 +123,10 @@ class Problem:
         return bool(self.mass_matrix.nnz == len(self.positions))
 
     def mass_times(self, x: Array) -> Array:
-        """The mass matrix times x (N, 3)."""
-        if self.mass_is_diagonal:
-            return self.mass[:, None] * x
-        return np.asarray(self.mass_matrix @ x)
+        """The mass matrix times x, for nodal vectors and configurations alike."""
+        nodal = x[: len(self.positions)]
+        out = self.mass[:, None] * nodal if self.mass_is_diagonal else self.mass_matrix @ nodal
+        return np.asarray(out) if len(x) == len(nodal) else self.extended(out)
 
     @property
     def time_step(self) -> float:
@@ -146,54 +156,114 @@ class Problem:
         """Prescribed positions (N, 3), m, at a time (s); meaningful where not `free`."""
         return self.clamps.positions(time)
 
+    # --- configurations ------------------------------------------------------------
+
+    @property
+    def unknowns(self) -> int:
+        """Nodes and internal modes, N + B."""
+        return len(self.positions) + self.space.internal
+
+    @cached_property
+    def free_unknowns(self) -> NDArray[np.bool_]:
+        """Components that may move of a configuration, (N + B, 3); modes always may."""
+        modes = np.ones((self.space.internal, 3), dtype=bool)
+        return np.concatenate([self.free, modes])
+
+    def extended(self, nodal: Array) -> Array:
+        """A nodal vector (N, 3) followed by zeros for the internal modes, (N + B, 3)."""
+        if not self.space.internal:
+            return nodal
+        return np.concatenate([nodal, np.zeros((self.space.internal, 3))])
+
+    def relaxed(self, positions: Array, steps: int = 50) -> Array:
+        """The configuration (N + B, 3) in which the internal modes are in equilibrium.
+
+        ``steps`` Newton steps in each cell at most.
+        """
+        self._check(positions, len(self.positions))
+        if not self.space.internal:
+            return positions
+        x = self.extended(positions - self.positions)
+        internal_modes.relax(
+            self.materials.model, x, self.space.local, self.cells.shape[1],
+            self.quadrature.lanes, *self._stiffness_weights, self.quadrature.first_volume,
+            steps, _RELAXED * self.cell_size,
+        )  # fmt: skip
+        x[: len(positions)] = positions
+        return x
+
     # --- elastic energy and its derivatives ----------------------------------------
 
     def energy(self, positions: Array) -> float:
-        """Elastic energy, J."""
-        return self.energy_and_forces(positions)[0]
+        """Elastic energy, J, with internal modes in equilibrium."""
+        return self.energy_and_forces(self.relaxed(positions))[0]
 
     def forces(self, positions: Array) -> Array:
         """Elastic nodal forces -dW/dp, (N, 3), N."""
-        return self.energy_and_forces(positions)[1]
+        return self.energy_and_forces(self.relaxed(positions))[1][: len(self.positions)]
 
-    def energy_and_forces(self, positions: Array) -> tuple[float, Array]:
-        """Elastic energy (J) and forces (N, 3) (N), from one pass over the cells."""
-        cells, quadrature, materials = self.cells, self.quadrature, self.materials
+    def stiffness(self, positions: Array, project: bool = False) -> sp.csr_matrix:
+        """Tangent stiffness d2W/dp2, (3N, 3N), N/m; component i of node n is row 3 n + i.
+
+        ``project`` raises negative eigenvalues to zero at each quadrature point.
+        """
+        tangent = self.linearise(self.relaxed(positions), project)
+        if not self.space.internal:
+            return tangent.assemble()
+        blocks = internal_modes.condense(tangent.blocks(), self.cells.shape[1])
+        return Assembly(self.cells, len(self.positions)).matrix(np.ascontiguousarray(blocks))
+
+    def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
+        """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
+        cells = self.space.local
         energy = np.empty(len(cells))
         by_cell = np.empty((*cells.shape, 3))
         kernels.cell_energy_and_forces(
-            self._displacement(positions), cells, quadrature.lanes, quadrature.weights,
-            materials.mu, materials.volume_weight, energy, by_cell,
+            self.materials.model, self._displacement(configuration), cells, self.quadrature.lanes,
+            *self._stiffness_weights, self.quadrature.first_volume, energy, by_cell,
         )  # fmt: skip
         return float(energy.sum()), self.assembly.vector(by_cell)
 
-    def linearise(self, positions: Array, project: bool = False) -> Linearisation:
-        """The tangent at ``positions``, ready to be applied or assembled.
+    def linearise(self, configuration: Array, project: bool = False) -> Linearisation:
+        """The tangent at a configuration, ready to be applied or assembled.
 
         ``project`` raises negative eigenvalues at each quadrature point to zero.
         """
-        cells, quadrature, materials = self.cells, self.quadrature, self.materials
-        count, lanes = quadrature.weights.shape
+        count, lanes = self.quadrature.weights.shape
         left, right = np.empty((count, 9, lanes)), np.empty((count, 9, lanes))
         tangent = np.empty((count, 12, lanes))
         kernels.linearise_cells(
-            self._displacement(positions), cells, quadrature.lanes, quadrature.weights,
-            materials.mu, materials.volume_weight, project, left, right, tangent,
+            self.materials.model, self._displacement(configuration), self.space.local,
+            self.quadrature.lanes, *self._stiffness_weights, self.quadrature.first_volume,
+            project, left, right, tangent,
         )  # fmt: skip
-        return Linearisation(self.assembly, quadrature, left, right, tangent)
+        return Linearisation(self.assembly, self.quadrature, left, right, tangent)
 
-    def stiffness(self, positions: Array, project: bool = False) -> sp.csr_matrix:
-        """Tangent stiffness d2W/dp2, (3N, 3N), N/m; component i of node n is row 3 n + i."""
-        return self.linearise(positions, project).assemble()
+    @cached_property
+    def _stiffness_weights(self) -> tuple[Array, Array]:
+        """Mu w and omega w at the quadrature points, (C, Q) each, J."""
+        return (
+            self.materials.mu[:, None] * self.quadrature.weights,
+            self.materials.volume_weight[:, None] * self.quadrature.volume_weights,
+        )
 
     def global_matrix(self, time_step: float, volume_scale: float = 1.0) -> sp.csr_matrix:
-        """G of eq. 3-14: M/h^2 + sum (2 mu + omega) w D^T D, (N, N), N/m.
+        """G of eq. 3-14: M/h^2 + sum (2 mu + omega) w D^T D, (N + B, N + B), N/m.
 
         ``volume_scale`` multiplies omega, for use as a first Hessian only.
         """
-        materials = self.materials
-        weight = 2 * materials.mu + volume_scale * materials.volume_weight
-        return sp.csr_matrix(self.mass_matrix / time_step**2 + self.space.laplacian(weight))
+        return self.scalar_matrix(1.0 / time_step**2, 1.0, volume_scale)
+
+    def scalar_matrix(
+        self, mass_factor: float, stiffness_factor: float, volume_scale: float = 1.0
+    ) -> sp.csr_matrix:
+        """A M + b sum (2 mu + omega) w D^T D for factors a (1/s2) and b: G of any integrator."""
+        shear, volume = self._stiffness_weights
+        coefficient = stiffness_factor * (2 * shear + volume_scale * volume)
+        matrix = self.quadrature.laplacian(coefficient, self.space.local, self.unknowns)
+        mass = self.mass_matrix.copy()
+        mass.resize(matrix.shape)
+        return sp.csr_matrix(matrix + mass_factor * mass)
 
     # --- changes ------------------------------------------------------------------
 
@@ -216,13 +286,18 @@ class Problem:
 
     # --- internals ----------------------------------------------------------------
 
-    def _displacement(self, positions: Array) -> Array:
-        """Positions minus rest positions: gradients of it do not depend on the origin."""
-        if np.shape(positions) != self.positions.shape:
-            raise InputError(
-                f"positions {np.shape(positions)}: expected {self.positions.shape}, one row a node."
-            )
-        return np.subtract(positions, self.positions)
+    def _displacement(self, configuration: Array) -> Array:
+        """The nodes' positions less those at rest: gradients of it do not depend on the origin."""
+        self._check(configuration, self.unknowns)
+        if not self.space.internal:
+            return np.subtract(configuration, self.positions)
+        out = np.array(configuration)
+        out[: len(self.positions)] -= self.positions
+        return out
+
+    def _check(self, x: Array, count: int) -> None:
+        if np.shape(x) != (count, 3):
+            raise InputError(f"positions {np.shape(x)}: expected ({count}, 3), one row a node.")
 
 
 def discretise(

@@ -12,7 +12,7 @@ from pdcorrect.scene.clamps import Clamp, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region
-from pdcorrect.scene.scene import Scene, Solver, Time
+from pdcorrect.scene.scene import Damping, Scene, Solver, Time
 
 __all__ = [
     "Beam",
@@ -20,6 +20,7 @@ __all__ = [
     "BodyForce",
     "Clamp",
     "Cross",
+    "Damping",
     "EffectiveModuli",
     "Force",
     "Gravity",

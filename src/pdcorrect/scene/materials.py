@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from pdcorrect.scene.regions import Poisson, Positive, Region, Strict
 
+Energy = Literal[
+    "corotated", "corotated-only", "arap", "volume-only", "neo-hookean", "st-venant-kirchhoff"
+]
 Moduli = TypeVar("Moduli", float, NDArray[np.float64])
 
 
@@ -34,7 +37,9 @@ class Material(Strict):
     Attributes
     ----------
     energy
-        "corotated" (both terms), "corotated-only" or "volume-only".
+        "corotated" (both terms), "corotated-only" (also called "arap") or
+        "volume-only"; "neo-hookean" (stable) and "st-venant-kirchhoff", see
+        `pdcorrect.fem.hyperelasticity`.
     volume_weight
         "lame": omega = 3 lambda, which gives the E and nu asked for.
         "published": omega = lambda, DiffPD's rule.
@@ -42,7 +47,7 @@ class Material(Strict):
         Pa, dimensionless in [0, 0.5), kg/m3.
     """
 
-    energy: Literal["corotated", "corotated-only", "volume-only"] = "corotated"
+    energy: Energy = "corotated"
     volume_weight: Literal["lame", "published"] = "lame"
     young: Positive
     poisson: Poisson
@@ -66,7 +71,7 @@ class Material(Strict):
         as a first Lame parameter ``omega / 3``.
         """
         mu = 0.0 if self.energy == "volume-only" else self.mu
-        lam = 0.0 if self.energy == "corotated-only" else self.lam
+        lam = 0.0 if self.energy in ("corotated-only", "arap") else self.lam
         lam = lam if self.volume_weight == "lame" else lam / 3
         total = lam + mu
         if total == 0:

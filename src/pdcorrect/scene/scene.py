@@ -15,14 +15,44 @@ from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
-from pdcorrect.scene.regions import Positive, PositiveCount, Strict
+from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
+
+Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
 
 class Time(Strict):
-    """Step size (s) and number of frames; one frame is one step."""
+    """Step size (s), number of frames (one frame is one step), and the integrator.
+
+    Attributes
+    ----------
+    integrator
+        "backward-euler" (the thesis's; first order, strongly damping), "bdf2",
+        "midpoint" and "generalised-alpha" (second order), or "quasi-static" (no
+        inertia; time only moves loads and clamps).
+    spectral_radius
+        Of generalised-alpha at infinite frequency, 0 (damps most) to 1.
+    """
 
     step: Positive
     frames: PositiveCount
+    integrator: Integrator = "backward-euler"
+    spectral_radius: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.8
+
+
+class Damping(Strict):
+    """Rayleigh damping: forces -(mass M + stiffness K) v.
+
+    Attributes
+    ----------
+    mass
+        1/s.
+    stiffness
+        s; K is the tangent stiffness at the start of each step, made positive
+        semi-definite, so rigid motion is not damped by it.
+    """
+
+    mass: NonNegative = 0.0
+    stiffness: NonNegative = 0.0
 
 
 class Solver(Strict):
@@ -35,14 +65,17 @@ class Solver(Strict):
         times cell volume on every node, as DiffPD; only to reproduce published
         results).
     element
-        "hex8": trilinear displacements, 2x2x2 Gauss points.
+        "hex8": trilinear displacements, 2x2x2 Gauss points.  "hex8-mean": its
+        volume term on the cell's mean deformation, against volumetric locking.
+        "hex8-bubble": three incompatible modes a cell, against shear locking.
+        "hex8-bubble-mean": both.  "hex27": triquadratic, 3x3x3 Gauss points.
     tolerance
         Largest accepted estimate of a node's distance from the step's exact
         solution, as a fraction of the coarse cell size.
     """
 
     mass: Literal["lumped", "averaged", "consistent", "per-node"] = "lumped"
-    element: Literal["hex8"] = "hex8"
+    element: Literal["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27"] = "hex8"
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
 
 
@@ -67,6 +100,7 @@ class Scene(Strict):
     material: Material
     materials: tuple[MaterialRegion, ...] = ()
     time: Time
+    damping: Damping = Damping()
     clamps: tuple[Clamp, ...] = ()
     loads: tuple[Load, ...] = ()
     solver: Solver = Solver()

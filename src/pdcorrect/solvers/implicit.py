@@ -14,9 +14,11 @@ from threadpoolctl import ThreadpoolController
 from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.integrators import Integrator, backward_euler
+from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
 from pdcorrect.solvers.newton_loop import newton_cg
-from pdcorrect.solvers.step import GlobalSolver, StepObjective, check_input
+from pdcorrect.solvers.step import GlobalSolver, StepObjective, check_input, hessian_factors
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
@@ -38,12 +40,24 @@ class _Effort:
         self.evaluations += minimum.evaluations
 
 
+@dataclass(eq=False)
+class _Outcome:
+    """The state after one attempt, with energies (J) that went in or out."""
+
+    state: State
+    minimum: Minimum
+    elastic_energy: float
+    external_work: float
+    clamp_work: float
+    damping_loss: float
+
+
 class ImplicitStepper:
-    """Backward Euler by minimisation (thesis eq. 3-6); subclasses say how to minimise.
+    """One implicit step by minimisation (thesis eq. 3-6); subclasses say how to minimise.
 
     A step that does not converge is tried again with Newton-CG from where it
-    stopped, then in 2, 4, 8, 16 sub-steps.  What happened is the result's
-    status; a step that fails after all is returned as failed.
+    stopped, then by backward Euler in 2, 4, 8, 16 sub-steps.  What happened is the
+    result's status; a step that fails after all is returned as failed.
 
     Parameters
     ----------
@@ -53,6 +67,8 @@ class ImplicitStepper:
         solution, as a fraction of the coarse cell size.
     time_step : float, optional
         s; the scene's by default.
+    integrator : str, optional
+        Name of the integrator; the scene's by default.
     backend : str
         Factorisation, see `factorise`.
     recover : bool
@@ -66,6 +82,7 @@ class ImplicitStepper:
         problem: Problem,
         tolerance: float,
         time_step: float | None = None,
+        integrator: str | None = None,
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
@@ -75,10 +92,13 @@ class ImplicitStepper:
         _positive("tolerance", tolerance)
         _positive("time_step", self.time_step)
         self.tolerance = float(tolerance)
+        time = problem.scene.time
+        self.integrator = time.integrator if integrator is None else integrator
+        self._integrator = make_integrator(self.integrator, time.spectral_radius)
         self._options = MinimiserOptions(self.tolerance * problem.cell_size)
         self._backend = backend
         self._recover = recover
-        self._solvers: dict[float, GlobalSolver] = {}
+        self._solvers: dict[tuple[float, float], GlobalSolver] = {}
 
     def __call__(
         self, state: State, forces: Array | None = None, time_step: float | None = None
@@ -101,47 +121,52 @@ class ImplicitStepper:
         check_input(self.problem, state, forces)
         h = self.time_step if time_step is None else float(time_step)
         _positive("time_step", h)
+        if h != self.time_step:  # several-step integrators need equal steps
+            state = replace(state, memory={})
         with _quiet_blas():
             return self._step(state, forces, h)
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         effort = _Effort()
-        minimum, loads = self._attempt(state, forces, h, effort)
-        after = _advance(state, minimum.positions, h)
-        work = float(np.vdot(loads, minimum.positions - state.positions))
-        if not minimum.status.ok and self._recover:
-            found = self._substeps(state, forces, h, effort)
-            if found is not None:
-                after, minimum, work = found
-        return self._report(after, minimum, effort, work)
+        outcome = self._attempt(state, forces, h, effort, self._integrator)
+        if not outcome.minimum.status.ok and self._recover:
+            outcome = self._substeps(state, forces, h, effort) or outcome
+        if h != self.time_step:
+            outcome.state = replace(outcome.state, memory={})
+        return self._report(outcome, effort)
 
     def prepare(self) -> Self:
         """Factorise and load the kernels now, so that the first step is like the others."""
         with _quiet_blas():
-            self._global_solver(self.time_step)
-            rest = self.problem.positions
-            self.problem.energy_and_forces(rest)
-            self.problem.linearise(rest).apply(rest)
+            problem, rest = self.problem, self.problem.rest_state()
+            stage = self._integrator(problem, rest, self.time_step)
+            objective = StepObjective(problem, rest, stage, np.zeros_like(rest.positions))
+            objective.value_and_gradient(objective.start)
+            objective.hessian_operator(objective.start)(objective.start)
+            self._global_solver(objective.factors)
         return self
 
     def __repr__(self) -> str:
         return f"{self.name} of {self.problem!r}, tolerance {self.tolerance:g}"
 
     def describe(self) -> dict[str, str]:
-        """Method, tolerance, step and factorisation in use."""
+        """Method, tolerance, integrator, step and factorisation in use."""
         return {
             "solver": self.name,
             "tolerance": f"{self.tolerance:g}",
+            "integrator": self.integrator,
             "time_step": f"{self.time_step:g}",
             "factorisation": self._factorisation(),
         }
 
     def _factorisation(self) -> str:
-        return self._global_solver(self.time_step).backend
+        rest = self.problem.rest_state()
+        stage = self._integrator(self.problem, rest, self.time_step)
+        return self._global_solver(hessian_factors(self.problem, stage)).backend
 
     # --- one attempt ----------------------------------------------------------------
 
-    def _minimise(self, objective: StepObjective) -> Minimum:
+    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
         """Minimise the step's objective from its starting point."""
         raise TypeError(f"{type(self).__name__} does not say how to minimise a step")
 
@@ -149,67 +174,110 @@ class ImplicitStepper:
         """Factor on the volume weight in G, as used by `_global_solver`."""
         return 1.0
 
-    def _global_solver(self, h: float) -> GlobalSolver:
-        """G's factor for a step size; the stepper's own and the last other one are kept."""
-        if h not in self._solvers:
-            kept = {k: v for k, v in self._solvers.items() if k == self.time_step}
-            kept[h] = GlobalSolver(self.problem, h, self._backend, self._volume_scale())
+    def _global_solver(self, factors: tuple[float, float]) -> GlobalSolver:
+        """G's factor; the first one made and the last other one are kept."""
+        if factors not in self._solvers:
+            kept = dict(list(self._solvers.items())[:1])
+            kept[factors] = GlobalSolver(self.problem, factors, self._backend, self._volume_scale())
             self._solvers = kept
-        return self._solvers[h]
+        return self._solvers[factors]
 
     def _attempt(
-        self, state: State, forces: Array | None, h: float, effort: _Effort
-    ) -> tuple[Minimum, Array]:
-        """The method itself, then Newton-CG from where it stopped; and the forces used."""
-        loads = self.problem.external_forces(state.time, state.time + h, state.positions)
+        self, state: State, forces: Array | None, h: float, effort: _Effort, integrate: Integrator
+    ) -> _Outcome:
+        """The method itself, then Newton-CG from where it stopped."""
+        problem = self.problem
+        stage = integrate(problem, state, h)
+        loads = problem.external_forces(*stage.loads_over, stage.loads_at)
         if forces is not None:
             loads = loads + forces
-        objective = StepObjective(self.problem, state, h, loads)
-        minimum = self._minimise(objective)
+        objective = StepObjective(problem, state, stage, loads)
+        options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
+        minimum = self._minimise(objective, options)
         effort.add(minimum)
-        if minimum.status.ok or not self._recover or minimum.status is Status.NOT_FINITE:
-            return minimum, loads
-        options = replace(self._options, max_iterations=_FALLBACK_ITERATIONS)
-        again = newton_cg(objective, minimum.positions, self._global_solver(h), options)
-        effort.add(again)
-        if again.status is Status.CONVERGED:
-            again.status = Status.RECOVERED
-        return again, loads
+        failed = not minimum.status.ok and minimum.status is not Status.NOT_FINITE
+        if failed and self._recover:
+            options = replace(options, max_iterations=_FALLBACK_ITERATIONS)
+            solver = self._global_solver(objective.factors)
+            minimum = newton_cg(objective, minimum.positions, solver, options)
+            effort.add(minimum)
+            if minimum.status is Status.CONVERGED:
+                minimum.status = Status.RECOVERED
+        minimum.estimate *= stage.gain
+        return _outcome(problem, state, objective, minimum, h)
 
     def _substeps(
         self, state: State, forces: Array | None, h: float, effort: _Effort
-    ) -> tuple[State, Minimum, float] | None:
+    ) -> _Outcome | None:
         """The step in 2, 4, 8, 16 parts; its residual and estimate are the worst part's."""
         for level in range(1, _SUBSTEP_LEVELS + 1):
             count = 2**level
-            current, work, estimate, gradient = state, 0.0, 0.0, np.zeros(1)
+            parts: list[_Outcome] = []
+            current = replace(state, memory={})
             for _ in range(count):
-                minimum, loads = self._attempt(current, forces, h / count, effort)
-                if not minimum.status.ok:
+                part = self._attempt(current, forces, h / count, effort, backward_euler)
+                if not part.minimum.status.ok:
                     break
-                work += float(np.vdot(loads, minimum.positions - current.positions))
-                current = _advance(current, minimum.positions, h / count)
-                estimate = max(estimate, minimum.estimate)
-                gradient = max(gradient, minimum.gradient, key=lambda g: np.abs(g).max())
+                parts.append(part)
+                current = part.state
             else:
-                worst = replace(
-                    minimum, status=Status.SUBSTEPPED, estimate=estimate, gradient=gradient
-                )
-                return replace(current, time=state.time + h), worst, work
+                return _joined(parts, replace(current, time=state.time + h))
         return None
 
-    def _report(self, state: State, minimum: Minimum, effort: _Effort, work: float) -> StepResult:
+    def _report(self, outcome: _Outcome, effort: _Effort) -> StepResult:
+        state, minimum = outcome.state, outcome.minimum
         kinetic = 0.5 * np.vdot(state.velocities, self.problem.mass_times(state.velocities))
         stats = {
             "evaluations": float(effort.evaluations),
-            "elastic_energy": self.problem.energy(state.positions),
+            "elastic_energy": outcome.elastic_energy,
             "kinetic_energy": float(kinetic),
-            "external_work": work,
+            "external_work": outcome.external_work,
+            "clamp_work": outcome.clamp_work,
+            "damping_loss": outcome.damping_loss,
         }
         residual = float(np.abs(minimum.gradient).max())
         return StepResult(
             state, minimum.status, effort.iterations, residual, minimum.estimate, stats
         )
+
+
+def _outcome(
+    problem: Problem, state: State, objective: StepObjective, minimum: Minimum, h: float
+) -> _Outcome:
+    y, nodes = minimum.positions, len(state.positions)
+    after = objective.stage.finish(y[:nodes])
+    moved = after.positions - state.positions
+    clamp_work = 0.0
+    if problem.clamps.moving:
+        clamp_work = float(np.vdot(objective.balance(y)[1][:nodes] * ~problem.free, moved))
+    end = y.copy()
+    end[:nodes] = after.positions
+    return _Outcome(
+        after,
+        minimum,
+        elastic_energy=problem.energy_and_forces(end)[0],
+        external_work=float(np.vdot(objective.forces[:nodes], moved)),
+        clamp_work=clamp_work,
+        damping_loss=objective.damping_loss(y, h),
+    )
+
+
+def _joined(parts: list[_Outcome], end: State) -> _Outcome:
+    last = parts[-1]
+    minimum = replace(
+        last.minimum,
+        status=Status.SUBSTEPPED,
+        estimate=max(part.minimum.estimate for part in parts),
+        gradient=max((part.minimum.gradient for part in parts), key=lambda g: np.abs(g).max()),
+    )
+    return _Outcome(
+        end,
+        minimum,
+        last.elastic_energy,
+        external_work=sum(part.external_work for part in parts),
+        clamp_work=sum(part.clamp_work for part in parts),
+        damping_loss=sum(part.damping_loss for part in parts),
+    )
 
 
 @cache
@@ -224,11 +292,6 @@ def _quiet_blas() -> AbstractContextManager[Any]:
     threads).
     """
     return _threadpools().limit(limits=1, user_api="blas")
-
-
-def _advance(state: State, positions: Array, h: float) -> State:
-    """Backward Euler's velocity, eq. 3-1."""
-    return State(positions, (positions - state.positions) / h, state.time + h)
 
 
 def whole(name: str, value: int) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, factorise
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import Minimum
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
 from pdcorrect.solvers.newton_loop import newton_loop
 from pdcorrect.solvers.step import StepObjective
 
@@ -38,7 +38,7 @@ class Newton(ImplicitStepper):
         Of the coarse cell size: the length of the Newton step at which the
         iteration stops.
     max_iterations : int
-    time_step, backend, recover
+    time_step, integrator, backend, recover
         See `ImplicitStepper`.
     """
 
@@ -51,32 +51,32 @@ class Newton(ImplicitStepper):
         *,
         max_iterations: int = 100,
         time_step: float | None = None,
+        integrator: str | None = None,
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
-        super().__init__(problem, tolerance, time_step, backend, recover)
+        super().__init__(problem, tolerance, time_step, integrator, backend, recover)
         self._options = replace(
             self._options, max_iterations=whole("max_iterations", max_iterations)
         )
-        self._free = np.flatnonzero(problem.free.ravel())
+        self._free = np.flatnonzero(problem.free_unknowns.ravel())
         self._used_backend = "none yet"
 
     def prepare(self) -> Self:
         """Assemble and factorise once at rest, so that the first step is like the others."""
         state = self.problem.rest_state()
-        objective = StepObjective(
-            self.problem, state, self.time_step, np.zeros_like(state.positions)
-        )
-        _, gradient = objective.value_and_gradient(state.positions)
-        self._direction(objective, state.positions, gradient)
+        stage = self._integrator(self.problem, state, self.time_step)
+        objective = StepObjective(self.problem, state, stage, np.zeros_like(state.positions))
+        _, gradient = objective.value_and_gradient(objective.start)
+        self._direction(objective, objective.start, gradient)
         return self
 
     def _factorisation(self) -> str:
         return self._used_backend
 
-    def _minimise(self, objective: StepObjective) -> Minimum:
+    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
         return newton_loop(
-            objective, objective.start, lambda p, g: self._direction(objective, p, g), self._options
+            objective, objective.start, lambda p, g: self._direction(objective, p, g), options
         )
 
     def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:

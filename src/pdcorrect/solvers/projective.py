@@ -7,9 +7,10 @@ from typing import Literal
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend
+from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import Minimum, minimise
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, minimise
 from pdcorrect.solvers.step import StepObjective
 
 Method = Literal["lbfgs", "local-global"]
@@ -44,7 +45,7 @@ class ProjectiveDynamics(ImplicitStepper):
         so the answer, is the same.
     max_iterations : int, optional
         1000 for L-BFGS and 20000 for local/global by default.
-    time_step, backend, recover
+    time_step, integrator, backend, recover
         See `ImplicitStepper`.
 
     Examples
@@ -62,6 +63,7 @@ class ProjectiveDynamics(ImplicitStepper):
         first_hessian: FirstHessian = "auto",
         max_iterations: int | None = None,
         time_step: float | None = None,
+        integrator: str | None = None,
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
@@ -73,8 +75,13 @@ class ProjectiveDynamics(ImplicitStepper):
             )
         if method == "local-global" and first_hessian == "G-scaled":
             raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
+        if method == "local-global" and problem.materials.model != COROTATED:
+            raise InputError(
+                f"method = 'local-global' with energy = {problem.scene.material.energy!r}: expected "
+                "the corotated energy, whose terms are projections; or method = 'lbfgs'."
+            )
         tolerance = problem.scene.solver.tolerance if tolerance is None else tolerance
-        super().__init__(problem, tolerance, time_step, backend, recover)
+        super().__init__(problem, tolerance, time_step, integrator, backend, recover)
         self.method = method
         self.name = f"projective dynamics ({method})"
         self.first_hessian = "G" if method == "local-global" else first_hessian
@@ -94,6 +101,6 @@ class ProjectiveDynamics(ImplicitStepper):
     def _volume_scale(self) -> float:
         return 1.0 if self.first_hessian == "G" else VOLUME_SCALE
 
-    def _minimise(self, objective: StepObjective) -> Minimum:
-        solver = self._global_solver(objective.time_step)
-        return minimise(objective, objective.start, solver, self._options)
+    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
+        solver = self._global_solver(objective.factors)
+        return minimise(objective, objective.start, solver, options)

@@ -1,9 +1,10 @@
 """The minimisation that one implicit step is (thesis eq. 3-6), and its preconditioner G.
 
-    gamma(p) = 1/(2 h^2) (p - q)^T M (p - q) + W(p) - f . (p - X),   q = p_t + h v_t
+    gamma(y) = c/2 (y - q)^T M (y - q) + d/2 (y - o)^T C (y - o) + W(y) - f . (y - X)
 
-is backward Euler: its stationary point satisfies eq. 3-4, and M is never
-inverted.  Clamped components of p are prescribed; gradients are zero there.
+with the constants of a `Stage`; for backward Euler c = 1/h^2 and q = p_t + h v_t, and the
+stationary point satisfies eq. 3-4.  M is never inverted.  Clamped components of y are
+prescribed; gradients are zero there.
 """
 
 from __future__ import annotations
@@ -18,78 +19,142 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.assembly import Linearisation
 from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.integrators import Stage
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
 
+_MODE_STEPS = 1
+"""Newton steps of each cell's internal modes before the first iterate."""
+
 
 class StepObjective:
-    """gamma for one step, over nodal positions p (N, 3).
+    """gamma for one step, over configurations y (N + B, 3).
 
     Parameters
     ----------
     problem : Problem
     state : State
         At the start of the step.
-    time_step : float
-        h, s.
+    stage : Stage
+        The integrator's equation.
     forces : (N, 3)
         All external forces of the step, N.
 
     Attributes
     ----------
-    start : (N, 3)
-        Inertial prediction p + h v, prescribed where clamped: the first iterate.
+    start : (N + B, 3)
+        First iterate, prescribed where clamped.
     scale : float
         Size of the terms of gamma where it was last evaluated, J: round-off in
         gamma is relative to this.
+    factors : tuple of float
+        On mass and on stiffness in the Hessian: 1/s2 and 1.
     """
 
-    def __init__(self, problem: Problem, state: State, time_step: float, forces: Array) -> None:
+    def __init__(self, problem: Problem, state: State, stage: Stage, forces: Array) -> None:
         self.problem = problem
-        self.time_step = time_step
-        self.free = problem.free
+        self.stage = stage
+        self.free = problem.free_unknowns
         self.scale = 0.0
-        self._forces = forces
-        self._target = state.positions + time_step * state.velocities
-        prescribed = problem.clamped_positions(state.time + time_step)
-        self.start = np.where(self.free, self._target, prescribed)
+        self.forces = problem.extended(forces)
+        self.start = problem.relaxed(stage.start, steps=_MODE_STEPS)
+        self.factors = hessian_factors(problem, stage)
+        self._rest = problem.extended(problem.positions)
+        self._target = problem.extended(stage.target)
+        self._damping: _Damping | None = None
+        damping = problem.scene.damping
+        if stage.rate and (damping.mass or damping.stiffness):
+            self._damping = _Damping(problem, state, stage)
 
-    def value_and_gradient(self, p: Array) -> tuple[float, Array]:
-        """Gamma (J) and its gradient (N, 3), N, zero where clamped."""
-        energy, elastic = self.problem.energy_and_forces(p)
-        offset = p - self._target
-        inertia = self.problem.mass_times(offset) / self.time_step**2
-        kinetic = 0.5 * np.vdot(offset, inertia)
-        work = np.vdot(self._forces, p - self.problem.positions)
+    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
+        """Gamma (J) and its gradient (N + B, 3), N, zero where clamped."""
+        energy, gradient = self.balance(y)
+        gradient *= self.free
+        return energy, gradient
+
+    def balance(self, y: Array) -> tuple[float, Array]:
+        """Gamma (J) and its gradient on all components: where clamped, the clamps' forces."""
+        energy, elastic = self.problem.energy_and_forces(y)
+        offset = y - self._target
+        gradient = self.problem.mass_times(offset)
+        gradient *= self.stage.inertia
+        kinetic = 0.5 * np.vdot(offset, gradient)
+        work = np.vdot(self.forces, y - self._rest)
         self.scale = float(energy + kinetic + abs(work))
         value = energy + kinetic - work
-        gradient = inertia
         gradient -= elastic
-        gradient -= self._forces
-        gradient *= self.free
+        gradient -= self.forces
+        if self._damping is not None:
+            loss, force = self._damping.value_and_gradient(y)
+            value, self.scale = value + loss, self.scale + loss
+            gradient += force
         return float(value), gradient
 
-    def hessian(self, p: Array, project: bool = False) -> sp.csr_matrix:
-        """Second derivative (3N, 3N), N/m, of all components."""
-        inertia = sp.kron(self.problem.mass_matrix / self.time_step**2, sp.eye_array(3))
-        return sp.csr_matrix(self.problem.stiffness(p, project) + inertia)
+    def damping_loss(self, y: Array, h: float) -> float:
+        """Energy that the damping takes out in a step of h seconds, J."""
+        if self._damping is None:
+            return 0.0
+        return 2.0 * self.stage.rate * h * self._damping.value_and_gradient(y)[0]
 
-    def hessian_operator(self, p: Array) -> HessianOperator:
+    def hessian(self, y: Array, project: bool = False) -> sp.csr_matrix:
+        """Second derivative (3 (N + B), 3 (N + B)), N/m, of all components."""
+        mass = self.problem.mass_matrix.copy()
+        mass.resize((len(y), len(y)))
+        out = self.problem.linearise(y, project).assemble()
+        out = out + self.factors[0] * sp.kron(mass, sp.eye_array(3))
+        if self._damping is not None and self._damping.stiffness:
+            out = out + self._damping.stiffness * self._damping.tangent.assemble()
+        return sp.csr_matrix(out)
+
+    def hessian_operator(self, y: Array) -> HessianOperator:
         """The same, restricted to free components, without assembling."""
-        return HessianOperator(self, self.problem.linearise(p))
+        return HessianOperator(self, self.problem.linearise(y))
+
+    def add_damping(self, x: Array, out: Array) -> None:
+        """Add the stiffness-proportional damping's second derivative times x to ``out``."""
+        if self._damping is not None and self._damping.stiffness:
+            out += self._damping.stiffness * self._damping.tangent.apply(x)
+
+
+class _Damping:
+    """d/2 (y - o)^T C (y - o) with C = alpha M + beta K(start of the step)."""
+
+    def __init__(self, problem: Problem, state: State, stage: Stage) -> None:
+        damping = problem.scene.damping
+        self._problem = problem
+        self._mass = stage.rate * damping.mass
+        self.stiffness = stage.rate * damping.stiffness
+        before = problem.relaxed(state.positions)
+        self._origin = np.concatenate([stage.origin, before[len(stage.origin) :]])
+        self.tangent = problem.linearise(before, project=True)
+
+    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
+        offset = y - self._origin
+        force = self._mass * self._problem.mass_times(offset)
+        if self.stiffness:
+            force = force + self.stiffness * self.tangent.apply(offset)
+        return 0.5 * float(np.vdot(offset, force)), force
+
+
+def hessian_factors(problem: Problem, stage: Stage) -> tuple[float, float]:
+    """What multiplies mass (1/s2) and stiffness in a stage's Hessian."""
+    damping = problem.scene.damping
+    return stage.inertia + stage.rate * damping.mass, 1.0 + stage.rate * damping.stiffness
 
 
 @dataclass(frozen=True, eq=False)
 class HessianOperator:
-    """x -> (M/h^2 + d2W/dp2) x on the free components."""
+    """x -> (d2 gamma/dy2) x on the free components."""
 
     objective: StepObjective
     tangent: Linearisation
 
     def __call__(self, x: Array) -> Array:
         out = self.tangent.apply(x)
-        out += self.objective.problem.mass_times(x) / self.objective.time_step**2
+        if self.objective.factors[0]:
+            out += self.objective.factors[0] * self.objective.problem.mass_times(x)
+        self.objective.add_damping(x, out)
         out *= self.objective.free
         return out
 
@@ -100,8 +165,8 @@ class GlobalSolver:
     Parameters
     ----------
     problem : Problem
-    time_step : float
-        s.
+    factors : tuple of float
+        On mass (1/s2) and stiffness, see `hessian_factors`.
     backend : str
         See `factorise`.
     volume_scale : float
@@ -111,29 +176,30 @@ class GlobalSolver:
     def __init__(
         self,
         problem: Problem,
-        time_step: float,
+        factors: tuple[float, float],
         backend: Backend = "auto",
         volume_scale: float = 1.0,
     ) -> None:
-        matrix = problem.global_matrix(time_step, volume_scale)
-        columns, group = np.unique(problem.free, axis=1, return_inverse=True)
+        matrix = problem.scalar_matrix(*factors, volume_scale)
+        free = problem.free_unknowns
+        columns, group = np.unique(free, axis=1, return_inverse=True)
         self._parts: list[tuple[Factor, NDArray[np.int64], NDArray[np.int64]]] = []
         for i in range(columns.shape[1]):
             nodes = np.flatnonzero(columns[:, i])
             if len(nodes):
-                factor = self._factorise(matrix[nodes][:, nodes], backend, time_step)
+                factor = self._factorise(matrix[nodes][:, nodes], backend)
                 self._parts.append((factor, nodes, np.flatnonzero(group.ravel() == i)))
-        self._all_free = bool(problem.free.all())
+        self._all_free = bool(free.all())
 
     @staticmethod
-    def _factorise(matrix: sp.csr_matrix, backend: Backend, time_step: float) -> Factor:
+    def _factorise(matrix: sp.csr_matrix, backend: Backend) -> Factor:
         try:
             return factorise(matrix, backend)
         except NotPositiveDefinite as error:
             raise ConvergenceError(
-                f"the global matrix of a step of {time_step:g} s is singular to working precision "
-                f"({error}): expected clamps, or inertia that matters beside the stiffness. Use a "
-                "smaller time step, more density or clamps."
+                f"the global matrix of the step is singular to working precision ({error}): "
+                "expected clamps, or inertia that matters beside the stiffness. Use clamps (a "
+                "quasi-static problem needs them), a smaller time step or more density."
             ) from None
 
     @property
@@ -142,7 +208,7 @@ class GlobalSolver:
         return self._parts[0][0].backend
 
     def __call__(self, r: Array) -> Array:
-        """X (N, 3) with G x = r on the free components, zero elsewhere."""
+        """X (N + B, 3) with G x = r on the free components, zero elsewhere."""
         if self._all_free:
             return self._parts[0][0].solve(r)
         out = np.zeros_like(r)

@@ -1,0 +1,219 @@
+"""Implicit time integrators, each as one equation of the same form.
+
+A step solves
+
+    c M (y - q) + d C (y - o) = f_int(y) + f_ext
+
+for one unknown configuration y, so every integrator minimises the same kind of
+function (thesis eq. 3-6) and projective dynamics needs no more than other factors in G.
+An integrator is a function from the state to that equation, a `Stage`, which also
+knows how y gives the next state.  C is Rayleigh damping, d (y - o) the velocity at y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem
+from pdcorrect.state import State
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """The equation of one step, over nodal arrays (N, 3).
+
+    Attributes
+    ----------
+    inertia : float
+        c, 1/s2.
+    target : (N, 3)
+        q, m: where y would be without forces.
+    rate : float
+        d, 1/s.
+    origin : (N, 3)
+        o, m.
+    start : (N, 3)
+        First iterate, m; prescribed values where clamped.
+    loads_over : tuple of float
+        Loads are averaged over this time interval (s), or taken at its ends if
+        these are equal.
+    loads_at : (N, 3)
+        Positions at which follower loads are sampled, m.
+    finish : callable
+        y -> the state after the step.
+    gain : float
+        dp'/dy, by which an error of y grows.
+    """
+
+    inertia: float
+    target: Array
+    rate: float
+    origin: Array
+    start: Array
+    loads_over: tuple[float, float]
+    loads_at: Array
+    finish: Callable[[Array], State]
+    gain: float = 1.0
+
+
+Integrator = Callable[[Problem, State, float], Stage]
+"""(problem, state, h) -> the equation of the step from ``state`` to its time + h."""
+
+
+def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
+    """An integrator by its name in a scene.
+
+    Raises
+    ------
+    InputError
+    """
+    if name == "generalised-alpha":
+        return generalised_alpha(spectral_radius)
+    if name not in _INTEGRATORS:
+        raise InputError(f"integrator {name!r}: expected {', '.join(INTEGRATORS)}.")
+    return _INTEGRATORS[name]
+
+
+def backward_euler(problem: Problem, state: State, h: float) -> Stage:
+    """Thesis eq. 3-1 to 3-4: v' = (p' - p)/h, M (v' - v)/h = f(p').  First order."""
+    p, v, end = state.positions, state.velocities, state.time + h
+    target = p + h * v
+    return Stage(
+        1.0 / h**2, target, 1.0 / h, p,
+        np.where(problem.free, target, problem.clamped_positions(end)),
+        (state.time, end), p,
+        lambda y: State(y, (y - p) / h, end),
+    )  # fmt: skip
+
+
+def bdf2(problem: Problem, state: State, h: float) -> Stage:
+    """Two-step backward differences: p' = (4 p - p_)/3 + 2h/3 v', the same for v'.
+
+    Second order.  Without the previous state (in ``state.memory``) the step is one of
+    backward Euler, which does not lower the order.
+    """
+    p, v, end = state.positions, state.velocities, state.time + h
+    if "previous_positions" not in state.memory:
+        stage = backward_euler(problem, state, h)
+        origin, target, rate = stage.origin, stage.target, stage.rate
+    else:
+        origin = (4.0 * p - state.memory["previous_positions"]) / 3.0
+        drift = (4.0 * v - state.memory["previous_velocities"]) / 3.0
+        rate = 1.5 / h
+        target = origin + drift / rate
+    memory = {"previous_positions": p, "previous_velocities": v}
+    return Stage(
+        rate**2, target, rate, origin,
+        np.where(problem.free, target, problem.clamped_positions(end)),
+        (end, end), p + h * v,
+        lambda y: State(y, rate * (y - origin), end, memory),
+    )  # fmt: skip
+
+
+def midpoint(problem: Problem, state: State, h: float) -> Stage:
+    """Implicit midpoint: y = (p + p')/2, M (v' - v)/h = f(y), p' - p = h (v + v')/2.
+
+    Second order, symplectic; keeps linear and angular momentum.
+    """
+    p, v, end = state.positions, state.velocities, state.time + h
+    target = p + 0.5 * h * v
+    clamped = 0.5 * (p + problem.clamped_positions(end))
+
+    def finish(y: Array) -> State:
+        velocities = np.where(problem.free, (4.0 / h) * (y - p) - v, (2.0 / h) * (y - p))
+        return State(2.0 * y - p, velocities, end)
+
+    return Stage(
+        4.0 / h**2, target, 2.0 / h, p, np.where(problem.free, target, clamped),
+        (state.time, end), target, finish, 2.0,
+    )  # fmt: skip
+
+
+def generalised_alpha(spectral_radius: float) -> Integrator:
+    """Chung and Hulbert (1993): second order, with chosen damping of high frequencies."""
+    r = spectral_radius
+    if not 0.0 <= r <= 1.0:
+        raise InputError(f"spectral_radius = {r!r}: expected a number from 0 to 1.")
+    alpha_m, alpha_f = (2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0)
+    gamma = 0.5 - alpha_m + alpha_f
+    beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2
+
+    def stage(problem: Problem, state: State, h: float) -> Stage:
+        p, v, end = state.positions, state.velocities, state.time + h
+        a = state.memory.get("accelerations")
+        if a is None:
+            a = accelerations(problem, state)
+        scale = 1.0 / ((1.0 - alpha_f) * beta * h**2)
+        at_rest = -v / (beta * h) - (0.5 / beta - 1.0) * a  # a' for y = p
+        rate = gamma / (beta * h)
+
+        def ahead(acceleration: Array) -> Array:
+            return v + h * ((1.0 - gamma) * a + gamma * acceleration)
+
+        def finish(y: Array) -> State:
+            new = at_rest + scale * (y - p)
+            position = p + (y - p) / (1.0 - alpha_f)
+            velocity = np.where(problem.free, ahead(new), (position - p) / h)
+            return State(position, velocity, end, {"accelerations": new * problem.free})
+
+        target = p - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale
+        clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
+        time = state.time + (1.0 - alpha_f) * h
+        return Stage(
+            (1.0 - alpha_m) * scale, target, rate,
+            p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate,
+            np.where(problem.free, p + (1.0 - alpha_f) * h * v, clamped),
+            (time, time), p + (1.0 - alpha_f) * h * v, finish,
+            1.0 / (1.0 - alpha_f),
+        )  # fmt: skip
+
+    return stage
+
+
+def quasi_static(problem: Problem, state: State, h: float) -> Stage:
+    """Equilibrium f(p') = 0 under the loads and clamps at the end of the step."""
+    p, end = state.positions, state.time + h
+    start = np.where(problem.free, p, problem.clamped_positions(end))
+    return Stage(
+        0.0, p, 0.0, p, start, (end, end), p, lambda y: State(y, np.zeros_like(y), end)
+    )  # fmt: skip
+
+
+def accelerations(problem: Problem, state: State) -> Array:
+    """M^-1 (f_int + f_ext - C v) at a state, (N, 3), m/s2; zero where clamped."""
+    damping = problem.scene.damping
+    force = problem.forces(state.positions)
+    force += problem.external_forces(state.time, None, state.positions)
+    if damping.mass:
+        force -= damping.mass * problem.mass_times(state.velocities)
+    if damping.stiffness:
+        K = problem.stiffness(state.positions, project=True)
+        force -= damping.stiffness * (K @ state.velocities.ravel()).reshape(force.shape)
+    out = np.zeros_like(force)
+    for i in range(3):
+        nodes = np.flatnonzero(problem.free[:, i])
+        if problem.mass_is_diagonal:
+            out[nodes, i] = force[nodes, i] / problem.mass[nodes]
+        elif len(nodes):
+            out[nodes, i] = spla.spsolve(
+                problem.mass_matrix[nodes][:, nodes].tocsc(), force[nodes, i]
+            )
+    return out
+
+
+_INTEGRATORS: dict[str, Integrator] = {
+    "backward-euler": backward_euler,
+    "bdf2": bdf2,
+    "midpoint": midpoint,
+    "quasi-static": quasi_static,
+}
+INTEGRATORS = (*_INTEGRATORS, "generalised-alpha")
+"""Names of `integrator`."""
