@@ -22,6 +22,8 @@ ORDER = [
     "scene",
     "state",
     "fem",
+    "fem.hexahedron",
+    "fem.mesh_checks",
     "fem.mesh",
     "fem.mesh_files",
     "fem.quadrature",

@@ -3,10 +3,14 @@
 import numpy as np
 import pytest
 
+from block_meshes import o_grid, spokes, warped
 from pdcorrect import shapes
 from pdcorrect.errors import MeshError, SceneError
+from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import (
     VTK_CORNERS,
+    VTK_EDGES,
+    VTK_FACES,
     HexMesh,
     boundary_faces,
     coincident_nodes,
@@ -39,25 +43,92 @@ def test_voxel_cells_are_in_vtk_order():
     )
 
 
-@pytest.mark.parametrize("k", [2, 3, 4])
-@pytest.mark.parametrize("make", [cross_mesh, distorted_mesh])
-def test_refinement_keeps_volume_nodes_and_conformity(make, k):
+MESHES = {
+    "cross": cross_mesh,
+    "distorted cross": distorted_mesh,
+    "3 cells round an edge": lambda: spokes(3),
+    "5 cells round an edge, warped": lambda: warped(spokes(5)),
+    "O-grid": o_grid,
+    "O-grid, warped": lambda: warped(o_grid()),
+}
+
+every_mesh = pytest.mark.parametrize("make", MESHES.values(), ids=MESHES)
+
+
+def volumes(mesh):
+    return jacobians(mesh.positions, mesh.cells, gauss_points(2)).mean(axis=1)
+
+
+def rows(mesh, local):
+    """All faces or edges of the cells as sorted node numbers, and how many cells have each."""
+    found = np.sort(mesh.cells[:, local].reshape(-1, local.shape[1]), axis=1)
+    return np.unique(found, axis=0, return_counts=True)
+
+
+def test_jacobians_are_the_derivatives_of_the_trilinear_map():
+    mesh = warped(spokes(3))
+    points = np.array([[0.2, 0.7, 0.4], [1.0, 0.0, 0.3]])
+
+    def place(at):
+        weights = np.where(VTK_CORNERS == 1, at, 1 - at).prod(axis=1)
+        return np.einsum("k,cki->ci", weights, mesh.positions[mesh.cells])
+
+    for point, found in zip(points, jacobians(mesh.positions, mesh.cells, points).T, strict=True):
+        steps = 1e-5 * np.eye(3)
+        slopes = [(place(point + step) - place(point - step)) / 2e-5 for step in steps]
+        np.testing.assert_allclose(found, np.linalg.det(np.stack(slopes, axis=-1)), rtol=1e-7)
+
+
+@every_mesh
+@pytest.mark.parametrize("k", [2, 3])
+def test_refinement_keeps_each_cells_volume_and_the_coarse_nodes(make, k):
     mesh = make()
     fine = refine(mesh, k)
     assert len(fine.cells) == k**3 * len(mesh.cells)
     np.testing.assert_array_equal(fine.positions[fine.coarse_nodes], mesh.positions)
     assert corner_jacobians(fine.positions, fine.cells).min() > 0
-    # conforming: the boundary is the refined boundary, with no inner cracks
-    assert len(boundary_faces(fine.cells)[0]) == k**2 * len(boundary_faces(mesh.cells)[0])
-    assert len(np.unique(np.round(fine.positions, 12), axis=0)) == len(fine.positions)
+    parts = volumes(fine).reshape(len(mesh.cells), k**3)
+    np.testing.assert_allclose(parts.sum(axis=1), volumes(mesh), rtol=1e-12)
 
 
-def test_refining_twice_equals_refining_once_by_the_product():
-    mesh = distorted_mesh()
-    once, twice = refine(mesh, 4), refine(refine(mesh, 2), 2)
+@every_mesh
+@pytest.mark.parametrize("k", [2, 3])
+def test_refined_meshes_are_conforming(make, k):
+    mesh = make()
+    fine = refine(mesh, k)
+    HexMesh.create(fine.positions, fine.cells)  # no duplicate or hanging nodes
+    (edges, _), (faces, coarse), (_, shared) = (
+        rows(mesh, VTK_EDGES), rows(mesh, VTK_FACES), rows(fine, VTK_FACES)
+    )  # fmt: skip
+    assert shared.max() == 2
+    assert (shared == 1).sum() == k**2 * (coarse == 1).sum()
+    assert (shared == 2).sum() == k**2 * (coarse == 2).sum() + 3 * k**2 * (k - 1) * len(mesh.cells)
+    assert len(fine.positions) == (
+        len(mesh.positions)
+        + (k - 1) * len(edges)
+        + (k - 1) ** 2 * len(faces)
+        + (k - 1) ** 3 * len(mesh.cells)
+    )
+
+
+@every_mesh
+def test_refining_twice_equals_refining_once_by_the_product(make):
+    mesh = make()
+    once, twice = refine(mesh, 6), refine(refine(mesh, 3), 2)
     order = coincident_nodes(twice.positions, once.positions, 1e-12)
-    assert len(np.unique(order)) == len(once.positions) == len(twice.positions)
-    np.testing.assert_allclose(twice.positions[twice.coarse_nodes], mesh.positions, atol=0, rtol=0)
+    np.testing.assert_array_equal(np.sort(order), np.arange(len(twice.positions)))
+    np.testing.assert_array_equal(order[once.coarse_nodes], twice.coarse_nodes)
+    np.testing.assert_array_equal(twice.positions[twice.coarse_nodes], mesh.positions)
+
+
+@pytest.mark.parametrize("make", [cross_mesh, lambda: spokes(3), lambda: spokes(5), o_grid])
+def test_flat_boundaries_keep_their_area_under_refinement(make):
+    def area(mesh):
+        a, b, c, d = np.moveaxis(mesh.positions[boundary_faces(mesh.cells)[0]], 1, 0)
+        return 0.5 * np.linalg.norm(np.cross(c - a, d - b), axis=1).sum()
+
+    mesh = make()
+    assert area(refine(mesh, 3)) == pytest.approx(area(mesh), rel=1e-12)
 
 
 def test_boundary_faces_point_outwards_and_close_the_body():

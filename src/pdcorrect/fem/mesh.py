@@ -13,21 +13,26 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pdcorrect.errors import MeshError
-
-VTK_CORNERS = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
+from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES, corner_jacobians
+from pdcorrect.fem.mesh_checks import (
+    check_arrays,
+    check_cells,
+    check_connections,
+    check_repetitions,
+    face_groups,
 )
-"""Corners of the unit cell in VTK order, (8, 3)."""
 
-VTK_FACES = np.array(
-    [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
-)
-"""Corners of the six faces, counter-clockwise seen from outside, (6, 4)."""
-
-VTK_EDGES = np.array(
-    [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]
-)
-"""Corners of the twelve edges, (12, 2)."""
+__all__ = [
+    "VTK_CORNERS",
+    "VTK_EDGES",
+    "VTK_FACES",
+    "HexMesh",
+    "boundary_faces",
+    "coincident_nodes",
+    "corner_jacobians",
+    "refine",
+    "voxel_mesh",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,38 +56,16 @@ class HexMesh:
         Raises
         ------
         MeshError
-            If shapes, indices or corner Jacobians are wrong; names the cell.
+            If shapes or indices are wrong, a cell is collapsed, repeated or
+            inverted, nodes are duplicate or hanging, or cells overlap at a
+            face; names the place.
         """
         positions = np.ascontiguousarray(positions, dtype=np.float64)
         cells = np.ascontiguousarray(cells, dtype=np.int64)
-        if positions.ndim != 2 or positions.shape[1] != 3 or cells.ndim != 2 or cells.shape[1] != 8:
-            raise MeshError(
-                f"nodes {positions.shape} and cells {cells.shape}: expected (N, 3) and (C, 8)."
-            )
-        if not len(cells):
-            raise MeshError("the mesh has no cells: expected at least one hexahedron.")
-        if not np.isfinite(positions).all():
-            node = int(np.argmin(np.isfinite(positions).all(axis=1)))
-            raise MeshError(f"node {node} is at {positions[node]}: expected finite coordinates.")
-        if cells.min() < 0 or cells.max() >= len(positions):
-            raise MeshError(
-                f"cells refer to nodes {cells.min()} to {cells.max()}: expected 0 to "
-                f"{len(positions) - 1}."
-            )
-        unused = np.flatnonzero(np.bincount(cells.ravel(), minlength=len(positions)) == 0)
-        if len(unused):
-            raise MeshError(
-                f"node {unused[0]} at {positions[unused[0]]} belongs to no cell: expected every "
-                "node to be used."
-            )
-        jacobian = corner_jacobians(positions, cells).min(axis=1)
-        if jacobian.min() <= 0:
-            cell = int(np.argmin(jacobian))
-            raise MeshError(
-                f"cell {cell} around {positions[cells[cell]].mean(axis=0)} is inverted or flat "
-                f"(smallest corner Jacobian {jacobian[cell]:.3g} m3): expected VTK node order and "
-                "a convex cell."
-            )
+        check_arrays(positions, cells)
+        check_repetitions(positions, cells)
+        check_cells(positions, cells)
+        check_connections(positions, cells)
         return cls(positions, cells, np.arange(len(positions)))
 
     @property
@@ -94,28 +77,6 @@ class HexMesh:
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest coordinates, (2, 3)."""
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
-
-
-def corner_jacobians(
-    positions: NDArray[np.float64], cells: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Determinant of the trilinear map at the corners, (C, 8), m3.
-
-    For cubes it is the cell volume; it is positive at all corners of a usable
-    cell.
-    """
-    corners = positions[cells]  # (C, 8, 3)
-    jacobian = np.empty((len(cells), 8))
-    for k, corner in enumerate(VTK_CORNERS):
-        edges = []
-        for axis in range(3):
-            other = corner.copy()
-            other[axis] = 1 - other[axis]
-            neighbour = int(np.flatnonzero((other == VTK_CORNERS).all(axis=1))[0])
-            sign = 1 - 2 * corner[axis]
-            edges.append(sign * (corners[:, neighbour] - corners[:, k]))
-        jacobian[:, k] = np.einsum("ci,ci->c", edges[0], np.cross(edges[1], edges[2]))
-    return jacobian
 
 
 def voxel_mesh(
@@ -145,7 +106,11 @@ def voxel_mesh(
     used, cells = np.unique(flat, return_inverse=True)
     nodes = np.stack(np.unravel_index(used, tuple(grid)), axis=1) - np.array(origin_index)
     positions = nodes * float(cell_size) + np.array(origin)
-    return HexMesh.create(positions, cells.reshape(-1, 8))
+    cells = np.ascontiguousarray(cells.reshape(-1, 8), dtype=np.int64)
+    # Cells of a grid are conforming by construction: only sizes can be wrong.
+    check_arrays(positions, cells)
+    check_cells(positions, cells, VTK_CORNERS.astype(np.float64))
+    return HexMesh(positions, cells, np.arange(len(positions)))
 
 
 def refine(mesh: HexMesh, k: int) -> HexMesh:
@@ -205,11 +170,8 @@ def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
     owners : (n,) int
         The cell behind each face.
     """
-    faces = cells[:, VTK_FACES].reshape(-1, 4)
-    _, first, counts = np.unique(
-        np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True
-    )
-    outer = np.sort(first[counts == 1])
+    faces, order, starts, counts = face_groups(cells)
+    outer = np.sort(order[starts[counts == 1]])
     return faces[outer], outer // 6
 
 
