@@ -34,10 +34,8 @@ def gauss_points(n: int) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def jacobians(
-    positions: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Determinant of the trilinear map at ``points`` (P, 3) of the unit cell, (C, P), m3."""
+def shape_derivatives(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """dN_k/dxi_j of the trilinear shape functions, (3, P, 8), at ``points`` (P, 3)."""
     at = points[:, None]  # (P, 1, 3)
     factors = np.where(VTK_CORNERS == 1, at, 1 - at)  # (P, 8, 3)
     slopes = 2.0 * VTK_CORNERS - 1
@@ -45,6 +43,14 @@ def jacobians(
     for axis in range(3):
         others = [i for i in range(3) if i != axis]
         shape[axis] = slopes[:, axis] * factors[..., others].prod(axis=-1)
+    return shape
+
+
+def jacobians(
+    positions: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Determinant of the trilinear map at ``points`` (P, 3) of the unit cell, (C, P), m3."""
+    shape = shape_derivatives(points)
     result = np.empty((len(cells), len(points)))
     for start in range(0, len(cells), _CHUNK):
         corners = positions[cells[start : start + _CHUNK]].transpose(2, 1, 0)  # (3, 8, c)

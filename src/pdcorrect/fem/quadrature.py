@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.fem.mesh import VTK_CORNERS
+from pdcorrect.fem.hexahedron import shape_derivatives
 
 Array = NDArray[np.float64]
 
@@ -77,8 +77,9 @@ class Quadrature:
 
     def with_incompatible_modes(self, corners: Array, points: Array) -> Quadrature:
         """Three bubbles a cell more, for corners (C, 8, 3) and points (Q, 3) of the unit cell."""
-        jacobian = jacobians(corners, points)  # (C, Q, 3, 3)
-        centre = jacobians(corners, np.full((1, 3), 0.5))[:, 0]
+        jacobian = np.einsum("cki,jqk->cqij", corners, shape_derivatives(points))
+        middle = shape_derivatives(np.full((1, 3), 0.5))[:, 0]
+        centre = np.einsum("cki,jk->cij", corners, middle)
         ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
         slopes = -4.0 * (2.0 * points - 1.0)  # dB_m/dxi_m, (Q, 3)
         inverse = np.linalg.inv(centre)  # (C, m, i): dxi_m/dx_i
@@ -127,16 +128,3 @@ class FaceQuadrature:
     gradients: Array
     weights: Array
     normals: Array
-
-
-def jacobians(corners: Array, points: Array) -> Array:
-    """dx_i/dxi_j of the trilinear map, (C, n, 3, 3), m.
-
-    ``corners`` (C, 8, 3) in VTK order, m; ``points`` (n, 3) of the unit cell.
-    """
-    sides = np.where(VTK_CORNERS[None] == 1, points[:, None], 1.0 - points[:, None])  # (n, 8, 3)
-    slopes = 2.0 * VTK_CORNERS - 1.0
-    derivatives = np.stack(
-        [slopes[:, j] * np.delete(sides, j, axis=2).prod(axis=2) for j in range(3)], axis=-1
-    )  # (n, 8, 3)
-    return np.einsum("cki,nkj->cnij", corners, derivatives, optimize=True)

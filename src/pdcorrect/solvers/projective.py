@@ -77,8 +77,8 @@ class ProjectiveDynamics(ImplicitStepper):
             raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
         if method == "local-global" and problem.materials.model != COROTATED:
             raise InputError(
-                f"method = 'local-global' with energy = {problem.scene.material.energy!r}: expected "
-                "the corotated energy, whose terms are projections; or method = 'lbfgs'."
+                f"method = 'local-global' with energy = {problem.scene.material.energy!r}: "
+                "expected the corotated energy, whose terms are projections, or method = 'lbfgs'."
             )
         tolerance = problem.scene.solver.tolerance if tolerance is None else tolerance
         super().__init__(problem, tolerance, time_step, integrator, backend, recover)
