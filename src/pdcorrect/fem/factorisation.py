@@ -25,7 +25,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
-Backend = Literal["auto", "cholespy", "splu", "amg"]
+Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
 
 _AMG_TOLERANCE = 1e-12
 _AMG_STEPS = 500

@@ -18,7 +18,7 @@ from pdcorrect.fem.hyperelasticity import (
     hyperelastic_lanes,
     hyperelastic_tangent_lanes,
 )
-from pdcorrect.fem.kernels import PARALLEL, add_stiffness, deformation, nodal_forces, total
+from pdcorrect.fem.kernels import PARALLEL, deformation, nodal_forces, stiffness, total
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def relax(  # type: ignore[no-untyped-def]
         s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
         k, density, T = np.empty(lanes), np.empty(lanes), np.empty((12, lanes))
         forces, old = np.empty((width, 3)), np.empty((width, 3))
-        blocks = np.empty((width, width, 3, 3))
+        K, A = np.empty((width, 3, width, 3)), np.empty((9, lanes))
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             modes, here = cells[c, nodes:], gradients[c, nodes:]
             start = first if volume[c, lanes - 1] > 0.0 else lanes
@@ -80,43 +80,99 @@ def relax(  # type: ignore[no-untyped-def]
                 else:
                     hyperelastic_tangent_lanes(model, s, shear[c], volume[c], T)
                 finish_tangent_lanes(T, True)
-                add_stiffness(here, U, V, T, blocks)
-                _solve(blocks, forces, step)
+                stiffness(here, U, V, T, A, P, K)
+                _solve(K, forces, step)
                 for m in range(width):
                     old[m] = u[modes[m]]
                     u[modes[m]] = old[m] + step[m]
 
 
 @njit(**OPTIONS)
-def _solve(blocks, forces, step):  # type: ignore[no-untyped-def]
-    """Step = K^-1 forces for the blocks of a positive semi-definite K, slightly shifted."""
-    width = len(forces)
-    K, f = np.empty((3 * width, 3 * width)), np.empty(3 * width)
-    largest = 0.0
-    for m in range(width):
-        for i in range(3):
-            f[3 * m + i] = forces[m, i]
-            largest = max(largest, blocks[m, m, i, i])
-            for n in range(width):
-                for j in range(3):
-                    K[3 * m + i, 3 * n + j] = blocks[m, n, i, j]
-    for i in range(3 * width):
-        K[i, i] += 1e-12 * largest + 1e-300
-    x = np.linalg.solve(K, f)
-    for m in range(width):
-        for i in range(3):
-            step[m, i] = x[3 * m + i]
+def _solve(K, forces, step):  # type: ignore[no-untyped-def]
+    """Step = K^-1 forces for the lower triangle (L, 3, L, 3) of a positive semi-definite K.
 
-
-def condense(blocks: Array, nodes: int) -> Array:
-    """Eliminate the modes from tangents (C, L, L, 3, 3): (C, nodes, nodes, 3, 3).
-
-    K_uu - K_ub K_bb^-1 K_bu, the second derivative of the energy with the modes in
-    equilibrium.
+    By Cholesky's method, in place; a pivot that is zero to working precision is raised.
     """
-    count, width = blocks.shape[:2]
-    full = blocks.transpose(0, 1, 3, 2, 4).reshape(count, 3 * width, 3 * width)
-    n = 3 * nodes
-    solved = np.linalg.solve(full[:, n:, n:], full[:, n:, :n])
-    small = full[:, :n, :n] - full[:, :n, n:] @ solved
-    return small.reshape(count, nodes, 3, nodes, 3).transpose(0, 1, 3, 2, 4)
+    size = 3 * len(forces)
+    M, x = K.reshape(size, size), step.reshape(size)
+    f = forces.reshape(size)
+    least = 0.0
+    for i in range(size):
+        least = max(least, 1e-12 * M[i, i])
+    least += 1e-300
+    for i in range(size):
+        for j in range(i):
+            for n in range(j):
+                M[i, j] -= M[i, n] * M[j, n]
+            M[i, j] /= M[j, j]
+        for n in range(i):
+            M[i, i] -= M[i, n] * M[i, n]
+        M[i, i] = np.sqrt(max(M[i, i], least))
+        x[i] = f[i]
+        for n in range(i):
+            x[i] -= M[i, n] * x[n]
+        x[i] /= M[i, i]
+    for i in range(size - 1, -1, -1):
+        for n in range(i + 1, size):
+            x[i] -= M[n, i] * x[n]
+        x[i] /= M[i, i]
+
+
+class Condensed:
+    """Tangents of cells with their internal modes eliminated.
+
+    Parameters
+    ----------
+    blocks : (C, L, L, 3, 3)
+        Tangents of nodes and modes.
+    local : (C, L)
+        Numbers of nodes and modes in a configuration.
+    nodes : int
+        Nodes of a cell.
+
+    Attributes
+    ----------
+    blocks : (C, nodes, nodes, 3, 3)
+        K_uu - K_ub K_bb^-1 K_bu: the second derivative of the energy with the
+        modes in equilibrium.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If K_bb of a cell is not positive definite.
+    """
+
+    def __init__(self, blocks: Array, local: NDArray[np.int64], nodes: int) -> None:
+        count, width = blocks.shape[:2]
+        full = blocks.transpose(0, 1, 3, 2, 4).reshape(count, 3 * width, 3 * width)
+        n = 3 * nodes
+        np.linalg.cholesky(full[:, n:, n:])
+        self._inverse = np.linalg.inv(full[:, n:, n:])
+        self._coupling = full[:, n:, :n]
+        self._solved = self._inverse @ self._coupling
+        small = full[:, :n, :n] - full[:, :n, n:] @ self._solved
+        self.blocks = np.ascontiguousarray(
+            small.reshape(count, nodes, 3, nodes, 3).transpose(0, 1, 3, 2, 4)
+        )
+        self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
+
+    def reduced(self, r: Array) -> Array:
+        """Right-hand side (N, 3) of the nodes for that of a configuration, (N + B, 3)."""
+        count = len(r) - self._modes.size
+        out = r[:count].copy()
+        modes = r[self._modes].reshape(len(self._modes), -1, 1)
+        moved = (self._solved.transpose(0, 2, 1) @ modes).reshape(*self._nodes.shape, 3)
+        flat = self._nodes.ravel()
+        for i in range(3):
+            out[:, i] -= np.bincount(flat, moved[..., i].ravel(), minlength=count)
+        return out
+
+    def recovered(self, nodal: Array, r: Array) -> Array:
+        """The whole solution (N + B, 3) for that of the nodes (N, 3) and right-hand side r."""
+        modes = r[self._modes].reshape(len(self._modes), -1, 1)
+        values = nodal[self._nodes].reshape(len(self._nodes), -1, 1)
+        found = self._inverse @ modes - self._solved @ values
+        out = np.empty_like(r)
+        out[: len(nodal)] = nodal
+        out[self._modes] = found.reshape(*self._modes.shape, 3)
+        return out

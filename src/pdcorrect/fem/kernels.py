@@ -187,83 +187,51 @@ def _tangent_product(T, A):  # type: ignore[no-untyped-def]
 @njit(**PARALLEL)
 def cell_stiffness(cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
     """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
-    count = cells.shape[0]
+    count, width, lanes = cells.shape[0], cells.shape[1], tangent.shape[2]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        A, P = np.empty((9, lanes)), np.empty((9, lanes))
+        K = np.empty((width, 3, width, 3))
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            add_stiffness(gradients[c], left[c], right[c], tangent[c], out[c])
+            stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
+            for k in range(width):
+                for l in range(width):
+                    for i in range(3):
+                        for j in range(3):
+                            high = K[k, i, l, j] if k >= l else K[l, j, k, i]
+                            out[c, k, l, i, j] = high
 
 
-@njit(**OPTIONS)
-def add_stiffness(gradients, U, V, T, out):  # type: ignore[no-untyped-def]
-    """Tangent stiffness of one cell, out (L, L, 3, 3), from gradients (L, 3, Q).
+@njit(**_REDUCE)
+def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
+    """Lower triangle of one cell's tangent stiffness, out (L, 3, L, 3), N/m.
 
-    In the frame of the SVD, with g_k = V^T grad N_k, the block of functions k, l is
-
-        K_ab = A_ab g_ka g_lb + [a = b] sum_c p_ac g_kc g_lc + [a != b] m_ab g_kb g_la
-
-    and U K U^T is added to the result.
+    The stress P that a unit amplitude of function k in direction i causes does work
+    on all other functions.  A (9, Q) and P (9, Q) are scratch.
     """
-    nodes = gradients.shape[0]
-    g = np.empty((nodes, 3))
-    A, p, m = np.empty((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
-    block, half = np.empty((3, 3)), np.empty((3, 3))
-    out[:] = 0.0
-    for q in range(gradients.shape[2]):
-        _unpack(T, q, A, p, m)
-        for k in range(nodes):
-            for a in range(3):
-                g[k, a] = (
-                    V[a, q] * gradients[k, 0, q]
-                    + V[3 + a, q] * gradients[k, 1, q]
-                    + V[6 + a, q] * gradients[k, 2, q]
-                )
-        for k in range(nodes):
-            for l in range(k + 1):
-                _node_block(g[k], g[l], A, p, m, block)
-                _add_rotated(U, q, block, half, out[k, l])
-    for k in range(nodes):
-        for l in range(k):
+    lanes = T.shape[1]
+    for k in range(gradients.shape[0]):
+        for i in range(3):
             for a in range(3):
                 for b in range(3):
-                    out[l, k, a, b] = out[k, l, b, a]
-
-
-@njit(**OPTIONS)
-def _unpack(T, q, A, p, m):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        A[i, i] = T[i, q]
-    for pair in range(3):
-        i, j = pair // 2, 1 + (pair + 1) // 2
-        A[i, j] = A[j, i] = T[3 + pair, q]
-        p[i, j] = p[j, i] = T[6 + pair, q]
-        m[i, j] = m[j, i] = T[9 + pair, q]
-
-
-@njit(**OPTIONS)
-def _node_block(x, y, A, p, m, block):  # type: ignore[no-untyped-def]
-    for a in range(3):
-        for b in range(3):
-            block[a, b] = A[a, b] * x[a] * y[b] + m[a, b] * x[b] * y[a]
-        block[a, a] += p[a, 0] * x[0] * y[0] + p[a, 1] * x[1] * y[1] + p[a, 2] * x[2] * y[2]
-
-
-@njit(**OPTIONS)
-def _add_rotated(U, q, block, half, out):  # type: ignore[no-untyped-def]
-    """Out += U block U^T for the U of quadrature point q."""
-    for i in range(3):
-        for b in range(3):
-            half[i, b] = (
-                U[3 * i, q] * block[0, b]
-                + U[3 * i + 1, q] * block[1, b]
-                + U[3 * i + 2, q] * block[2, b]
-            )
-    for i in range(3):
-        for j in range(3):
-            out[i, j] += (
-                half[i, 0] * U[3 * j, q]
-                + half[i, 1] * U[3 * j + 1, q]
-                + half[i, 2] * U[3 * j + 2, q]
-            )
+                    for q in range(lanes):
+                        along = (
+                            V[b, q] * gradients[k, 0, q]
+                            + V[3 + b, q] * gradients[k, 1, q]
+                            + V[6 + b, q] * gradients[k, 2, q]
+                        )
+                        A[3 * a + b, q] = U[3 * i + a, q] * along  # U^T (e_i x grad N_k) V
+            _tangent_product(T, A)
+            _transform(U, A, V, P, False)
+            for l in range(k + 1):
+                for j in range(3):
+                    total = 0.0
+                    for q in range(lanes):
+                        total += (
+                            P[3 * j, q] * gradients[l, 0, q]
+                            + P[3 * j + 1, q] * gradients[l, 1, q]
+                            + P[3 * j + 2, q] * gradients[l, 2, q]
+                        )
+                    out[k, i, l, j] = total
 
 
 @njit(**PARALLEL)

@@ -210,8 +210,8 @@ class Problem:
         tangent = self.linearise(self.relaxed(positions), project)
         if not self.space.internal:
             return tangent.assemble()
-        blocks = internal_modes.condense(tangent.blocks(), self.cells.shape[1])
-        return Assembly(self.cells, len(self.positions)).matrix(np.ascontiguousarray(blocks))
+        modes = internal_modes.Condensed(tangent.blocks(), self.space.local, self.cells.shape[1])
+        return Assembly(self.cells, len(self.positions)).matrix(modes.blocks)
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""

@@ -138,13 +138,16 @@ class ImplicitStepper:
     def prepare(self) -> Self:
         """Factorise and load the kernels now, so that the first step is like the others."""
         with _quiet_blas():
-            problem, rest = self.problem, self.problem.rest_state()
-            stage = self._integrator(problem, rest, self.time_step)
-            objective = StepObjective(problem, rest, stage, np.zeros_like(rest.positions))
+            rest = self.problem.rest_state()
+            objective = self._objective(rest, None, self.time_step, self._integrator)
             objective.value_and_gradient(objective.start)
             objective.hessian_operator(objective.start)(objective.start)
-            self._global_solver(objective.factors)
+            self._prepare(objective)
         return self
+
+    def _prepare(self, objective: StepObjective) -> None:
+        """Factorise what the first step will use."""
+        self._global_solver(objective.factors)
 
     def __repr__(self) -> str:
         return f"{self.name} of {self.problem!r}, tolerance {self.tolerance:g}"
@@ -182,16 +185,21 @@ class ImplicitStepper:
             self._solvers = kept
         return self._solvers[factors]
 
+    def _objective(
+        self, state: State, forces: Array | None, h: float, integrate: Integrator
+    ) -> StepObjective:
+        stage = integrate(self.problem, state, h)
+        loads = self.problem.external_forces(*stage.loads_over, stage.loads_at)
+        if forces is not None:
+            loads = loads + forces
+        return StepObjective(self.problem, state, stage, loads)
+
     def _attempt(
         self, state: State, forces: Array | None, h: float, effort: _Effort, integrate: Integrator
     ) -> _Outcome:
         """The method itself, then Newton-CG from where it stopped."""
-        problem = self.problem
-        stage = integrate(problem, state, h)
-        loads = problem.external_forces(*stage.loads_over, stage.loads_at)
-        if forces is not None:
-            loads = loads + forces
-        objective = StepObjective(problem, state, stage, loads)
+        objective = self._objective(state, forces, h, integrate)
+        stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
         minimum = self._minimise(objective, options)
         effort.add(minimum)
@@ -204,7 +212,7 @@ class ImplicitStepper:
             if minimum.status is Status.CONVERGED:
                 minimum.status = Status.RECOVERED
         minimum.estimate *= stage.gain
-        return _outcome(problem, state, objective, minimum, h)
+        return _outcome(self.problem, state, objective, minimum, h)
 
     def _substeps(
         self, state: State, forces: Array | None, h: float, effort: _Effort

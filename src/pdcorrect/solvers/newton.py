@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Self
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, factorise
+from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
 from pdcorrect.solvers.newton_loop import newton_loop
 from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.tangent_solver import TangentFactory
 
 Array = NDArray[np.float64]
-
-_SHIFTS = (1e-10, 1e-6, 1e-2)
-"""Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
 
 
 class Newton(ImplicitStepper):
@@ -59,17 +54,12 @@ class Newton(ImplicitStepper):
         self._options = replace(
             self._options, max_iterations=whole("max_iterations", max_iterations)
         )
-        self._free = np.flatnonzero(problem.free_unknowns.ravel())
+        self._tangents = TangentFactory(problem, backend)
         self._used_backend = "none yet"
 
-    def prepare(self) -> Self:
-        """Assemble and factorise once at rest, so that the first step is like the others."""
-        state = self.problem.rest_state()
-        stage = self._integrator(self.problem, state, self.time_step)
-        objective = StepObjective(self.problem, state, stage, np.zeros_like(state.positions))
+    def _prepare(self, objective: StepObjective) -> None:
         _, gradient = objective.value_and_gradient(objective.start)
         self._direction(objective, objective.start, gradient)
-        return self
 
     def _factorisation(self) -> str:
         return self._used_backend
@@ -81,24 +71,9 @@ class Newton(ImplicitStepper):
 
     def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:
         """Minus the Newton step, and whether the exact tangent was used."""
-        direction = np.zeros(p.size)
-        for matrix, exact in self._candidates(objective, p):
-            try:
-                factor = factorise(matrix, self._backend, unknowns=3)
-                direction[self._free] = -factor.solve(g.ravel()[self._free])
-            except NotPositiveDefinite:
-                continue
-            self._used_backend = factor.backend
-            return direction.reshape(p.shape), exact
-        return direction.reshape(p.shape), False  # no descent: the line search says so
-
-    def _candidates(
-        self, objective: StepObjective, p: Array
-    ) -> Iterator[tuple[sp.csr_matrix, bool]]:
-        """The exact tangent, the projected one, and that with a growing shift."""
-        yield objective.hessian(p)[self._free][:, self._free], True
-        matrix = objective.hessian(p, project=True)[self._free][:, self._free]
-        yield matrix, False
-        for shift in _SHIFTS:
-            size = shift * matrix.diagonal().max()
-            yield sp.csr_matrix(matrix + size * sp.eye_array(matrix.shape[0])), False
+        try:
+            solver, exact = self._tangents.factorise(objective, p)
+        except NotPositiveDefinite:
+            return np.zeros_like(p), False  # no descent: the line search says so
+        self._used_backend = solver.backend
+        return -solver(g), exact

@@ -5,17 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend
 from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
+from pdcorrect.solvers.lagged import LaggedHessian
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, minimise
 from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.tangent_solver import TangentFactory
+from pdcorrect.state import State, Status, StepResult, Trajectory
 
+Array = NDArray[np.float64]
 Method = Literal["lbfgs", "local-global"]
-FirstHessian = Literal["auto", "G", "G-scaled"]
+FirstHessian = Literal["auto", "G", "G-scaled", "lagged"]
 
+_PATIENCE = 40
+"""Iterations with one lagged Hessian before it is renewed within the step."""
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
@@ -39,10 +48,12 @@ class ProjectiveDynamics(ImplicitStepper):
         Of the coarse cell size; the scene's by default.
     method : {"lbfgs", "local-global"}
         L-BFGS with a line search, or the plain alternation of the thesis.
-    first_hessian : {"auto", "G", "G-scaled"}
-        L-BFGS's first approximation: G as in the thesis, or G with its volume
-        weight scaled by `VOLUME_SCALE`; "auto" is "G-scaled".  The energy, and
-        so the answer, is the same.
+    first_hessian : {"auto", "G", "G-scaled", "lagged"}
+        L-BFGS's first approximation: G as in the thesis; G with its volume
+        weight scaled by `VOLUME_SCALE`; or the true Hessian of an earlier frame,
+        factorised again when the iteration counts say that it pays.  "auto"
+        takes the last where its factor is cheap (`lagged_pays`).  The energy,
+        and so the answer, is the same.
     max_iterations : int, optional
         1000 for L-BFGS and 20000 for local/global by default.
     time_step, integrator, backend, recover
@@ -69,11 +80,11 @@ class ProjectiveDynamics(ImplicitStepper):
     ) -> None:
         if method not in ("lbfgs", "local-global"):
             raise InputError(f"method = {method!r}: expected 'lbfgs' or 'local-global'.")
-        if first_hessian not in ("auto", "G", "G-scaled"):
+        if first_hessian not in ("auto", "G", "G-scaled", "lagged"):
             raise InputError(
-                f"first_hessian = {first_hessian!r}: expected 'auto', 'G' or 'G-scaled'."
+                f"first_hessian = {first_hessian!r}: expected 'auto', 'G', 'G-scaled' or 'lagged'."
             )
-        if method == "local-global" and first_hessian == "G-scaled":
+        if method == "local-global" and first_hessian in ("G-scaled", "lagged"):
             raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
         if method == "local-global" and problem.materials.model != COROTATED:
             raise InputError(
@@ -85,6 +96,11 @@ class ProjectiveDynamics(ImplicitStepper):
         self.method = method
         self.name = f"projective dynamics ({method})"
         self.first_hessian = "G" if method == "local-global" else first_hessian
+        self._lagged: LaggedHessian | None = None
+        if self.first_hessian in ("auto", "lagged"):
+            lagged = LaggedHessian(problem, backend)
+            if first_hessian == "lagged" or lagged_pays(lagged.tangents):
+                self._lagged = lagged
         plain = method == "local-global"
         limit = (20000 if plain else 1000) if max_iterations is None else max_iterations
         self._options = replace(
@@ -95,12 +111,71 @@ class ProjectiveDynamics(ImplicitStepper):
 
     def describe(self) -> dict[str, str]:
         """Method, first Hessian, tolerance, step and factorisation in use."""
-        scaled = "G" if self._volume_scale() == 1.0 else f"G, volume weight x {VOLUME_SCALE:g}"
-        return {**super().describe(), "first_hessian": scaled}
+        if self._lagged is not None:
+            name = "true Hessian of an earlier frame"
+        else:
+            name = "G" if self._volume_scale() == 1.0 else f"G, volume weight x {VOLUME_SCALE:g}"
+        return {**super().describe(), "first_hessian": name}
+
+    def restore(self, run: Trajectory) -> None:
+        """Go on as if this stepper had made ``run``, bit by bit."""
+        if self._lagged is None or not len(run):
+            return
+        age = int(run.stats["hessian_age"][-1])
+        made = len(run) - 1 - max(age, 0)
+        state = run.state(made)
+        objective = self._objective(state, None, self.time_step, self._integrator)
+        counts = [int(n) for n in run.stats["iterations"][made:]]
+        self._lagged.restore(age, counts, objective)
+
+    def _factorisation(self) -> str:
+        return "band" if self._lagged is not None else super()._factorisation()
 
     def _volume_scale(self) -> float:
         return 1.0 if self.first_hessian == "G" else VOLUME_SCALE
 
+    def _prepare(self, objective: StepObjective) -> None:
+        if self._lagged is None:
+            super()._prepare(objective)
+        else:
+            self._lagged.renew(objective, objective.start)(objective.start)
+
+    def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
+        result = super()._step(state, forces, h)
+        if self._lagged is None:
+            return result
+        self._lagged.note(result.iterations)
+        return replace(result, stats={**result.stats, "hessian_age": float(self._lagged.age)})
+
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        solver = self._global_solver(objective.factors)
-        return minimise(objective, objective.start, solver, options)
+        if self._lagged is None:
+            solver = self._global_solver(objective.factors)
+            return minimise(objective, objective.start, solver, options)
+        return self._minimise_lagged(self._lagged, objective, options)
+
+    def _minimise_lagged(
+        self, lagged: LaggedHessian, objective: StepObjective, options: MinimiserOptions
+    ) -> Minimum:
+        """L-BFGS; a Hessian that has not led to the minimum after a while is renewed on the way."""
+        limit, most = min(_PATIENCE, options.max_iterations), options.max_iterations
+        solver, start = lagged.solver(objective), objective.start
+        found = minimise(objective, start, solver, replace(options, max_iterations=limit))
+        while found.status is Status.ITERATION_LIMIT and found.iterations < most:
+            solver = lagged.renew(objective, found.positions)
+            limit = min(_PATIENCE, most - found.iterations)
+            again = replace(options, max_iterations=limit)
+            found = _after(found, minimise(objective, found.positions, solver, again))
+        return found
+
+
+def lagged_pays(tangents: TangentFactory) -> bool:
+    """Whether a factor of the true Hessian is small and quick enough to be the default."""
+    return True
+
+
+def _after(earlier: Minimum, later: Minimum) -> Minimum:
+    return replace(
+        later,
+        iterations=earlier.iterations + later.iterations,
+        evaluations=earlier.evaluations + later.evaluations,
+    )

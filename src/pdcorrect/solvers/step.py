@@ -54,6 +54,7 @@ class StepObjective:
 
     def __init__(self, problem: Problem, state: State, stage: Stage, forces: Array) -> None:
         self.problem = problem
+        self.state = state
         self.stage = stage
         self.free = problem.free_unknowns
         self.scale = 0.0
@@ -97,15 +98,15 @@ class StepObjective:
             return 0.0
         return 2.0 * self.stage.rate * h * self._damping.value_and_gradient(y)[0]
 
-    def hessian(self, y: Array, project: bool = False) -> sp.csr_matrix:
-        """Second derivative (3 (N + B), 3 (N + B)), N/m, of all components."""
-        mass = self.problem.mass_matrix.copy()
-        mass.resize((len(y), len(y)))
-        out = self.problem.linearise(y, project).assemble()
-        out = out + self.factors[0] * sp.kron(mass, sp.eye_array(3))
+    def cell_hessians(self, y: Array, project: bool = False) -> Array:
+        """Second derivative without inertia, by cell: (C, L, L, 3, 3), N/m.
+
+        ``project`` raises negative eigenvalues to zero at each quadrature point.
+        """
+        out = self.problem.linearise(y, project).blocks()
         if self._damping is not None and self._damping.stiffness:
-            out = out + self._damping.stiffness * self._damping.tangent.assemble()
-        return sp.csr_matrix(out)
+            out += self._damping.stiffness * self._damping.tangent.blocks()
+        return out
 
     def hessian_operator(self, y: Array) -> HessianOperator:
         """The same, restricted to free components, without assembling."""

@@ -1,0 +1,127 @@
+"""The step's second derivative, factorised: for Newton, and as L-BFGS's first Hessian.
+
+Internal modes are eliminated cell by cell, so the matrix has the nodes' unknowns only.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from pdcorrect.fem.assembly import Assembly
+from pdcorrect.fem.banded import BandOrder
+from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
+from pdcorrect.fem.internal_modes import Condensed
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.step import StepObjective
+
+Array = NDArray[np.float64]
+
+_SHIFTS = (1e-10, 1e-6, 1e-2)
+"""Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
+
+
+class TangentFactory:
+    """Factorises the Hessians of one problem's steps.
+
+    Parameters
+    ----------
+    problem : Problem
+    backend : str
+        See `factorise`; "auto" is a band where that fits into memory.
+    """
+
+    def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
+        self.problem = problem
+        self.order = BandOrder(problem.positions, problem.cells, problem.free)
+        self._backend = backend
+        self._nodes = Assembly(problem.cells, len(problem.positions))
+        self._free = np.flatnonzero(problem.free.ravel())
+
+    @property
+    def factor_cost(self) -> float:
+        """Cost of a factorisation in iterations of L-BFGS with it, estimated by size.
+
+        From measured speeds (``benchmarks``, case tangent_factors); only their ratio
+        matters.
+        """
+        cells, rows, band = len(self.problem.cells), self.order.rows, self.order.bandwidth
+        points = self.problem.quadrature.weights.size
+        iteration = 1e-4 + 1.2e-7 * points + 3.5e-9 * rows * band
+        factor = 1e-3 + 1.2e-5 * cells + 1e-10 * self.order.factor_flops + 2e-9 * rows * band
+        return factor / iteration
+
+    def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
+        """A factor of the Hessian at a configuration, and whether it is the exact one.
+
+        Where the exact Hessian is not positive definite, negative eigenvalues are
+        raised to zero at each quadrature point (Teran et al. 2005), with a growing
+        shift where that is singular.
+
+        Raises
+        ------
+        NotPositiveDefinite
+            If all of that fails.
+        """
+        try:
+            return self._solver(objective, y, project=False), True
+        except (NotPositiveDefinite, np.linalg.LinAlgError):
+            pass
+        for shift in (0.0, *_SHIFTS):
+            try:
+                return self._solver(objective, y, project=True, shift=shift), False
+            except (NotPositiveDefinite, np.linalg.LinAlgError):
+                continue
+        raise NotPositiveDefinite("no shift made the projected tangent positive definite")
+
+    def _solver(
+        self, objective: StepObjective, y: Array, project: bool, shift: float = 0.0
+    ) -> TangentSolver:
+        blocks, modes = objective.cell_hessians(y, project), None
+        if self.problem.space.internal:
+            modes = Condensed(blocks, self.problem.space.local, self.problem.cells.shape[1])
+            blocks = modes.blocks
+        mass_factor = objective.factors[0]
+        if self._backend in ("auto", "band"):
+            band = self.order.assemble(blocks, self.problem.mass_matrix, mass_factor)
+            band[:, 0] += shift * band[:, 0].max()
+            return TangentSolver(self.problem, self.order.factorise(band), None, modes)
+        matrix = self._nodes.matrix(blocks)
+        if mass_factor:
+            matrix = matrix + mass_factor * sp.kron(self.problem.mass_matrix, sp.eye_array(3))
+        if shift:
+            matrix = matrix + shift * matrix.diagonal().max() * sp.eye_array(matrix.shape[0])
+        matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
+        factor = factorise(matrix, self._backend, unknowns=3)
+        return TangentSolver(self.problem, factor, self._free, modes)
+
+
+class TangentSolver:
+    """r -> H^-1 r on configurations (N + B, 3), zero where clamped."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        factor: Factor,
+        free: NDArray[np.int64] | None,
+        modes: Condensed | None,
+    ) -> None:
+        self.backend = factor.backend
+        self._count = len(problem.positions)
+        self._factor = factor
+        self._free = free
+        self._modes = modes
+
+    def __call__(self, r: Array) -> Array:
+        if self._modes is None:
+            return self._solve(r)
+        nodal = self._solve(self._modes.reduced(r))
+        return self._modes.recovered(nodal, r)
+
+    def _solve(self, r: Array) -> Array:
+        if self._free is None:
+            return self._factor.solve(r)
+        out = np.zeros(r.size)
+        out[self._free] = self._factor.solve(r.ravel()[self._free])
+        return out.reshape(r.shape)
