@@ -1,5 +1,7 @@
 """A twisting and stretching cross, given by a formula: trajectories without a solver."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from pdcorrect import shapes
@@ -54,9 +56,19 @@ def trajectory(frames=6, refine=1, angle=0.9, step=0.02, seed=0):
     )
 
 
+def remembering(run, first=2):
+    """The same run with accelerations from frame ``first`` on."""
+    noise = np.random.default_rng(7).normal(size=run.positions.shape)
+    noise[:first] = np.nan
+    return replace(run, memory={"acceleration": noise})
+
+
 def assert_same(found, expected, frames=None):
     """Bit-equal arrays; ``frames`` leading ones of ``expected`` (default: all)."""
     frames = len(expected.times) if frames is None else frames
+    assert list(found.memory) == list(expected.memory)
+    for name, values in expected.memory.items():
+        assert found.memory[name].tobytes() == values[:frames].tobytes(), name
     for name in ("positions", "velocities", "times"):
         array, wanted = getattr(found, name), getattr(expected, name)[:frames]
         assert array.dtype == wanted.dtype

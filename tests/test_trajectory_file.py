@@ -14,8 +14,9 @@ import h5py
 import numpy as np
 import pytest
 
-from motion import assert_same, trajectory
+from motion import assert_same, remembering, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
+from pdcorrect.io.disk_space import Reserve
 from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
@@ -133,6 +134,49 @@ def test_statistics_may_come_and_go(run, tmp_path):
     assert loaded.positions.tobytes() == run.positions.tobytes()
 
 
+@pytest.mark.parametrize("first", [0, 1, 3])
+def test_what_states_remember_is_stored_with_them(run, tmp_path, first):
+    path = tmp_path / "run.h5"
+    expected = remembering(run, first)
+    save_trajectory(path, expected)
+    loaded = load_trajectory(path)
+    assert_same(loaded, expected)
+    for k in range(len(run.times)):
+        assert list(loaded.state(k).memory) == (["acceleration"] if k >= first else [])
+    kept = loaded.state(-1).memory["acceleration"]
+    assert kept.tobytes() == expected.memory["acceleration"][-1].tobytes()
+    with h5py.File(path) as file:
+        assert file["memory/acceleration"].shape == run.positions.shape
+        assert np.isnan(file["memory/acceleration"][:first]).all()
+
+
+def test_a_run_that_remembers_nothing_has_no_memory_in_its_file(saved):
+    with h5py.File(saved) as file:
+        assert set(file) == {"positions", "velocities", "times", "mesh", "stats"}
+    assert load_trajectory(saved).memory == {}
+
+
+def test_room_is_made_for_memory_that_comes_late(tmp_path, monkeypatch):
+    promised, filled = [], []
+    ensure, fill = Reserve.ensure, GrowingFile._add
+
+    def ensuring(self, used, need):
+        promised.append(used + need)
+        ensure(self, used, need)
+
+    def filling(self, columns):
+        fill(self, columns)
+        self._file.flush()
+        if "memory/acceleration" in columns:
+            filled.append((promised[-1], self._file.id.get_filesize()))
+
+    monkeypatch.setattr(Reserve, "ensure", ensuring)
+    monkeypatch.setattr(GrowingFile, "_add", filling)
+    save_trajectory(tmp_path / "run.h5", remembering(trajectory(frames=300), 298))
+    ((room, used),) = filled
+    assert used <= room < 1.5 * used
+
+
 # --- what a writer refuses -------------------------------------------------------------
 
 
@@ -177,6 +221,8 @@ def test_states_that_do_not_fit_are_refused_and_leave_the_file_whole(run, tmp_pa
             (State(good.positions[:-1], good.velocities[:-1], 1.0), "positions, expected"),
             (State(bad, good.velocities, 1.0), "only finite states"),
             (State(good.positions, good.velocities, good.time), "expected more than"),
+            (State(good.positions, good.velocities, 1.0, {"a": bad}), "only finite states"),
+            (State(good.positions, good.velocities, 1.0, {"a/b": bad}), "without '/'"),
         ):
             with pytest.raises(InputError, match=words):
                 writer.append_values(state, {})
@@ -193,6 +239,7 @@ def test_states_that_do_not_fit_are_refused_and_leave_the_file_whole(run, tmp_pa
         ({"stats": {"residual": np.zeros(3)}}, "'residual' has shape"),
         ({"stats": {"status": np.array(["FINE"] * 6)}}, "'FINE' is unknown"),
         ({"stats": {"a/b": np.zeros(6)}}, "a/b"),
+        ({"memory": {"a": np.zeros((7, 2, 3))}}, "memory 'a' has float64 of shape"),
         ({"attributes": {"format": "mine"}}, "file's own"),
     ],
 )
@@ -200,6 +247,23 @@ def test_contradictory_trajectories_are_not_saved(run, tmp_path, change, words):
     with pytest.raises(InputError, match=words):
         save_trajectory(tmp_path / "run.h5", dataclasses.replace(run, **change))
     assert not (tmp_path / "run.h5").exists()
+
+
+def test_contradictory_memory_is_not_saved(run, tmp_path):
+    whole, partly, none = (np.full(run.positions.shape, x) for x in (1.0, np.nan, np.nan))
+    partly[2, 3:] = 1.0
+    for memory, words in (
+        ({"a/b": whole}, "memory 'a/b': expected a name"),
+        ({"a": partly}, "memory 'a' has infinite or NaN entries"),
+        ({"a": none}, "memory 'a' has no finite frame"),
+    ):
+        with pytest.raises(InputError, match=words):
+            save_trajectory(tmp_path / "run.h5", dataclasses.replace(run, memory=memory))
+    assert not (tmp_path / "run.h5").exists()
+    with pytest.raises(InputError, match=r"memory 'a': expected shape \(N, 3\), got \(4,\)"):
+        State(run.positions[0], run.velocities[0], 0.0, {"a": np.zeros(4)})
+    with pytest.raises(InputError, match="memory 'a': expected the shape of positions"):
+        State(run.positions[0], run.velocities[0], 0.0, {"a": np.zeros((4, 3))})
 
 
 # --- writers that do not finish --------------------------------------------------------

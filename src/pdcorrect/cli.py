@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
+from pdcorrect.interruption import Terminated, terminable
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
-    from pdcorrect.state import Stepper, StepResult
+    from pdcorrect.solvers.rollout import StepLog
+    from pdcorrect.state import Stepper, StepResult, Trajectory
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -22,7 +24,7 @@ app = typer.Typer(
     help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
 )
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 
 
 class SolverName(StrEnum):
@@ -57,36 +59,28 @@ def simulate(
         Optional[Path], typer.Option(help="Also write VTU files and a PVD into this folder.")
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
+    resume: Annotated[
+        bool, typer.Option(help="Continue an existing output file after its last complete frame.")
+    ] = False,
 ) -> None:
     """Run one scene and write its trajectory, frame by frame."""
-    from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory
+    from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.report import make_folder
     from pdcorrect.scene import Scene
-    from pdcorrect.solvers.rollout import StepLog, march, run_attributes
 
+    if resume and overwrite:
+        raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
     loaded = Scene.load(scene)
     if vtu:
         make_folder(vtu)
     stepper = _make_stepper(loaded, solver, refine)
     count = frames or loaded.time.frames
-    writer = TrajectoryWriter(
-        output, stepper.problem.positions, stepper.problem.cells, stepper.problem.rest_state(),
-        scene_toml=loaded.to_toml(), attributes=run_attributes(stepper), overwrite=overwrite,
-    )  # fmt: skip
-    log = StepLog()
-    with writer, _progress() as progress:
-        task = progress.add_task(f"{loaded.name}", total=count)
-        try:
-            for result, elapsed in march(stepper, count):
-                writer.append(result, elapsed)
-                log.add(result, elapsed)
-                progress.advance(task)
-        except KeyboardInterrupt:
-            done = len(log.arrays()["status"])
-            typer.echo(f"stopped: {done} of {count} frames are in {output}", err=True)
-            raise typer.Exit(INTERRUPTED) from None
-    _summary(log.arrays(), stepper)
-    _say(f"wrote {output}")
+    earlier = _frames_so_far(output, stepper, count) if resume else None
+    log = _run(stepper, count, output, earlier, overwrite)
+    before = 0 if earlier is None else len(earlier)
+    if before < count:
+        _summary(log.arrays(), stepper, before)
+        _say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
@@ -200,13 +194,68 @@ def _make_stepper(scene: Scene, solver: SolverName, refine: int) -> Stepper:
     return make_stepper(scene, solver.value, refine)
 
 
-def _summary(stats: dict[str, Any], stepper: Stepper) -> None:
+def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | None:
+    """What a file holds of the run to ``count`` frames, under the scene that is now run."""
+    from dataclasses import replace
+
+    from pdcorrect.io.trajectory import load_trajectory
+    from pdcorrect.solvers.resume import check_same_run
+
+    if not output.exists():
+        _say(f"{output} does not exist yet: starting from the beginning")
+        return None
+    run = load_trajectory(output, salvage=True)
+    check_same_run(stepper, run, str(output))
+    if len(run) < count:
+        _say(f"{output} holds {len(run)} of {count} frames: continuing")
+        return replace(run, scene_toml=stepper.problem.scene.to_toml())
+    _say(f"{output} holds {len(run)} frames already, {count} wanted: nothing to do")
+    return run
+
+
+def _run(
+    stepper: Stepper, count: int, output: Path, earlier: Trajectory | None, overwrite: bool
+) -> StepLog:
+    """Step to frame ``count`` and write each frame; an interruption ends the program."""
+    from pdcorrect.io.trajectory import TrajectoryWriter
+    from pdcorrect.solvers.resume import continue_from
+    from pdcorrect.solvers.rollout import StepLog, march, run_attributes
+
+    problem = stepper.problem
+    if earlier is None:
+        state, done, log = problem.rest_state(), 0, StepLog()
+        writer = TrajectoryWriter(
+            output, problem.positions, problem.cells, state, overwrite=overwrite,
+            scene_toml=problem.scene.to_toml(), attributes=run_attributes(stepper),
+        )  # fmt: skip
+    else:
+        state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
+        writer = TrajectoryWriter.resume(output, earlier)
+    with writer, _progress(hidden=done >= count) as progress:
+        task = progress.add_task(problem.scene.name, total=count, completed=done)
+        try:
+            for result, elapsed in march(stepper, max(0, count - done), state=state):
+                writer.append(result, elapsed)
+                log.add(result, elapsed)
+                progress.advance(task)
+        except (KeyboardInterrupt, Terminated) as stop:
+            typer.echo(
+                f"stopped: {writer.steps} of {count} frames are in {output}; --resume continues",
+                err=True,
+            )
+            ended = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
+            raise typer.Exit(ended) from None
+    return log
+
+
+def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, residual, energy, and what solved them."""
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
+    ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
     _say(
-        f"{count} frames of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
+        f"{ran} of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
         f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
         f"{seconds:.2f} s: {1e3 * seconds / count:.3g} ms a frame"
     )
@@ -226,7 +275,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper) -> None:
     )
 
 
-def _progress() -> Any:
+def _progress(hidden: bool = False) -> Any:
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -238,7 +287,7 @@ def _progress() -> Any:
 
     return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(),
+        TextColumn("left"), TimeRemainingColumn(), disable=hidden,
     )  # fmt: skip
 
 
@@ -250,7 +299,11 @@ def _say(text: str) -> None:
 def main() -> None:
     """Entry point: one paragraph and an exit status instead of a traceback."""
     try:
-        app()
+        with terminable():
+            app()
+    except Terminated:
+        typer.echo("stopped by SIGTERM", err=True)
+        sys.exit(TERMINATED)
     except ConvergenceError as error:
         _stop(str(error), FAILED)
     except OutputError as error:

@@ -151,15 +151,25 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
     """
     folder = make_folder(folder)
     try:
-        (folder / "report.csv").write_text(to_csv(comparison), encoding="utf-8")
-        (folder / "report.json").write_text(to_json(comparison), encoding="utf-8")
-        (folder / "report.md").write_text(to_markdown(comparison, []), encoding="utf-8")
+        _put(folder / "report.csv", to_csv(comparison))
+        _put(folder / "report.json", to_json(comparison))
+        _put(folder / "report.md", to_markdown(comparison, []))
         if draw:
             pictures = draw_figures(comparison, folder)
-            (folder / "report.md").write_text(to_markdown(comparison, pictures), encoding="utf-8")
+            _put(folder / "report.md", to_markdown(comparison, pictures))
     except OSError as error:
         raise _not_written(folder, error) from error
     return folder / "report.md"
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a file that appears under its name only when it is complete."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def make_folder(folder: str | Path) -> Path:

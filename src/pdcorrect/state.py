@@ -45,7 +45,14 @@ class Status(Enum):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Positions (m) and velocities (m/s), each (N, 3) float64, at a time (s)."""
+    """Positions (m) and velocities (m/s), each (N, 3) float64, at a time (s).
+
+    Attributes
+    ----------
+    memory : mapping of str to (N, 3) float64
+        What a time integrator needs besides to take the next step, by name:
+        accelerations, or positions and velocities of an earlier frame.
+    """
 
     positions: Array
     velocities: Array
@@ -54,10 +61,9 @@ class State:
 
     def __post_init__(self) -> None:
         for name in ("positions", "velocities"):
-            array = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
-            if array.ndim != 2 or array.shape[1] != 3:
-                raise InputError(f"{name}: expected shape (N, 3), got {array.shape}.")
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, _nodal(name, getattr(self, name)))
+        memory = {name: _nodal(f"memory {name!r}", a) for name, a in self.memory.items()}
+        object.__setattr__(self, "memory", memory)
         if not math.isfinite(self.time):
             raise InputError(f"time = {self.time}: expected a finite number of seconds.")
         if self.positions.shape != self.velocities.shape:
@@ -65,9 +71,22 @@ class State:
                 f"positions {self.positions.shape} and velocities {self.velocities.shape}: "
                 "expected the same shape."
             )
+        for name, array in memory.items():
+            if array.shape != self.positions.shape:
+                raise InputError(
+                    f"memory {name!r}: expected the shape of positions, {self.positions.shape}, "
+                    f"got {array.shape}."
+                )
 
     def __repr__(self) -> str:
         return f"State({len(self.positions)} nodes, t = {self.time:g} s)"
+
+
+def _nodal(name: str, values: Array) -> Array:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name}: expected shape (N, 3), got {array.shape}.")
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +124,13 @@ class StepResult:
 
 
 class Stepper(Protocol):
-    """Anything that advances a state by one step."""
+    """Anything that advances a state by one step.
+
+    All that the next step depends on belongs into the `State`.  A stepper that
+    carries anything else from step to step may have a method
+    ``restore(run: Trajectory) -> None``: before a run is continued from a file,
+    it is called with the frames so far.
+    """
 
     @property
     def problem(self) -> Problem:
@@ -142,6 +167,8 @@ class Trajectory:
         Solver, refinement, element, mass, code version.
     problem : Problem or None
         What was stepped; None when read from a file.
+    memory : mapping of str to (T+1, N, 3) float64
+        ``State.memory`` of the frames; NaN in those that have none.
     """
 
     positions: Array
@@ -153,6 +180,7 @@ class Trajectory:
     scene_toml: str = ""
     attributes: Mapping[str, str] = field(default_factory=dict)
     problem: Problem | None = None
+    memory: Mapping[str, Array] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return (
@@ -166,4 +194,7 @@ class Trajectory:
 
     def state(self, frame: int = -1) -> State:
         """The state at a frame."""
-        return State(self.positions[frame], self.velocities[frame], float(self.times[frame]))
+        memory = {n: a[frame] for n, a in self.memory.items() if np.isfinite(a[frame]).all()}
+        return State(
+            self.positions[frame], self.velocities[frame], float(self.times[frame]), memory
+        )

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError, OutputError, require_extra
+from pdcorrect.errors import InputError, require_extra
+from pdcorrect.figures.files import replacing
 from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
@@ -40,11 +41,8 @@ def _save(figure: Any, output: str | Path) -> Path:
     known = figure.canvas.get_supported_filetypes()
     if suffix not in known:
         raise InputError(f"{output}: expected a name ending in .{', .'.join(sorted(known))}.")
-    try:
-        figure.savefig(output, dpi=150)
-    except OSError as error:
-        reason = error.strerror or error
-        raise OutputError(f"{output}: cannot be written ({reason}).") from error
+    with replacing(Path(output)) as part:
+        figure.savefig(part, dpi=150)
     return Path(output)
 
 

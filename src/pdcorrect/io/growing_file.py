@@ -15,7 +15,8 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple, Self
 
 import h5py
 import numpy as np
@@ -35,6 +36,11 @@ class Column(NamedTuple):
     dtype: np.dtype[Any]
     shape: tuple[int, ...] = ()
     first: int = 0
+
+    @property
+    def size(self) -> int:
+        """Bytes of an entry."""
+        return self.dtype.itemsize * math.prod(self.shape)
 
 
 class Content(NamedTuple):
@@ -83,9 +89,7 @@ class GrowingFile:
         _check_target(path, overwrite)
         self.path = path
         self.records = 0
-        self._filters: dict[str, Any] = {"fletcher32": True}
-        if compress:
-            self._filters |= {"shuffle": True, "compression": "gzip", "compression_opts": 4}
+        self._filters = _filters(compress)
         self._columns: dict[str, Column] = {}
         self._counter = counter
         self._reserve = Reserve(path)
@@ -95,7 +99,41 @@ class GrowingFile:
                 self._create(content)
                 self._add(columns)
                 self._write(first)
-            _save(memory.getvalue(), path, overwrite)
+            _save(memory.getvalue(), path)
+
+    @classmethod
+    def reopen(
+        cls,
+        path: Path,
+        columns: Mapping[str, Column],
+        counter: str,
+        records: int,
+        attributes: Mapping[str, str | int],
+    ) -> Self | None:
+        """A finished file again, to append to; parameters as for a new one.
+
+        Returns
+        -------
+        GrowingFile or None
+            None if the file was not closed, has more or less than these whole
+            records, other attributes, or a layout that does not grow.
+        """
+        block = read_superblock(path)
+        if block.in_writing or not 0 < block.end <= block.size:
+            return None
+        with h5py.File(path, "r", locking=False) as stored:
+            same = _growing(stored) == set(columns) and all(
+                _fits(stored[name], column, records) for name, column in columns.items()
+            )
+            if not same or _texts(stored.attrs) != _texts(attributes):
+                return None
+            compressed = stored[counter].compression is not None
+        file = cls.__new__(cls)
+        file.path, file.records = path, records
+        file._columns, file._counter = dict(columns), counter
+        file._filters, file._reserve = _filters(compressed), Reserve(path)
+        file._broken, file._file = False, None  # opened with the next record
+        return file
 
     def append(self, entries: Mapping[str, Any], columns: Mapping[str, Column]) -> None:
         """Write one record.
@@ -160,12 +198,12 @@ class GrowingFile:
     def _declare(self, new: Mapping[str, Column]) -> None:
         """Open the file, with more datasets; they are added to a copy that then replaces it."""
         self.close()
-        part = self.path.with_name(self.path.name + ".part")
+        part = part_of(self.path)
         with self._reporting():
             try:
                 if new:
                     shutil.copyfile(self.path, part)
-                    Reserve(part).ensure(part.stat().st_size, self._room(len(new)))
+                    Reserve(part).ensure(part.stat().st_size, self._room(new))
                     with h5py.File(part, "r+", libver=_LIBRARY) as self._file:
                         self._add(new)
                     part.replace(self.path)
@@ -189,11 +227,12 @@ class GrowingFile:
         dataset.resize(self.records - first + 1, axis=0)
         dataset[self.records - first] = entries.get(name, _FILL[dtype.kind])
 
-    def _room(self, new: int = 0) -> int:
+    def _room(self, new: Mapping[str, Column] = MappingProxyType({})) -> int:
         """Bytes for a record and for ``new`` datasets, with the blocks of their indices."""
-        size = sum(c.dtype.itemsize * math.prod(c.shape) for c in self._columns.values())
-        index = 256 * (16 + math.isqrt(self.records)) * (len(self._columns) + new)
-        return 2 * size + index + new * (2048 + 64 * self.records) + 32768
+        size = 2 * sum(c.size for c in self._columns.values())
+        index = 256 * (16 + math.isqrt(self.records)) * (len(self._columns) + len(new))
+        filled = sum(2048 + (56 + c.size) * self.records for c in new.values())
+        return size + index + filled + 32768
 
     def _make_room(self) -> None:
         try:
@@ -225,27 +264,70 @@ class GrowingFile:
 def _check_target(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise OutputError(f"{path}: is a folder; give the name of a file in it.")
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: is a device or a pipe; give the name of a file.")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; create it first.")
     if path.exists() and not overwrite:
         raise OutputError(
-            f"{path}: exists already; overwrite it with --overwrite (overwrite=True) or choose "
-            "another name."
+            f"{path}: exists already; choose another name, overwrite it with --overwrite "
+            "(overwrite=True), or continue it with --resume (TrajectoryWriter.resume)."
         )
 
 
-def _save(data: bytes, path: Path, overwrite: bool) -> None:
-    created = False
+def _save(data: bytes, path: Path) -> None:
+    """Write all or nothing: a killed process leaves no file without its beginning."""
+    part = part_of(path)
     try:
-        with path.open("wb" if overwrite else "xb") as file:
-            created = True
-            file.write(data)
+        part.write_bytes(data)
+        part.replace(path)
     except OSError as error:
-        if created:
-            path.unlink(missing_ok=True)
         raise OutputError(
             f"{path}: cannot be written ({_reason(error)}); choose another place."
         ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def part_of(path: Path) -> Path:
+    """Where what is to replace a file is written."""
+    return path.with_name(path.name + ".part")
+
+
+def _filters(compress: bool) -> dict[str, Any]:
+    checksum = {"fletcher32": True}
+    gzip = {"shuffle": True, "compression": "gzip", "compression_opts": 4}
+    return checksum | gzip if compress else checksum
+
+
+def _texts(attributes: Mapping[str, Any]) -> dict[str, str]:
+    return {
+        name: value.decode("utf-8") if isinstance(value, bytes) else str(value)
+        for name, value in attributes.items()
+    }
+
+
+def _growing(file: Any) -> set[str]:
+    """Names of the datasets that can grow."""
+    found: set[str] = set()
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and item.maxshape[:1] == (None,):
+            found.add(name)
+
+    file.visititems(visit)
+    return found
+
+
+def _fits(dataset: Any, column: Column, records: int) -> bool:
+    """Whether a dataset is what `GrowingFile` made, with all its records and no more."""
+    return (
+        dataset.dtype == column.dtype
+        and dataset.shape == (max(0, records - column.first), *column.shape)
+        and dataset.chunks == (1, *column.shape)
+        and dataset.fletcher32
+    )
 
 
 def _reason(error: Exception) -> str:

@@ -1,9 +1,9 @@
 """Trajectories in HDF5: written frame by frame, readable at any moment.
 
 Layout: ``positions`` and ``velocities`` (T+1, N, 3), ``times`` (T+1,),
-``mesh/points``, ``mesh/cells``, ``stats/<name>`` (T,); the scene and the
-attributes of the run are attributes of the file.  The length of ``times`` counts
-the complete frames.
+``mesh/points``, ``mesh/cells``, ``stats/<name>`` (T,), and ``memory/<name>``
+(T+1, N, 3) if the states remember anything; the scene and the attributes of the
+run are attributes of the file.  The length of ``times`` counts the complete frames.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 
 from pdcorrect import __version__
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.io.growing_file import Column, Content, GrowingFile
+from pdcorrect.io.growing_file import Column, Content, GrowingFile, part_of
 from pdcorrect.io.trajectory_reader import (
     FORMAT,
     RESERVED,
     VERSION,
     load_trajectory,
+    read_storage,
     trajectory_fault,
 )
 from pdcorrect.state import State, StepResult, Trajectory
@@ -93,17 +94,13 @@ class TrajectoryWriter:
             cells=np.ascontiguousarray(cells, dtype=np.int64),
             scene_toml=scene_toml,
             attributes=dict(attributes or {}),
+            memory={name: array[None] for name, array in initial.memory.items()},
         )
         _refuse(first)
         self._shape = first.points.shape
-        frames = {
-            "positions": Column(_FLOAT, self._shape),
-            "velocities": Column(_FLOAT, self._shape),
-            "times": Column(_FLOAT),
-        }
         self._file = GrowingFile(
             Path(path),
-            frames,
+            _frame_columns(self._shape) | _memory_columns(initial.memory, self._shape),
             "times",
             _entries(initial),
             Content(
@@ -116,10 +113,60 @@ class TrajectoryWriter:
         )
         self._time = initial.time
 
+    @classmethod
+    def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
+        """Reopen a finished or interrupted file, to append after its last complete frame.
+
+        A file that was not closed, or has a damaged or half-written frame, is
+        first rewritten without it; until that is done the old one stays.
+
+        Parameters
+        ----------
+        path : path
+            No other process may be writing it.
+        run : Trajectory, optional
+            What the file is to hold before the next frame; by default what
+            ``load_trajectory(path, salvage=True)`` reads from it.
+
+        Raises
+        ------
+        FileFormatError
+            If no frame can be read.
+        InputError
+            If another version of this package wrote the file.
+        OutputError
+            If the file cannot be rewritten; it is unchanged.
+        """
+        path = Path(path)
+        stored = read_storage(path)
+        if stored.version != __version__:
+            raise InputError(
+                f"{path}: written by pdcorrect {stored.version}, this is {__version__}: continue "
+                "it with the version that began it, or start again."
+            )
+        run = load_trajectory(path, salvage=True) if run is None else run
+        _refuse(run)
+        file = _reopened(path, run)
+        if file is None:
+            _rewrite(path, run, stored.compressed)
+            file = _reopened(path, run)
+        if file is None:
+            raise OutputError(f"{path}: has changed meanwhile; is another process writing it?")
+        for stale in (part_of(path), part_of(part_of(path))):  # of a killed process
+            stale.unlink(missing_ok=True)
+        writer = cls.__new__(cls)
+        writer._file, writer._shape, writer._time = file, run.points.shape, float(run.times[-1])
+        return writer
+
     @property
     def path(self) -> Path:
         """The file."""
         return self._file.path
+
+    @property
+    def steps(self) -> int:
+        """Steps in the file, the initial state not counted."""
+        return self._file.records - 1
 
     def __enter__(self) -> TrajectoryWriter:
         return self
@@ -154,7 +201,7 @@ class TrajectoryWriter:
 
     def append_values(self, state: State, values: Mapping[str, Any]) -> None:
         """Write one frame with statistics by name: numbers, and ``status`` as text."""
-        columns = {f"stats/{name}": _column(name, value) for name, value in values.items()}
+        columns = _stats_columns(values) | _memory_columns(state.memory, self._shape)
         self._check(state)
         entries = {f"stats/{name}": value for name, value in values.items()}
         self._file.append(entries | _entries(state), columns)
@@ -168,14 +215,19 @@ class TrajectoryWriter:
         where = f"{self.path}: frame {self._file.records}"
         if state.positions.shape != self._shape:
             raise InputError(f"{where}: {state.positions.shape} positions, expected {self._shape}.")
-        if not (np.isfinite(state.positions).all() and np.isfinite(state.velocities).all()):
+        arrays = (state.positions, state.velocities, *state.memory.values())
+        if not all(np.isfinite(array).all() for array in arrays):
             raise InputError(f"{where}: infinite or NaN entries; only finite states are stored.")
         if not state.time > self._time:
             raise InputError(f"{where}: time {state.time} s, expected more than {self._time} s.")
 
 
-def save_trajectory(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
+def save_trajectory(
+    path: str | Path, trajectory: Trajectory, overwrite: bool = False, compress: bool = False
+) -> None:
     """Write a whole trajectory; `load_trajectory` returns the same arrays, bit by bit.
+
+    Parameters are those of `TrajectoryWriter`.
 
     Raises
     ------
@@ -185,8 +237,6 @@ def save_trajectory(path: str | Path, trajectory: Trajectory, overwrite: bool = 
         If the file cannot be written.
     """
     _refuse(trajectory)
-    for name, array in trajectory.stats.items():
-        _column(name, array[0] if len(array) else array)
     with TrajectoryWriter(
         path,
         trajectory.points,
@@ -195,6 +245,7 @@ def save_trajectory(path: str | Path, trajectory: Trajectory, overwrite: bool = 
         scene_toml=trajectory.scene_toml,
         attributes=trajectory.attributes,
         overwrite=overwrite,
+        compress=compress,
     ) as writer:
         for k in range(len(trajectory)):
             values = {name: array[k] for name, array in trajectory.stats.items()}
@@ -208,10 +259,56 @@ def _refuse(trajectory: Trajectory) -> None:
     taken = sorted(set(trajectory.attributes) & RESERVED)
     if taken:
         raise InputError(f"attribute {taken[0]!r} is the file's own: choose another name.")
+    _columns(trajectory)
+
+
+def _reopened(path: Path, run: Trajectory) -> GrowingFile | None:
+    return GrowingFile.reopen(path, _columns(run), "times", len(run.times), _file_attributes(run))
+
+
+def _rewrite(path: Path, run: Trajectory, compress: bool) -> None:
+    part = part_of(path)
+    try:
+        save_trajectory(part, run, overwrite=True, compress=compress)
+        part.replace(path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: is unchanged, but the copy to continue with failed: {error}"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _entries(state: State) -> dict[str, Any]:
-    return {"positions": state.positions, "velocities": state.velocities, "times": state.time}
+    memory = {f"memory/{name}": array for name, array in state.memory.items()}
+    return memory | {
+        "positions": state.positions, "velocities": state.velocities, "times": state.time
+    }  # fmt: skip
+
+
+def _columns(run: Trajectory) -> dict[str, Column]:
+    """All growing datasets of a run's file."""
+    values = {name: array[0] if len(array) else array for name, array in run.stats.items()}
+    stats, shape = _stats_columns(values), run.points.shape
+    fixed = _frame_columns(shape) | _memory_columns(run.memory, shape)
+    return fixed | stats if len(run) else fixed  # statistics come with the first step
+
+
+def _frame_columns(shape: tuple[int, ...]) -> dict[str, Column]:
+    nodal = Column(_FLOAT, shape)
+    return {"positions": nodal, "velocities": nodal, "times": Column(_FLOAT)}
+
+
+def _memory_columns(memory: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Column]:
+    for name in memory:
+        if name in ("", ".") or "/" in name:
+            raise InputError(f"memory {name!r}: expected a name without '/'.")
+    return {f"memory/{name}": Column(_FLOAT, shape) for name in memory}
+
+
+def _stats_columns(values: Mapping[str, Any]) -> dict[str, Column]:
+    return {f"stats/{name}": _column(name, value) for name, value in values.items()}
 
 
 def _column(name: str, value: Any) -> Column:

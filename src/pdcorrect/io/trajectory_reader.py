@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -47,9 +47,33 @@ def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
     """
     path = Path(path)
     block = read_superblock(path)
+    with _refusing(path, block), _opened(path, block) as file:
+        return _read(file, block, salvage)
+
+
+class Storage(NamedTuple):
+    """How a file is stored: with gzip or not, and the pdcorrect that wrote it."""
+
+    compressed: bool
+    version: str
+
+
+def read_storage(path: Path) -> Storage:
+    """What rewriting a trajectory file has to keep; raises as `load_trajectory`."""
+    block = read_superblock(path)
+    with _refusing(path, block), _opened(path, block) as file:
+        _check_format(file)
+        positions = _dataset(file, "positions", "f", 3)
+        known = "pdcorrect_version" in file.attrs
+        version = _attribute(file, "pdcorrect_version") if known else "of an unknown version"
+        return Storage(positions.compression is not None, version)
+
+
+@contextlib.contextmanager
+def _refusing(path: Path, block: Superblock) -> Iterator[None]:
+    """Turn whatever a file's content makes HDF5 raise into `FileFormatError`."""
     try:
-        with _opened(path, block) as file:
-            return _read(file, block, salvage)
+        yield
     except _RefusalError as refusal:
         raise FileFormatError(f"{path}: {refusal}.") from None
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
@@ -83,7 +107,20 @@ def trajectory_fault(trajectory: Trajectory) -> str | None:
         return "it has no frames" if nodes else "it has no nodes"
     if (np.diff(trajectory.times) <= 0).any():
         return "times do not increase"
+    for name, array in trajectory.memory.items():
+        fault = _memory_fault(array, (frames, nodes, 3))
+        if fault:
+            return f"memory {name!r} {fault}"
     return _cells_fault(trajectory.cells, nodes) or _stats_fault(trajectory, frames - 1)
+
+
+def _memory_fault(array: Any, shape: tuple[int, ...]) -> str | None:
+    if array.shape != shape or array.dtype != np.float64:
+        return f"has {array.dtype} of shape {array.shape}, expected float64 of {shape}"
+    finite = np.isfinite(array).all(axis=(1, 2))
+    if not (finite | np.isnan(array).all(axis=(1, 2))).all():
+        return "has infinite or NaN entries, expected all or none of a frame to be NaN"
+    return None if finite.any() else "has no finite frame"
 
 
 def _cells_fault(cells: Any, nodes: int) -> str | None:
@@ -119,6 +156,8 @@ def _opened(path: Path, block: Superblock) -> Iterator[Any]:
 def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     _check_format(file)
     datasets = {name: _dataset(file, name, "f", ndim) for name, ndim in _FRAMES.items()}
+    remembered = list(_group(file, "memory")) if "memory" in file else []
+    datasets |= {f"memory/{n}": _dataset(file, f"memory/{n}", "f", 3) for n in remembered}
     points = _dataset(file, "mesh/points", "f", 2)[...]
     cells = _dataset(file, "mesh/cells", "iu", 2)[...]
     names = list(_group(file, "stats"))
@@ -149,6 +188,11 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
         cells=cells.astype(np.int64, copy=False),
         scene_toml=_attribute(file, "scene_toml"),
         attributes={name: _attribute(file, name) for name in file.attrs if name not in RESERVED},
+        memory={
+            name: arrays[f"memory/{name}"]
+            for name in remembered
+            if not np.isnan(arrays[f"memory/{name}"]).all()  # added, but its frame never completed
+        },
     )
     fault = trajectory_fault(trajectory)
     if fault:
@@ -206,21 +250,33 @@ def _check_lengths(datasets: dict[str, Any], stats: dict[str, Any], frames: int)
 
 def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int, size: int) -> int:
     """Number of leading frames whose every chunk is complete and has the right checksum."""
+    stored = {dataset: _chunks(dataset, size) for dataset in (*frame_data, *step_data)}
     for k in range(frames):
         parts = [(dataset, k) for dataset in frame_data]
         parts += [(dataset, k - 1) for dataset in step_data if k]
-        if not all(_intact(dataset, index, size) for dataset, index in parts):
+        if not all(_intact(dataset, index, stored[dataset]) for dataset, index in parts):
             return k
     return frames
 
 
-def _intact(dataset: Any, index: int, size: int) -> bool:
-    try:
+def _chunks(dataset: Any, size: int) -> set[int]:
+    """First index of each chunk that lies in the first ``size`` bytes of the file."""
+    found: set[int] = set()
+
+    def note(chunk: Any) -> None:
+        if chunk.byte_offset is not None and chunk.byte_offset + chunk.size <= size:
+            found.add(chunk.chunk_offset[0])
+
+    with contextlib.suppress(OSError, RuntimeError, ValueError):  # those before the damage count
         if dataset.chunks:
-            corner = (index - index % dataset.chunks[0],) + (0,) * (dataset.ndim - 1)
-            chunk = dataset.id.get_chunk_info_by_coord(corner)
-            if chunk.byte_offset is None or chunk.byte_offset + chunk.size > size:
-                return False
+            dataset.id.chunk_iter(note)
+    return found
+
+
+def _intact(dataset: Any, index: int, stored: set[int]) -> bool:
+    if dataset.chunks and index - index % dataset.chunks[0] not in stored:
+        return False
+    try:
         dataset[index]
     except (OSError, RuntimeError, ValueError):
         return False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -133,14 +133,34 @@ def _trajectory(stepper: Stepper, states: list[State], log: StepLog) -> Trajecto
         scene_toml=problem.scene.to_toml(),
         attributes=run_attributes(stepper),
         problem=problem,
+        memory=_memory(states),
     )
 
 
-class StepLog:
-    """Statistics of a run, one row a step, without its states."""
+def _memory(states: list[State]) -> dict[str, Array]:
+    """What the states remember, (T+1, N, 3) by name; NaN where one has none."""
+    none = np.full_like(states[0].positions, np.nan)
+    names = dict.fromkeys(name for state in states for name in state.memory)
+    return {name: np.stack([s.memory.get(name, none) for s in states]) for name in names}
 
-    def __init__(self) -> None:
-        self._rows: list[dict[str, Any]] = []
+
+class StepLog:
+    """Statistics of a run, one row a step, without its states.
+
+    Parameters
+    ----------
+    earlier : mapping of str to (T,) arrays
+        Those of the steps before, of a run that is continued.
+    """
+
+    def __init__(self, earlier: Mapping[str, NDArray[Any]] | None = None) -> None:
+        columns = earlier or {}
+        rows = zip(*columns.values(), strict=True)
+        self._rows: list[dict[str, Any]] = [dict(zip(columns, row, strict=True)) for row in rows]
+
+    def __len__(self) -> int:
+        """Number of steps."""
+        return len(self._rows)
 
     def add(self, result: StepResult, seconds: float) -> None:
         """Note a step and its wall-clock seconds."""
@@ -157,8 +177,8 @@ class StepLog:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The ``stats`` of a `Trajectory`: (T,) arrays by name."""
-        names = self._rows[0] if self._rows else _NO_STEPS
-        return {name: np.array([row[name] for row in self._rows]) for name in names}
+        names = dict.fromkeys(n for row in self._rows for n in row) if self._rows else _NO_STEPS
+        return {name: np.array([row.get(name, np.nan) for row in self._rows]) for name in names}
 
 
 _NO_STEPS = ("status", "iterations", "residual", "error_estimate", "seconds")
@@ -205,4 +225,5 @@ def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
         scene_toml=run.scene_toml,
         attributes={**run.attributes, "restricted": "to the nodes of a coarser mesh"},
         problem=None,
+        memory={name: array[:, nodes] for name, array in run.memory.items()},
     )

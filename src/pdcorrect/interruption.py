@@ -1,0 +1,48 @@
+"""SIGTERM as an exception, so that files are closed before the process ends."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+from typing import Any
+
+_PAUSE = 0.01  # s
+
+
+class Terminated(BaseException):
+    """The process was asked to end; as `KeyboardInterrupt`, it is no `Exception`."""
+
+
+@contextlib.contextmanager
+def terminable() -> Iterator[None]:
+    """Raise `Terminated` in the main thread at the first SIGTERM; later ones are ignored."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler, hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+    sys.unraisablehook = _insist
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGTERM, handler)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    signal.signal(number, signal.SIG_IGN)  # closing takes a moment; let nothing cut it short
+    raise Terminated
+
+
+def _insist(lost: Any) -> None:
+    """Signal again if Python dropped the exception, as it does in destructors and callbacks."""
+    if lost.exc_type is not Terminated:
+        sys.__unraisablehook__(lost)
+        return
+    signal.signal(signal.SIGTERM, _terminate)
+    again = threading.Timer(_PAUSE, signal.raise_signal, [signal.SIGTERM])
+    again.daemon = True
+    again.start()
