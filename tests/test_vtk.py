@@ -6,6 +6,8 @@ import meshio
 import numpy as np
 import pytest
 
+import pdcorrect as pc
+from conftest import beam
 from motion import cross_mesh, trajectory
 from pdcorrect.errors import InputError, MeshError, OutputError
 from pdcorrect.fem.mesh_files import read_hex_mesh, write_vtu
@@ -52,6 +54,26 @@ def test_extra_fields_are_written(run, tmp_path):
     mesh = meshio.read(tmp_path / "run_0005.vtu")
     assert (mesh.point_data["error"] == 5.0).all()
     np.testing.assert_array_equal(mesh.cell_data["number"][0], np.arange(len(run.cells)) + 5)
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex27"])
+def test_the_stress_of_a_stretched_body_is_written_by_component(element, tmp_path):
+    problem = pc.discretise(
+        beam((2, 1, 1), clamps=[], loads=[], poisson=0.3, solver={"element": element})
+    )
+    F = np.eye(3) + 1e-4 * np.array([[1.0, 4.0, 6.0], [4.0, 2.0, 5.0], [6.0, 5.0, 3.0]])
+    moved = pc.State(problem.positions @ F.T, np.zeros_like(problem.positions))
+    run = pc.rollout(pc.Newton(problem), frames=0, state=moved)
+    write_vtu_series(run, tmp_path, stress_of=run.problem)
+    data = meshio.read(tmp_path / "run_0000.vtu").point_data
+    expected = 2 * problem.materials.mu[0] * 1e-4 * np.array([1, 2, 3, 4, 5, 6])
+    expected[:3] += problem.materials.volume_weight[0] / 3 * 6e-4
+    np.testing.assert_allclose(data["stress"], np.tile(expected, (len(run.points), 1)), rtol=3e-3)
+    shear = expected[:3] - expected[:3].mean()
+    invariant = np.sqrt(1.5 * ((shear**2).sum() + 2 * (expected[3:] ** 2).sum()))
+    np.testing.assert_allclose(data["von_mises"], invariant, rtol=3e-3)
+    write_vtu_series(run, tmp_path)
+    assert set(meshio.read(tmp_path / "run_0000.vtu").point_data) == {"displacement", "velocity"}
 
 
 def test_what_cannot_be_written_is_named(run, tmp_path):

@@ -26,11 +26,14 @@ _HOME = {
     "Trajectory": "pdcorrect.state",
     "Problem": "pdcorrect.fem.problem",
     "discretise": "pdcorrect.fem.problem",
+    "stress": "pdcorrect.fem.stress",
+    "modes": "pdcorrect.fem.modes",
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
     "Newton": "pdcorrect.solvers.newton",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
+    "reactions": "pdcorrect.solvers.reactions",
     "load_trajectory": "pdcorrect.io.trajectory",
     "save_trajectory": "pdcorrect.io.trajectory",
     "TrajectoryWriter": "pdcorrect.io.trajectory",
@@ -49,11 +52,14 @@ __all__ = [  # noqa: RUF022
     "Trajectory",
     "Problem",
     "discretise",
+    "stress",
+    "modes",
     "ProjectiveDynamics",
     "Newton",
     "rollout",
     "march",
     "restrict",
+    "reactions",
     "load_trajectory",
     "save_trajectory",
     "TrajectoryWriter",
@@ -71,13 +77,16 @@ __all__ = [  # noqa: RUF022
 if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report
     from pdcorrect.evaluate import compare
+    from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
+    from pdcorrect.fem.stress import stress
     from pdcorrect.figures import render
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
     from pdcorrect.io.vtk import write_vtu_series
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.newton import Newton
     from pdcorrect.solvers.projective import ProjectiveDynamics
+    from pdcorrect.solvers.reactions import reactions
     from pdcorrect.solvers.rollout import march, restrict, rollout
     from pdcorrect.state import State, Status, Stepper, StepResult, Trajectory
 

@@ -1,4 +1,4 @@
-"""Errors and invariants of trajectories, as pure functions of arrays.
+"""Errors, invariants and energies of trajectories, as pure functions of arrays.
 
 Positions are (T+1, N, 3) with frame 0 the common initial state; anything with a
 ``positions`` attribute is taken as well.  All runs of one comparison live on
@@ -7,12 +7,17 @@ the same nodes (see `restrict`).
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.errors import InputError
+
+if TYPE_CHECKING:
+    from pdcorrect.fem.problem import Problem
+    from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -111,3 +116,91 @@ def relative_drift(values: ArrayLike) -> float:
     array = array.reshape(len(array), -1)
     size = np.linalg.norm(array, axis=1).max()
     return float(np.linalg.norm(array - array[0], axis=1).max() / size) if size else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyBalance:
+    """Energies of each frame and what went in and out since frame 0, (T+1,) each, J.
+
+    Attributes
+    ----------
+    kinetic, elastic
+        At the frame.
+    external_work, clamp_work
+        Done on the body by the loads and by moving clamps.
+    damping_loss
+        Taken out by the scene's damping.
+    """
+
+    kinetic: Array
+    elastic: Array
+    external_work: Array
+    clamp_work: Array
+    damping_loss: Array
+
+    @property
+    def total(self) -> Array:
+        """Kinetic and elastic energy, (T+1,), J."""
+        return self.kinetic + self.elastic
+
+    @property
+    def dissipation(self) -> Array:
+        """What is missing, (T+1,), J: positive where the integrator has lost energy.
+
+        Zero for an exact solution.  It also holds what steps that are not solved
+        exactly and work integrated by one point a step leave over.
+        """
+        put_in = self.external_work + self.clamp_work - self.damping_loss
+        return self.total[0] + put_in - self.total
+
+
+def energy_balance(run: Trajectory, problem: Problem | None = None) -> EnergyBalance:
+    """Where the energy of a run has gone.
+
+    Parameters
+    ----------
+    run : Trajectory
+        With the statistics of `rollout`.
+    problem : Problem, optional
+        What was stepped, for the energies of frame 0, which statistics do not hold; the
+        run's own by default.  A run that starts at rest needs none.
+
+    Returns
+    -------
+    EnergyBalance
+
+    Raises
+    ------
+    InputError
+        If statistics are missing, or the energies of frame 0 are unknown.
+    """
+    missing = [name for name in _ENERGIES if name not in run.stats]
+    if missing and len(run):
+        raise InputError(
+            f"the run's statistics lack {', '.join(missing)}: expected those of rollout(...)."
+        )
+    start = _initial_energies(run, run.problem if problem is None else problem)
+    steps = {name: np.asarray(run.stats.get(name, ()), dtype=np.float64) for name in _ENERGIES}
+    sums = {name: np.concatenate([[0.0], np.cumsum(steps[name])]) for name in _ENERGIES[2:]}
+    return EnergyBalance(
+        *(np.concatenate([[e], steps[name]]) for e, name in zip(start, _ENERGIES[:2], strict=True)),
+        **sums,
+    )
+
+
+_ENERGIES = ("kinetic_energy", "elastic_energy", "external_work", "clamp_work", "damping_loss")
+"""Statistics of a step: energies after it, then work and loss in it."""
+
+
+def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, float]:
+    """Kinetic and elastic energy of frame 0, J."""
+    positions, velocities = run.positions[0], run.velocities[0]
+    if problem is not None:
+        kinetic = 0.5 * float(np.vdot(velocities, problem.mass_times(velocities)))
+        return kinetic, problem.energy(positions)
+    if velocities.any() or (positions != run.points).any():
+        raise InputError(
+            "the run has no problem and does not start at rest, so the energies of frame 0 are "
+            "unknown: expected energy_balance(run, problem)."
+        )
+    return 0.0, 0.0

@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, scratch, signed_svd_lanes
@@ -183,23 +183,26 @@ def nearest_unit_determinant(F: Array) -> Array:
     return scaled @ np.swapaxes(_from_lanes(V, shape), -1, -2)
 
 
-def energy_density(F: Array, mu: float, omega: float, energy: str = "corotated") -> Array:
-    """Psi(F), (...), J/m3, for F (..., 3, 3) and weights in Pa; ``energy`` as in `Material`."""
+def energy_density(F: Array, mu: ArrayLike, omega: ArrayLike, energy: str = "corotated") -> Array:
+    """Psi(F), (...), J/m3, for F (..., 3, 3); ``energy`` as in `Material`.
+
+    The weights ``mu`` and ``omega``, Pa, are numbers or arrays that broadcast to (...).
+    """
     return _density_and_stress(F, mu, omega, energy)[0]
 
 
-def first_piola(F: Array, mu: float, omega: float, energy: str = "corotated") -> Array:
-    """P = dPsi/dF, (..., 3, 3), Pa."""
+def first_piola(F: Array, mu: ArrayLike, omega: ArrayLike, energy: str = "corotated") -> Array:
+    """P = dPsi/dF, (..., 3, 3), Pa, for the arguments of `energy_density`."""
     return _density_and_stress(F, mu, omega, energy)[1]
 
 
 def elasticity(
-    F: Array, mu: float, omega: float, project: bool = False, energy: str = "corotated"
+    F: Array, mu: ArrayLike, omega: ArrayLike, project: bool = False, energy: str = "corotated"
 ) -> Array:
     """dP/dF, (..., 3, 3, 3, 3), Pa; ``project`` makes it positive semi-definite."""
     flat, shape = _to_lanes(F)
     U, s, V, _, _, v, k = _decompose(flat)
-    T, weights = np.empty((12, flat.shape[1])), _weights(mu, omega, flat.shape[1])
+    T, weights = np.empty((12, flat.shape[1])), _weights(mu, omega, shape)
     if energy_code(energy) == COROTATED:
         corotated_tangent_lanes(s, v, k, *weights, 0, T)
     else:
@@ -217,10 +220,12 @@ def elasticity(
     return out.reshape(*shape, 3, 3, 3, 3)
 
 
-def _density_and_stress(F: Array, mu: float, omega: float, energy: str) -> tuple[Array, Array]:
+def _density_and_stress(
+    F: Array, mu: ArrayLike, omega: ArrayLike, energy: str
+) -> tuple[Array, Array]:
     flat, shape = _to_lanes(F)
     U, s, V, _, _, v, k = _decompose(flat)
-    weights = _weights(mu, omega, flat.shape[1])
+    weights = _weights(mu, omega, shape)
     density, t, P = np.empty(flat.shape[1]), np.empty_like(s), np.empty_like(flat)
     if energy_code(energy) == COROTATED:
         corotated_lanes(s, v, k, *weights, 0, density, t)
@@ -230,8 +235,20 @@ def _density_and_stress(F: Array, mu: float, omega: float, energy: str) -> tuple
     return density.reshape(shape), _from_lanes(P, shape)
 
 
-def _weights(mu: float, omega: float, count: int) -> tuple[Array, Array]:
-    return np.full(count, float(mu)), np.full(count, float(omega))
+def _weights(mu: ArrayLike, omega: ArrayLike, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Both weights, one a matrix of F."""
+    return _spread("mu", mu, shape), _spread("omega", omega, shape)
+
+
+def _spread(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    try:
+        return np.broadcast_to(array, shape).flatten()
+    except ValueError:
+        raise InputError(
+            f"{name} has shape {array.shape}: expected a number, or a shape that broadcasts to "
+            f"F's {shape}."
+        ) from None
 
 
 def _decompose(flat: Array) -> tuple[Array, ...]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.mesh_files import write_vtu
+from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.stress import stress, von_mises
 from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
@@ -26,6 +28,7 @@ def write_vtu_series(
     name: str = "run",
     point_data: Data | None = None,
     cell_data: Data | None = None,
+    stress_of: Problem | None = None,
 ) -> Path:
     """Write ``name_0000.vtu`` … and ``name.pvd``; open the latter in ParaView.
 
@@ -42,6 +45,9 @@ def write_vtu_series(
         Write each such frame; frame 0 always.
     point_data, cell_data : callable, optional
         Frame -> fields (N, ...) or (C, ...).
+    stress_of : Problem, optional
+        What was stepped (``trajectory.problem``): adds the Cauchy stress averaged to the
+        points, ``stress`` (N, 6), Pa, as xx yy zz xy yz xz, and its ``von_mises`` (N,).
 
     Returns
     -------
@@ -73,6 +79,7 @@ def write_vtu_series(
             {
                 "displacement": trajectory.positions[frame] - trajectory.points,
                 "velocity": trajectory.velocities[frame],
+                **(_stresses(stress_of, trajectory.positions[frame]) if stress_of else {}),
                 **(point_data(frame) if point_data else {}),
             },
             cell_data(frame) if cell_data else None,
@@ -88,3 +95,12 @@ def write_vtu_series(
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
     return path
+
+
+def _stresses(problem: Problem, positions: Array) -> dict[str, Array]:
+    """Fields of the stress at the points; a symmetric tensor in ParaView's order."""
+    cauchy = stress(problem, positions).nodal_cauchy
+    return {
+        "stress": cauchy[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
+        "von_mises": von_mises(cauchy),
+    }

@@ -124,16 +124,18 @@ def midpoint(problem: Problem, state: State, h: float) -> Stage:
     Second order, symplectic; keeps linear and angular momentum.
     """
     p, v, end = state.positions, state.velocities, state.time + h
-    target = p + 0.5 * h * v
-    clamped = 0.5 * (p + problem.clamped_positions(end))
+    ahead = p + 0.5 * h * v
+    prescribed = problem.clamped_positions(end)
+    clamped, mean = 0.5 * (p + prescribed), (prescribed - p) / h
+    held = clamped - 0.25 * h * (mean - v)  # their acceleration is (mean - v)/h
 
     def finish(y: Array) -> State:
         velocities = np.where(problem.free, (4.0 / h) * (y - p) - v, (2.0 / h) * (y - p))
         return State(2.0 * y - p, velocities, end)
 
     return Stage(
-        4.0 / h**2, target, 2.0 / h, p, np.where(problem.free, target, clamped),
-        (state.time, end), target, finish, 2.0,
+        4.0 / h**2, np.where(problem.free, ahead, held), 2.0 / h, p,
+        np.where(problem.free, ahead, clamped), (state.time, end), ahead, finish, 2.0,
     )  # fmt: skip
 
 
@@ -164,15 +166,18 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
             velocity = np.where(problem.free, ahead(new), (position - p) / h)
             return State(position, velocity, end, {"accelerations": new * problem.free})
 
+        inertia = (1.0 - alpha_m) * scale
+        free, prescribed = problem.free, problem.clamped_positions(end)
+        clamped, mean = alpha_f * p + (1.0 - alpha_f) * prescribed, (prescribed - p) / h
+        start = p + (1.0 - alpha_f) * h * v
         target = p - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale
-        clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
+        held = clamped - (mean - v) / (h * inertia)  # their acceleration is (mean - v)/h
+        origin = p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate
+        moved = clamped - ((1.0 - alpha_f) * mean + alpha_f * v) / rate
         time = state.time + (1.0 - alpha_f) * h
         return Stage(
-            (1.0 - alpha_m) * scale, target, rate,
-            p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate,
-            np.where(problem.free, p + (1.0 - alpha_f) * h * v, clamped),
-            (time, time), p + (1.0 - alpha_f) * h * v, finish,
-            1.0 / (1.0 - alpha_f),
+            inertia, np.where(free, target, held), rate, np.where(free, origin, moved),
+            np.where(free, start, clamped), (time, time), start, finish, 1.0 / (1.0 - alpha_f),
         )  # fmt: skip
 
     return stage
@@ -187,16 +192,27 @@ def quasi_static(problem: Problem, state: State, h: float) -> Stage:
     )  # fmt: skip
 
 
-def accelerations(problem: Problem, state: State) -> Array:
-    """M^-1 (f_int + f_ext - C v) at a state, (N, 3), m/s2; zero where clamped."""
+def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:
+    """f_int + f_ext - C v at a state, (N, 3), N, without the clamps' forces.
+
+    ``forces`` (N, 3), N, act besides the scene's loads.
+    """
     damping = problem.scene.damping
-    force = problem.forces(state.positions)
-    force += problem.external_forces(state.time, None, state.positions)
+    out = problem.forces(state.positions)
+    out += problem.external_forces(state.time, None, state.positions)
+    if forces is not None:
+        out += forces
     if damping.mass:
-        force -= damping.mass * problem.mass_times(state.velocities)
+        out -= damping.mass * problem.mass_times(state.velocities)
     if damping.stiffness:
         K = problem.stiffness(state.positions, project=True)
-        force -= damping.stiffness * (K @ state.velocities.ravel()).reshape(force.shape)
+        out -= damping.stiffness * (K @ state.velocities.ravel()).reshape(out.shape)
+    return out
+
+
+def accelerations(problem: Problem, state: State, forces: Array | None = None) -> Array:
+    """M^-1 `forces_at` a state, (N, 3), m/s2; zero where clamped."""
+    force = forces_at(problem, state, forces)
     out = np.zeros_like(force)
     for i in range(3):
         nodes = np.flatnonzero(problem.free[:, i])

@@ -1,0 +1,99 @@
+"""Natural frequencies and mode shapes of small vibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.factorisation import NotPositiveDefinite, factorise
+from pdcorrect.fem.problem import Problem
+
+Array = NDArray[np.float64]
+
+_SHIFT = 1e-8
+"""Of the largest ratio of stiffness to mass of a component: how far below zero the search
+starts.  Large enough to factorise a body without clamps, and small beside any frequency of
+bending that the mesh resolves; the results do not depend on it."""
+
+
+class Modes(NamedTuple):
+    """Modes of vibration, lowest frequency first.
+
+    Attributes
+    ----------
+    frequencies : (count,)
+        Hz.
+    shapes : (count, N, 3)
+        Displacements u, zero where clamped, with u . M u = 1 (so in kg^-1/2).
+    """
+
+    frequencies: Array
+    shapes: Array
+
+
+def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> Modes:
+    """The lowest modes: K u = (2 pi f)^2 M u on the free components, without damping.
+
+    K is the tangent stiffness of the elastic energy with internal modes in equilibrium, M the
+    problem's own mass matrix; loads are dead.  A body without clamps has six modes of about
+    0 Hz at rest.
+
+    Parameters
+    ----------
+    problem : Problem
+    count : int
+        How many.
+    positions : (N, 3), optional
+        Where to linearise, m: an equilibrium under load, say; at rest by default.
+
+    Returns
+    -------
+    Modes
+
+    Raises
+    ------
+    InputError
+        If ``count`` is not below the number of free components.
+    ConvergenceError
+        If K has negative eigenvalues: the positions are no stable equilibrium.
+    """
+    at = problem.positions if positions is None else positions
+    free = np.flatnonzero(problem.free)
+    _check(count, len(free))
+    K = problem.stiffness(at)[free][:, free]
+    M = sp.csr_matrix(sp.kron(problem.mass_matrix, sp.eye_array(3)))[free][:, free]
+    shift = _SHIFT * float((K.diagonal() / M.diagonal()).max())
+    inverse = spla.LinearOperator(K.shape, matvec=_inverse(K + shift * M), dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=len(free))  # for the same digits every time
+    values, vectors = spla.eigsh(K, count, M, sigma=-shift, OPinv=inverse, v0=start)
+    order = np.argsort(values)
+    shapes = np.zeros((count, problem.free.size))
+    shapes[:, free] = vectors[:, order].T
+    frequencies = np.sqrt(np.maximum(values[order], 0.0)) / (2.0 * np.pi)
+    return Modes(frequencies, shapes.reshape(count, -1, 3))
+
+
+def _inverse(matrix: sp.csr_matrix) -> Callable[[Array], Array]:
+    try:
+        return factorise(matrix, unknowns=3).solve
+    except NotPositiveDefinite as error:
+        raise ConvergenceError(
+            f"the tangent stiffness is not positive semi-definite ({error}): expected positions "
+            "in stable equilibrium. Give those of a quasi-static run, or none for the body at "
+            "rest."
+        ) from None
+
+
+def _check(count: int, size: int) -> None:
+    whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
+    if not whole or not 1 <= count < size:
+        raise InputError(
+            f"count = {count!r}: expected a whole number from 1 to {size - 1}, fewer than the "
+            "free components."
+        )
