@@ -50,7 +50,7 @@ def test_a_resumed_run_equals_the_uninterrupted_one_bit_by_bit(integrator, stop)
         return pc.ProjectiveDynamics(problem, first_hessian="lagged")
 
     whole = pc.rollout(stepper(), 12)
-    assert 0 < whole.stats["hessian_age"].max()
+    assert whole.stats["hessian_age"].max() > 0
     first = pc.rollout(stepper(), stop)
     again = stepper()
     rest = pc.rollout(again, 12 - stop, state=continue_from(again, first))

@@ -420,9 +420,10 @@ def test_another_run_is_not_continued(program, scene_file, tmp_path):
 def test_a_stepper_is_told_of_the_run_that_it_continues(program, scene_file, tmp_path, monkeypatch):
     path, expected = tmp_path / "run.h5", tmp_path / "expected.h5"
     told = []
-    real = pc.ProjectiveDynamics.__call__
+    real, real_restore = pc.ProjectiveDynamics.__call__, pc.ProjectiveDynamics.restore
 
     def restore(self, run):
+        real_restore(self, run)
         told.append(run)
         self.taken = len(run)
 
@@ -431,7 +432,7 @@ def test_a_stepper_is_told_of_the_run_that_it_continues(program, scene_file, tmp
         result = real(self, state, np.full_like(state.positions, 1e-3 * self.taken))
         return dataclasses.replace(result, stats={**result.stats, "taken": float(self.taken)})
 
-    monkeypatch.setattr(pc.ProjectiveDynamics, "restore", restore, raising=False)
+    monkeypatch.setattr(pc.ProjectiveDynamics, "restore", restore)
     monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", adaptive)
     program("simulate", scene_file, "-o", expected)
     program("simulate", scene_file, "-o", path, "--frames", 5)

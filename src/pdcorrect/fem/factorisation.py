@@ -29,7 +29,7 @@ Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
 
 _AMG_TOLERANCE = 1e-12
 _AMG_STEPS = 500
-_MEMORY_SHARE = 0.5
+MEMORY_SHARE = 0.5
 """Share of the free memory that a factor may be expected to take."""
 
 
@@ -149,7 +149,8 @@ def factorise(matrix: sp.spmatrix, backend: Backend = "auto", unknowns: int = 1)
     matrix : (n, n) sparse
     backend : {"auto", "cholespy", "splu", "amg"}
         "auto" takes a direct factor where it is expected to fit into memory
-        (cholespy if installed), otherwise multigrid.
+        (cholespy if installed), otherwise multigrid; so does "band", which is a
+        choice for tangents only (`BandOrder`).
     unknowns : int
         For each node: 1 for G, 3 for a tangent.
 
@@ -159,15 +160,15 @@ def factorise(matrix: sp.spmatrix, backend: Backend = "auto", unknowns: int = 1)
         If a pivot is not positive.
     """
     check_backend(backend)
-    if backend == "auto":
+    if backend in ("auto", "band"):
         backend = choose_backend(matrix.shape[0], unknowns)
     return _BACKENDS[backend](sp.csc_matrix(matrix))
 
 
 def check_backend(backend: str) -> None:
-    """Refuse a name that is none of the back ends or "auto"."""
-    if backend != "auto" and backend not in _BACKENDS:
-        raise InputError(f"backend {backend!r}: expected auto, {', '.join(_BACKENDS)}.")
+    """Refuse a name that is none of the back ends, "band" (for tangents) or "auto"."""
+    if backend not in ("auto", "band", *_BACKENDS):
+        raise InputError(f"backend {backend!r}: expected auto, band, {', '.join(_BACKENDS)}.")
 
 
 def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) -> Backend:
@@ -176,7 +177,7 @@ def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) ->
     ``memory`` (bytes) defaults to what is available.
     """
     memory = available_memory() if memory is None else memory
-    if factor_bytes(size, unknowns) > _MEMORY_SHARE * memory:
+    if factor_bytes(size, unknowns) > MEMORY_SHARE * memory:
         return "amg"
     return "cholespy" if importlib.util.find_spec("cholespy") else "splu"
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.factorisation import Backend
-from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory, TangentSolver
 
@@ -22,13 +20,12 @@ class LaggedHessian:
     A factor's first step needs the fewest iterations; what later steps need more is
     its loss.  When the losses since the last factorisation add up to the cost of one,
     it is time for the next: this keeps the total within twice the best possible.  The
-    rule counts iterations, not seconds, so runs can be repeated exactly.
+    rule counts iterations, not seconds, and a state that does not continue the run at
+    hand gets a new factor, so runs can be repeated exactly.
 
     Parameters
     ----------
-    problem : Problem
-    backend : str
-        See `TangentFactory`.
+    tangents : TangentFactory
 
     Attributes
     ----------
@@ -37,19 +34,20 @@ class LaggedHessian:
         `INSIDE` if that was not at the start of a step.
     """
 
-    def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
-        self._problem = problem
+    def __init__(self, tangents: TangentFactory) -> None:
+        self.tangents = tangents
+        self._problem = tangents.problem
         self._factors = (0.0, 0.0)
-        self.tangents = TangentFactory(problem, backend)
         self._cost = self.tangents.factor_cost
         self._solver: TangentSolver | None = None
+        self._time = 0.0
         self.age = INSIDE
         self._counts: list[int] = []
 
     def solver(self, objective: StepObjective) -> TangentSolver:
         """The factor for the step that ``objective`` belongs to."""
-        stale = self.age == INSIDE or objective.factors != self._factors or self._spent()
-        if self._solver is None or stale:
+        other = objective.factors != self._factors or objective.state.time != self._time
+        if self._solver is None or self.age == INSIDE or other or self._spent():
             return self._renew(objective, self._problem.relaxed(objective.state.positions), 0)
         self.age += 1
         return self._solver
@@ -63,18 +61,20 @@ class LaggedHessian:
         self._factors, self.age, self._counts = objective.factors, age, []
         return self._solver
 
-    def note(self, iterations: int) -> None:
-        """What the step took."""
+    def note(self, iterations: int, time: float) -> None:
+        """What the step took, and the time that it led to (s)."""
         self._counts.append(iterations)
+        self._time = time
 
-    def restore(self, age: int, counts: list[int], objective: StepObjective) -> None:
+    def restore(self, age: int, counts: list[int], objective: StepObjective, time: float) -> None:
         """Take up a factor made ``age`` steps before the last one, in the step of ``objective``.
 
-        ``counts`` are the iterations of that step and of those since.
+        ``counts`` are the iterations of that step and of those since; ``time`` (s) is
+        where the run goes on.
         """
         if age != INSIDE:
             self._renew(objective, self._problem.relaxed(objective.state.positions), age)
-            self._counts = counts
+            self._counts, self._time = counts, time
 
     def _spent(self) -> bool:
         fewest = min(self._counts, default=0)

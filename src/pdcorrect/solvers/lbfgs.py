@@ -99,18 +99,18 @@ class History:
     """The pairs (s, z = G^-1 y) and the small matrices of the compact form.
 
     Only S, Z, R^-1, D and Y Z^T are kept; products with Y follow from those with
-    Z, because y_i . x = z_i . g for x = G^-1 g.
+    Z, because y_i . x = z_i . g for x = G^-1 g.  A new pair overwrites the oldest
+    one's rows of S and Z; ``_rows`` says where the pairs are, from old to new.
     """
 
     def __init__(self, size: int, length: int) -> None:
-        self._capacity = size
         self._s = np.empty((size, length))
         self._z = np.empty((size, length))
         self.clear()
 
     def clear(self) -> None:
         """Forget all pairs."""
-        self._count = 0
+        self._rows = np.empty(0, dtype=np.intp)
         self._r_inverse = np.empty((0, 0))
         self._d = np.empty(0)
         self._yz = np.empty((0, 0))
@@ -118,64 +118,67 @@ class History:
         self._zg = np.empty(0)
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._rows)
 
     def direction(self, gradient: Array, x: Array) -> Array:
         """-H g for the gradient (n,) whose products `observe` or `append` took last."""
-        m = self._count
+        m = len(self)
         if m == 0:
             return -x
         w = self._r_inverse @ self._sg
-        c = self._r_inverse.T @ (self._d * w + self._yz @ w - self._zg)
-        out = w @ self._z[:m]
-        out -= c @ self._s[:m]
+        weights = np.empty((2, m))
+        weights[0, self._rows] = self._r_inverse.T @ (self._d * w + self._yz @ w - self._zg)
+        weights[1, self._rows] = w
+        out = weights[1] @ self._z[:m]
+        out -= weights[0] @ self._s[:m]
         out -= x
         return out
 
     def observe(self, gradient: Array) -> None:
         """Take the products of the stored pairs with a gradient."""
-        self._sg = self._s[: self._count] @ gradient
-        self._zg = self._z[: self._count] @ gradient
+        m = len(self)
+        self._sg = (self._s[:m] @ gradient)[self._rows]
+        self._zg = (self._z[:m] @ gradient)[self._rows]
 
     def append(self, step: Array, change: Array, gradient: Array, new_gradient: Array) -> None:
         """Add s = ``step``, z = ``change`` of G^-1 g, for the move between two gradients.
 
         A pair without positive curvature is not stored.
         """
-        y_s = float(step @ new_gradient - step @ gradient)
-        y_z = float(change @ new_gradient - change @ gradient)
+        s_new, z_new = float(step @ new_gradient), float(change @ new_gradient)
+        y_s, y_z = s_new - float(step @ gradient), z_new - float(change @ gradient)
         old_sg, old_zg = self._sg, self._zg
         self.observe(new_gradient)
         if not (y_s > 1e-12 * math.sqrt(abs(y_z) * abs(float(step @ step))) and y_z > 0):
             return
         s_y, z_y = self._sg - old_sg, self._zg - old_zg
-        if self._count == self._capacity:
+        row = len(self)
+        if row == len(self._s):
+            row = int(self._rows[0])
             self._drop_oldest()
             s_y, z_y = s_y[1:], z_y[1:]
-        m = self._count
-        self._s[m], self._z[m] = step, change
+        self._s[row], self._z[row] = step, change
+        m = len(self)
         r_inverse = np.zeros((m + 1, m + 1))
         r_inverse[:m, :m] = self._r_inverse
-        r_inverse[:m, m] = -(self._r_inverse @ s_y) / y_s
+        r_inverse[:m, m] = (self._r_inverse @ s_y) / -y_s
         r_inverse[m, m] = 1.0 / y_s
         yz = np.empty((m + 1, m + 1))
         yz[:m, :m] = self._yz
         yz[m, :m] = yz[:m, m] = z_y
         yz[m, m] = y_z
         self._r_inverse, self._yz = r_inverse, yz
+        self._rows = np.append(self._rows, row)
         self._d = np.append(self._d, y_s)
-        self._sg = np.append(self._sg, step @ new_gradient)
-        self._zg = np.append(self._zg, change @ new_gradient)
-        self._count = m + 1
+        self._sg = np.append(self._sg, s_new)
+        self._zg = np.append(self._zg, z_new)
 
     def _drop_oldest(self) -> None:
         """R is upper triangular, so the inverse of its trailing part is the trailing part."""
-        self._s[:-1] = self._s[1:]
-        self._z[:-1] = self._z[1:]
+        self._rows = self._rows[1:]
         self._r_inverse = self._r_inverse[1:, 1:]
         self._d, self._yz = self._d[1:], self._yz[1:, 1:]
         self._sg, self._zg = self._sg[1:], self._zg[1:]
-        self._count -= 1
 
 
 def minimise(

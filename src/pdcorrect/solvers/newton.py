@@ -55,14 +55,13 @@ class Newton(ImplicitStepper):
             self._options, max_iterations=whole("max_iterations", max_iterations)
         )
         self._tangents = TangentFactory(problem, backend)
-        self._used_backend = "none yet"
 
     def _prepare(self, objective: StepObjective) -> None:
         _, gradient = objective.value_and_gradient(objective.start)
         self._direction(objective, objective.start, gradient)
 
     def _factorisation(self) -> str:
-        return self._used_backend
+        return self._tangents.backend
 
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
         return newton_loop(
@@ -75,5 +74,4 @@ class Newton(ImplicitStepper):
             solver, exact = self._tangents.factorise(objective, p)
         except NotPositiveDefinite:
             return np.zeros_like(p), False  # no descent: the line search says so
-        self._used_backend = solver.backend
         return -solver(g), exact

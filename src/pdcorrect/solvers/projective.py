@@ -25,6 +25,11 @@ FirstHessian = Literal["auto", "G", "G-scaled", "lagged"]
 
 _PATIENCE = 40
 """Iterations with one lagged Hessian before it is renewed within the step."""
+_DEAREST = 3.0
+"""Cost of an iteration with a band factor, in iterations with G, up to which it is the default.
+
+It takes a third to a tenth of the iterations (``benchmarks``, case first_hessian).
+"""
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
@@ -98,9 +103,9 @@ class ProjectiveDynamics(ImplicitStepper):
         self.first_hessian = "G" if method == "local-global" else first_hessian
         self._lagged: LaggedHessian | None = None
         if self.first_hessian in ("auto", "lagged"):
-            lagged = LaggedHessian(problem, backend)
-            if first_hessian == "lagged" or lagged_pays(lagged.tangents):
-                self._lagged = lagged
+            tangents = TangentFactory(problem, backend)
+            if first_hessian == "lagged" or lagged_pays(tangents):
+                self._lagged = LaggedHessian(tangents)
         plain = method == "local-global"
         limit = (20000 if plain else 1000) if max_iterations is None else max_iterations
         self._options = replace(
@@ -126,10 +131,12 @@ class ProjectiveDynamics(ImplicitStepper):
         state = run.state(made)
         objective = self._objective(state, None, self.time_step, self._integrator)
         counts = [int(n) for n in run.stats["iterations"][made:]]
-        self._lagged.restore(age, counts, objective)
+        self._lagged.restore(age, counts, objective, run.state(-1).time)
 
     def _factorisation(self) -> str:
-        return "band" if self._lagged is not None else super()._factorisation()
+        if self._lagged is not None:
+            return self._lagged.tangents.backend
+        return super()._factorisation()
 
     def _volume_scale(self) -> float:
         return 1.0 if self.first_hessian == "G" else VOLUME_SCALE
@@ -144,7 +151,7 @@ class ProjectiveDynamics(ImplicitStepper):
         result = super()._step(state, forces, h)
         if self._lagged is None:
             return result
-        self._lagged.note(result.iterations)
+        self._lagged.note(result.iterations, result.state.time)
         return replace(result, stats={**result.stats, "hessian_age": float(self._lagged.age)})
 
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
@@ -170,7 +177,7 @@ class ProjectiveDynamics(ImplicitStepper):
 
 def lagged_pays(tangents: TangentFactory) -> bool:
     """Whether a factor of the true Hessian is small and quick enough to be the default."""
-    return True
+    return tangents.backend == "band" and tangents.iteration_cost < _DEAREST
 
 
 def _after(earlier: Minimum, later: Minimum) -> Minimum:

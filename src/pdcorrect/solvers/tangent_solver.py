@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.banded import BandOrder
-from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
+from pdcorrect.fem.factorisation import (
+    MEMORY_SHARE,
+    Backend,
+    Factor,
+    NotPositiveDefinite,
+    available_memory,
+    factorise,
+)
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.step import StepObjective
@@ -29,28 +36,46 @@ class TangentFactory:
     ----------
     problem : Problem
     backend : str
-        See `factorise`; "auto" is a band where that fits into memory.
+        See `factorise`; "auto" is a band where that fits into memory, else multigrid.
+
+    Attributes
+    ----------
+    backend : str
+        The one in use.
     """
 
     def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
         self.problem = problem
         self.order = BandOrder(problem.positions, problem.cells, problem.free)
-        self._backend = backend
+        fits = self.order.factor_bytes < MEMORY_SHARE * available_memory()
+        self.backend = ("band" if fits else "amg") if backend == "auto" else backend
         self._nodes = Assembly(problem.cells, len(problem.positions))
         self._free = np.flatnonzero(problem.free.ravel())
 
     @property
-    def factor_cost(self) -> float:
-        """Cost of a factorisation in iterations of L-BFGS with it, estimated by size.
+    def iteration_cost(self) -> float:
+        """Cost of an iteration of L-BFGS with a band factor, in iterations with G."""
+        return 1.0 + self._solve_seconds / self._other_seconds
 
-        From measured speeds (``benchmarks``, case tangent_factors); only their ratio
-        matters.
+    @property
+    def factor_cost(self) -> float:
+        """Cost of a band factorisation in iterations of L-BFGS with it."""
+        rows, band = self.order.rows, self.order.bandwidth
+        assembly = 1e-3 + 6e-6 * len(self.problem.cells) + 2e-9 * rows * band
+        seconds = assembly + 1e-10 * self.order.factor_flops
+        return seconds / (self._other_seconds + self._solve_seconds)
+
+    @property
+    def _other_seconds(self) -> float:
+        """An iteration without its solve; estimates by size, of which only ratios matter.
+
+        From measured speeds (``benchmarks``, case tangent_factors).
         """
-        cells, rows, band = len(self.problem.cells), self.order.rows, self.order.bandwidth
-        points = self.problem.quadrature.weights.size
-        iteration = 1e-4 + 1.2e-7 * points + 3.5e-9 * rows * band
-        factor = 1e-3 + 1.2e-5 * cells + 1e-10 * self.order.factor_flops + 2e-9 * rows * band
-        return factor / iteration
+        return 1e-4 + 1.2e-7 * self.problem.quadrature.weights.size
+
+    @property
+    def _solve_seconds(self) -> float:
+        return 3.5e-9 * self.order.rows * self.order.bandwidth
 
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
         """A factor of the Hessian at a configuration, and whether it is the exact one.
@@ -83,7 +108,7 @@ class TangentFactory:
             modes = Condensed(blocks, self.problem.space.local, self.problem.cells.shape[1])
             blocks = modes.blocks
         mass_factor = objective.factors[0]
-        if self._backend in ("auto", "band"):
+        if self.backend == "band":
             band = self.order.assemble(blocks, self.problem.mass_matrix, mass_factor)
             band[:, 0] += shift * band[:, 0].max()
             return TangentSolver(self.problem, self.order.factorise(band), None, modes)
@@ -93,7 +118,7 @@ class TangentFactory:
         if shift:
             matrix = matrix + shift * matrix.diagonal().max() * sp.eye_array(matrix.shape[0])
         matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
-        factor = factorise(matrix, self._backend, unknowns=3)
+        factor = factorise(matrix, self.backend, unknowns=3)
         return TangentSolver(self.problem, factor, self._free, modes)
 
 
