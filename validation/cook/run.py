@@ -1,0 +1,112 @@
+"""Cook's membrane: convergence of the elements in plane stress, plane strain and finite strain."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+import pdcorrect as pc
+
+THICKNESS = 0.5
+CORNER, MIDDLE = (48.0, 60.0, 0.0), (48.0, 52.0, 0.0)
+SIZES = (2, 4, 8, 16, 32)
+"""Cells along each edge."""
+
+
+def membrane(
+    n: int, element: str, material: dict[str, Any], load: float, flat: bool, ramp: float = 0.0
+) -> pc.Problem:
+    """Mesh of n x n x 1 cells with the force ``load`` (N) for each metre of thickness.
+
+    ``flat`` holds z on both faces (plane strain), otherwise on one only (plane stress).
+    """
+    faces = ["min", "max"] if flat else ["min"]
+    clamps: list[dict[str, Any]] = [
+        {"region": {"plane": "z", "at": at}, "components": ["z"]} for at in faces
+    ]
+    clamps.append({"region": {"plane": "x", "at": "min"}, "components": ["x", "y"]})
+    traction = {
+        "kind": "traction",
+        "traction": [0.0, load / 16, 0.0],
+        "region": {"plane": "x", "at": "max"},
+        "ramp": ramp,
+    }
+    return common.mapped_block(
+        (n, n, 1), _place, element, clamps=clamps, loads=[traction], time=common.STATIC,
+        material={"density": 1.0, **material},
+    )  # fmt: skip
+
+
+def _place(unit: np.ndarray) -> np.ndarray:
+    x, y, z = unit.T
+    low, height = 44 * x, 44 - 28 * x
+    return np.column_stack([48 * x, low + height * y, THICKNESS * z])
+
+
+def lift(problem: pc.Problem, point: tuple[float, float, float], steps: int = 1) -> float:
+    """Vertical displacement of the node at a point, m."""
+    node = common.nearest(problem, point)
+    moved = common.equilibrium(problem, steps)[node] - problem.positions[node]
+    return float(moved[1])
+
+
+def plane_stress(n: int, element: str) -> float:
+    """Lift of the loaded edge's middle for E = 1, nu = 1/3, unit force and thickness."""
+    load = 2e-4
+    material = {"young": 1.0, "poisson": 1 / 3}
+    return lift(membrane(n, element, material, load, flat=False), MIDDLE) / load
+
+
+def plane_strain(n: int, element: str, poisson: float = 1 / 3) -> float:
+    """Lift of the corner for E = 70 and force 100, by the slope at a small force."""
+    load = 0.02
+    material = {"young": 70.0, "poisson": poisson}
+    return lift(membrane(n, element, material, load, flat=True), CORNER) * 100 / load
+
+
+def incompressible(n: int, element: str) -> float:
+    """The same for nu = 0.4999."""
+    return plane_strain(n, element, 0.4999)
+
+
+def finite_strain(n: int, element: str, steps: int = 5) -> float:
+    """Lift of the corner for E = 240.565 at the full force; NaN without a stable equilibrium."""
+    material = {"young": 240.565, "poisson": 0.4999, "energy": "neo-hookean"}
+    problem = membrane(n, element, material, 100.0, flat=True, ramp=float(steps))
+    try:
+        return lift(problem, CORNER, steps)
+    except RuntimeError:
+        return float("nan")
+
+
+PROBLEMS = {
+    "plane stress": plane_stress,
+    "plane strain": plane_strain,
+    "near incompressible": incompressible,
+    "neo-Hookean": finite_strain,
+}
+
+
+def compute(
+    problems: Sequence[str] = tuple(PROBLEMS),
+    elements: Sequence[str] = common.ELEMENTS,
+    sizes: Sequence[int] = SIZES,
+) -> common.Figures:
+    """Lifts by problem, element and cells along an edge."""
+    figures: common.Figures = {}
+    for problem in problems:
+        for element in elements:
+            for n in sizes:
+                figures[f"{problem}, {element}, {n}x{n}"] = PROBLEMS[problem](n, element)
+    return figures
+
+
+if __name__ == "__main__":
+    sys.exit(common.finish(Path(__file__).parent, compute()))
