@@ -124,16 +124,17 @@ def midpoint(problem: Problem, state: State, h: float) -> Stage:
     Second order, symplectic; keeps linear and angular momentum.
     """
     p, v, end = state.positions, state.velocities, state.time + h
-    target = p + 0.5 * h * v
-    clamped = 0.5 * (p + problem.clamped_positions(end))
+    free = problem.free
+    start = np.where(free, p + 0.5 * h * v, 0.5 * (p + problem.clamped_positions(end)))
+    clamp_velocity = _clamp_velocity(problem, end, h)
+    target = np.where(free, start, start - 0.25 * h * (clamp_velocity - v))
 
     def finish(y: Array) -> State:
-        velocities = np.where(problem.free, (4.0 / h) * (y - p) - v, (2.0 / h) * (y - p))
+        velocities = np.where(free, (4.0 / h) * (y - p) - v, clamp_velocity)
         return State(2.0 * y - p, velocities, end)
 
     return Stage(
-        4.0 / h**2, target, 2.0 / h, p, np.where(problem.free, target, clamped),
-        (state.time, end), target, finish, 2.0,
+        4.0 / h**2, target, 2.0 / h, p, start, (state.time, end), p + 0.5 * h * v, finish, 2.0
     )  # fmt: skip
 
 
@@ -160,17 +161,27 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
 
         def finish(y: Array) -> State:
             new = at_rest + scale * (y - p)
-            position = p + (y - p) / (1.0 - alpha_f)
-            velocity = np.where(problem.free, ahead(new), (position - p) / h)
-            return State(position, velocity, end, {"accelerations": new * problem.free})
+            velocity = np.where(free, ahead(new), clamp_velocity)
+            return State(
+                p + (y - p) / (1.0 - alpha_f), velocity, end, {"accelerations": new * free}
+            )
 
+        free, time = problem.free, state.time + (1.0 - alpha_f) * h
+        inertia = (1.0 - alpha_m) * scale
         target = p - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale
+        origin = p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate
         clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
-        time = state.time + (1.0 - alpha_f) * h
+        clamp_velocity = _clamp_velocity(problem, end, h)
+        acceleration = (clamp_velocity - v) / h  # mean over the step, moved to y's time:
+        if state.memory:
+            acceleration += _clamp_acceleration(problem, time, h)
+            acceleration -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
         return Stage(
-            (1.0 - alpha_m) * scale, target, rate,
-            p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate,
-            np.where(problem.free, p + (1.0 - alpha_f) * h * v, clamped),
+            inertia,
+            np.where(free, target, clamped - acceleration / inertia),
+            rate,
+            np.where(free, origin, clamped - _clamp_velocity(problem, time, h) / rate),
+            np.where(free, p + (1.0 - alpha_f) * h * v, clamped),
             (time, time), p + (1.0 - alpha_f) * h * v, finish,
             1.0 / (1.0 - alpha_f),
         )  # fmt: skip
@@ -185,6 +196,27 @@ def quasi_static(problem: Problem, state: State, h: float) -> Stage:
     return Stage(
         0.0, p, 0.0, p, start, (end, end), p, lambda y: State(y, np.zeros_like(y), end)
     )  # fmt: skip
+
+
+def _clamp_velocity(problem: Problem, time: float, h: float) -> Array:
+    """Velocity of the prescribed positions by central differences, (N, 3), m/s.
+
+    Inertia of clamped nodes acts on others through a mass matrix that is not diagonal.
+    Velocities that only satisfy an integrator's own recursion would ring, as nothing damps
+    them, and one-sided differences, put into that recursion, double the acceleration.
+    """
+    if not problem.clamps.moving:
+        return np.zeros_like(problem.positions)
+    ahead, behind = problem.clamped_positions(time + h), problem.clamped_positions(time - h)
+    return (ahead - behind) / (2.0 * h)
+
+
+def _clamp_acceleration(problem: Problem, time: float, h: float) -> Array:
+    """Acceleration of the prescribed positions by central differences, (N, 3), m/s2."""
+    if not problem.clamps.moving:
+        return np.zeros_like(problem.positions)
+    places = [problem.clamped_positions(time + k * h) for k in (-1, 0, 1)]
+    return (places[0] - 2.0 * places[1] + places[2]) / h**2
 
 
 def accelerations(problem: Problem, state: State) -> Array:
