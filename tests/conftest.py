@@ -1,9 +1,18 @@
-"""Scenes that several tests share; all asymmetric on purpose."""
+"""Scenes and meshes that several tests share; all asymmetric on purpose."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pdcorrect as pc
+from pdcorrect.fem.materials import Materials
+from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
+from pdcorrect.fem.operators import Space
+from pdcorrect.fem.problem import _build
+from pdcorrect.fem.selection import Selector
+
+ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
 
 CLAMPED = [{"region": {"plane": "x", "at": 0.0}}]
 GRAVITY = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
@@ -39,6 +48,39 @@ def cross(poisson=0.45, **changes):
             **changes,
         },
     )
+
+
+def box_mesh(counts, size, distortion=0.0, seed=0):
+    """A box of hexahedra; inner nodes moved at random by up to ``distortion`` cells."""
+    mesh = voxel_mesh(np.ones(counts, dtype=bool), (0, 0, 0), 1.0)
+    x = mesh.positions
+    inside = ((x > 0) & (x < counts)).all(axis=1)
+    moves = np.random.default_rng(seed).uniform(-distortion, distortion, x.shape)
+    return HexMesh.create((x + moves * inside[:, None]) * np.divide(size, counts), mesh.cells)
+
+
+def problem_on(mesh, element="hex8", **changes):
+    """A free body without loads on any mesh, which no scene shape makes."""
+    scene = beam(**{"clamps": [], "loads": [], **changes}).with_changes(solver={"element": element})
+    space = Space(mesh, element)
+    cell_size = float(np.cbrt(space.volumes().mean()))
+    selector = Selector(mesh, space.positions, cell_size)
+    materials = Materials.from_scene(scene, selector, len(mesh.cells))
+    return _build(scene, 1, mesh, space, space.quadrature(), materials, cell_size)
+
+
+def boundary_nodes(problem):
+    """Numbers of all nodes on the surface, those of edges and faces included."""
+    faces = problem.space.face_quadrature(boundary_faces(problem.mesh.cells)[0])
+    touched = np.abs(faces.values).max(axis=1) > 1e-9
+    return np.unique(problem.cells[faces.cells][touched])
+
+
+def held(problem, nodes, positions):
+    """The same problem with ``nodes`` held at their rows of ``positions`` (N, 3)."""
+    free = np.ones_like(problem.free)
+    free[nodes] = False
+    return replace(problem, clamps=replace(problem.clamps, free=free, rest=positions))
 
 
 def disturbed(problem, amplitude, seed=0):

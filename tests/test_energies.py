@@ -6,6 +6,7 @@ import pytest
 from conftest import rotation
 from pdcorrect.errors import InputError
 from pdcorrect.fem import energies
+from pdcorrect.scene.materials import Material, lame
 
 R, Q = rotation(1), rotation(2)
 CASES = {
@@ -21,6 +22,9 @@ CASES = {
     "expanded, one direction flattened by V": R @ np.diag([3.0, 2.5, 2.2]) @ Q,
 }
 WEIGHTS = {"corotated": (1.0, 0.0), "volume": (0.0, 1.0), "both": (1.0, 3.0)}
+
+
+OTHERS = ("neo-hookean", "st-venant-kirchhoff")
 
 
 def taylor_slope(remainder, steps=(1e-3, 5e-4)):
@@ -146,6 +150,108 @@ def test_small_strain_energy_has_the_effective_moduli(rng):
     assert energies.energy_density(np.eye(3) + strain, mu, omega) == pytest.approx(
         expected, rel=1e-3
     )
+
+
+# --- the other energies -----------------------------------------------------------------
+
+
+def literal_density(F, mu, lam, energy):
+    """The formulas of the theory page, on whole matrices."""
+    J, identity = np.linalg.det(F), np.eye(3)
+    if energy == "neo-hookean":
+        squares = (F**2).sum(axis=(-2, -1)) - 3
+        return mu / 2 * squares - mu * (J - 1) + (mu + lam) / 2 * (J - 1) ** 2
+    strain = 0.5 * (np.swapaxes(F, -1, -2) @ F - identity)
+    trace = np.trace(strain, axis1=-2, axis2=-1)
+    return mu * (strain**2).sum(axis=(-2, -1)) + lam / 2 * trace**2
+
+
+@pytest.mark.parametrize("energy", OTHERS)
+def test_other_energies_are_their_formulas(energy, rng):
+    F = np.concatenate([rng.normal(size=(200, 3, 3)), list(CASES.values())])
+    assert (np.linalg.det(F) < 0).sum() > 50
+    np.testing.assert_allclose(
+        energies.energy_density(F, 2.0, 7.5, energy),
+        literal_density(F, 2.0, 2.5, energy),
+        rtol=1e-12, atol=1e-12,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("energy", OTHERS)
+def test_stress_of_other_energies_is_the_derivative_of_the_formula(energy, rng):
+    """Central differences of two sizes, extrapolated: nothing is left but round-off."""
+    F = np.concatenate([rng.normal(size=(50, 3, 3)), list(CASES.values())])
+    stress = energies.first_piola(F, 2.0, 7.5, energy)
+    for i, j in np.ndindex(3, 3):
+        d = np.zeros((3, 3))
+        d[i, j] = 1.0
+
+        def slope(h, d=d):
+            up, down = (literal_density(F + s * h * d, 2.0, 2.5, energy) for s in (1, -1))
+            return (up - down) / (2 * h)
+
+        found = (4 * slope(1e-3) - slope(2e-3)) / 3
+        np.testing.assert_allclose(stress[:, i, j], found, rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("energy", OTHERS)
+@pytest.mark.parametrize("F", CASES.values(), ids=CASES)
+def test_derivatives_of_other_energies_have_taylor_remainders(F, energy, rng):
+    d = rng.normal(size=(3, 3))
+    density, stress = energies.energy_density, energies.first_piola
+    base, first = density(F, 2.0, 7.5, energy), stress(F, 2.0, 7.5, energy)
+    slope = np.vdot(first, d)
+    change = np.einsum("ijkl,kl->ij", energies.elasticity(F, 2.0, 7.5, energy=energy), d)
+    steps = (1e-4, 5e-5)
+    assert taylor_slope(
+        lambda h: abs(density(F + h * d, 2.0, 7.5, energy) - base - h * slope), steps
+    ) == pytest.approx(2, abs=0.05)
+    assert taylor_slope(
+        lambda h: np.linalg.norm(stress(F + h * d, 2.0, 7.5, energy) - first - h * change), steps
+    ) == pytest.approx(2, abs=0.05)
+
+
+@pytest.mark.parametrize("energy", OTHERS)
+def test_projected_tangents_of_other_energies_only_raise_eigenvalues(energy, rng):
+    F = np.concatenate([rng.normal(size=(100, 3, 3)), list(CASES.values())])
+    exact = energies.elasticity(F, 2.0, 7.5, energy=energy).reshape(-1, 9, 9)
+    projected = energies.elasticity(F, 2.0, 7.5, project=True, energy=energy).reshape(-1, 9, 9)
+    np.testing.assert_allclose(exact, exact.swapaxes(1, 2), atol=1e-11)
+    values = np.linalg.eigvalsh(exact)
+    assert (values[:, 0] < -0.1).sum() > 10
+    assert np.linalg.eigvalsh(projected).min() > -1e-10
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(projected), np.sort(np.maximum(values, 0), axis=1), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("energy", OTHERS)
+def test_other_energies_are_invariant_under_rotation_from_either_side(energy, rng):
+    F = rng.normal(size=(20, 3, 3))
+    density, stress = energies.energy_density, energies.first_piola
+    for G in (R @ F, F @ R):
+        np.testing.assert_allclose(
+            density(G, 2.0, 7.5, energy), density(F, 2.0, 7.5, energy), rtol=1e-11
+        )
+    np.testing.assert_allclose(
+        stress(R @ F @ Q, 2.0, 7.5, energy), R @ stress(F, 2.0, 7.5, energy) @ Q, atol=1e-10
+    )
+    np.testing.assert_allclose(density(R, 2.0, 7.5, energy), 0, atol=1e-14)
+    np.testing.assert_allclose(stress(R, 2.0, 7.5, energy), 0, atol=1e-13)
+
+
+@pytest.mark.parametrize("energy", ["corotated", *OTHERS])
+def test_tangent_at_rest_is_that_of_the_effective_moduli(energy):
+    """2 mu sym + lambda tr, with the moduli that the scene states for its material."""
+    material = Material(energy=energy, young=3e5, poisson=0.4, density=1e3)
+    assert material.effective.poisson == pytest.approx(0.4)
+    mu, lam = lame(material.effective.young, material.effective.poisson)
+    found = energies.elasticity(np.eye(3), material.mu, 3 * material.lam, energy=energy)
+    one = np.eye(3)
+    expected = lam * np.einsum("ij,kl->ijkl", one, one) + mu * (
+        np.einsum("ik,jl->ijkl", one, one) + np.einsum("il,jk->ijkl", one, one)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9 * lam)
 
 
 def test_wrong_input_is_refused():

@@ -124,18 +124,17 @@ def midpoint(problem: Problem, state: State, h: float) -> Stage:
     Second order, symplectic; keeps linear and angular momentum.
     """
     p, v, end = state.positions, state.velocities, state.time + h
-    ahead = p + 0.5 * h * v
-    prescribed = problem.clamped_positions(end)
-    clamped, mean = 0.5 * (p + prescribed), (prescribed - p) / h
-    held = clamped - 0.25 * h * (mean - v)  # their acceleration is (mean - v)/h
+    free = problem.free
+    start = np.where(free, p + 0.5 * h * v, 0.5 * (p + problem.clamped_positions(end)))
+    clamp_velocity = _clamp_velocity(problem, end, h)
+    target = np.where(free, start, start - 0.25 * h * (clamp_velocity - v))
 
     def finish(y: Array) -> State:
-        velocities = np.where(problem.free, (4.0 / h) * (y - p) - v, (2.0 / h) * (y - p))
+        velocities = np.where(free, (4.0 / h) * (y - p) - v, clamp_velocity)
         return State(2.0 * y - p, velocities, end)
 
     return Stage(
-        4.0 / h**2, np.where(problem.free, ahead, held), 2.0 / h, p,
-        np.where(problem.free, ahead, clamped), (state.time, end), ahead, finish, 2.0,
+        4.0 / h**2, target, 2.0 / h, p, start, (state.time, end), p + 0.5 * h * v, finish, 2.0
     )  # fmt: skip
 
 
@@ -162,22 +161,29 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
 
         def finish(y: Array) -> State:
             new = at_rest + scale * (y - p)
-            position = p + (y - p) / (1.0 - alpha_f)
-            velocity = np.where(problem.free, ahead(new), (position - p) / h)
-            return State(position, velocity, end, {"accelerations": new * problem.free})
+            velocity = np.where(free, ahead(new), clamp_velocity)
+            return State(
+                p + (y - p) / (1.0 - alpha_f), velocity, end, {"accelerations": new * free}
+            )
 
+        free, time = problem.free, state.time + (1.0 - alpha_f) * h
         inertia = (1.0 - alpha_m) * scale
-        free, prescribed = problem.free, problem.clamped_positions(end)
-        clamped, mean = alpha_f * p + (1.0 - alpha_f) * prescribed, (prescribed - p) / h
-        start = p + (1.0 - alpha_f) * h * v
         target = p - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale
-        held = clamped - (mean - v) / (h * inertia)  # their acceleration is (mean - v)/h
         origin = p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate
-        moved = clamped - ((1.0 - alpha_f) * mean + alpha_f * v) / rate
-        time = state.time + (1.0 - alpha_f) * h
+        clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
+        clamp_velocity = _clamp_velocity(problem, end, h)
+        acceleration = (clamp_velocity - v) / h  # mean over the step, moved to y's time:
+        if state.memory:
+            acceleration += _clamp_acceleration(problem, time, h)
+            acceleration -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
         return Stage(
-            inertia, np.where(free, target, held), rate, np.where(free, origin, moved),
-            np.where(free, start, clamped), (time, time), start, finish, 1.0 / (1.0 - alpha_f),
+            inertia,
+            np.where(free, target, clamped - acceleration / inertia),
+            rate,
+            np.where(free, origin, clamped - _clamp_velocity(problem, time, h) / rate),
+            np.where(free, p + (1.0 - alpha_f) * h * v, clamped),
+            (time, time), p + (1.0 - alpha_f) * h * v, finish,
+            1.0 / (1.0 - alpha_f),
         )  # fmt: skip
 
     return stage
@@ -190,6 +196,27 @@ def quasi_static(problem: Problem, state: State, h: float) -> Stage:
     return Stage(
         0.0, p, 0.0, p, start, (end, end), p, lambda y: State(y, np.zeros_like(y), end)
     )  # fmt: skip
+
+
+def _clamp_velocity(problem: Problem, time: float, h: float) -> Array:
+    """Velocity of the prescribed positions by central differences, (N, 3), m/s.
+
+    Inertia of clamped nodes acts on others through a mass matrix that is not diagonal.
+    Velocities that only satisfy an integrator's own recursion would ring, as nothing damps
+    them, and one-sided differences, put into that recursion, double the acceleration.
+    """
+    if not problem.clamps.moving:
+        return np.zeros_like(problem.positions)
+    ahead, behind = problem.clamped_positions(time + h), problem.clamped_positions(time - h)
+    return (ahead - behind) / (2.0 * h)
+
+
+def _clamp_acceleration(problem: Problem, time: float, h: float) -> Array:
+    """Acceleration of the prescribed positions by central differences, (N, 3), m/s2."""
+    if not problem.clamps.moving:
+        return np.zeros_like(problem.positions)
+    places = [problem.clamped_positions(time + k * h) for k in (-1, 0, 1)]
+    return (places[0] - 2.0 * places[1] + places[2]) / h**2
 
 
 def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:

@@ -1,0 +1,239 @@
+"""Time integrators: their orders, what they conserve, damping, and agreement of the solvers."""
+
+import numpy as np
+import pytest
+import scipy.linalg as sla
+
+import pdcorrect as pc
+from conftest import CLAMPED, GRAVITY, box_mesh, disturbed, problem_on
+from test_elements import MESHES
+from time_orders import errors, reference, swinging
+
+SECOND = [
+    ("midpoint", 0.0),
+    ("generalised-alpha", 0.8),
+    ("generalised-alpha", 1.0),
+    ("bdf2", 0.0),
+    ("generalised-alpha", 0.0),
+]
+DYNAMIC = [("backward-euler", 0.0), *SECOND]
+
+
+def names(cases):
+    return [name + (f" {r:g}" if "alpha" in name else "") for name, r in cases]
+
+
+on_second_order = pytest.mark.parametrize(("name", "radius"), SECOND, ids=names(SECOND))
+on_every_integrator = pytest.mark.parametrize(("name", "radius"), DYNAMIC, ids=names(DYNAMIC))
+
+# --- orders ----------------------------------------------------------------------------------
+
+MOTIONS = {
+    "pulse": {},
+    "moving clamp, consistent mass": {"moving": True, "mass": "consistent"},
+    "moving clamp, mass damping": {"moving": True, "damping": {"mass": 3.0}},
+    "small, Rayleigh damping": {"strength": 0.01, "damping": {"mass": 1.0, "stiffness": 0.01}},
+    "incompatible modes": {"element": "hex8-bubble", "mass": "consistent"},
+}
+_EXACT = {}
+
+
+def measured_orders(motion, name, radius, counts):
+    """Orders of positions and velocities between each two counts of steps."""
+    settings = MOTIONS[motion]
+    if motion not in _EXACT:
+        _EXACT[motion] = reference(swinging(**settings), settings.get("moving", False))
+    problem = swinging(**settings, integrator=name, spectral_radius=radius)
+    found = np.array([errors(problem, _EXACT[motion], n) for n in counts])
+    return np.log2(found[:-1] / found[1:])
+
+
+def check_orders(found, name):
+    """At steps where fast modes still spoil the velocities."""
+    if name == "backward-euler":
+        assert ((found > 0.85) & (found < 1.2)).all()
+    else:
+        assert found[:, 0].min() > 1.85
+        assert found[:, 1].min() > 1.5
+
+
+@on_every_integrator
+def test_errors_fall_with_the_order_of_the_integrator(name, radius):
+    check_orders(measured_orders("pulse", name, radius, (32, 64)), name)
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"), [("midpoint", 0.0), ("generalised-alpha", 0.8), ("generalised-alpha", 0.0)]
+)
+def test_inertia_of_moving_clamps_acts_on_their_neighbours(name, radius):
+    """Through a consistent mass."""
+    found = measured_orders("moving clamp, consistent mass", name, radius, (32, 64))
+    check_orders(found, name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", MOTIONS)
+@on_every_integrator
+def test_errors_fall_so_at_smaller_steps_in_every_motion(name, radius, motion):
+    found = measured_orders(motion, name, radius, (128, 256))
+    low, high = (0.9, 1.2) if name == "backward-euler" else (1.9, 2.3)
+    assert low < found.min()
+    assert found.max() < high
+
+
+@on_second_order
+def test_stiffness_damping_of_small_motion_keeps_the_second_order(name, radius):
+    found = measured_orders("small, Rayleigh damping", name, radius, (32, 64))
+    check_orders(found, name)
+
+
+# --- conservation ----------------------------------------------------------------------------
+
+
+def flight(element, mass, integrator, radius=0.8, loads=()):
+    """A free body that spins, drifts and vibrates."""
+    problem = problem_on(
+        box_mesh((3, 2, 1), (0.06, 0.05, 0.03), 0.0), element,
+        material={"young": 2e5, "poisson": 0.35}, solver={"mass": mass}, loads=list(loads),
+        time={"step": 0.002, "integrator": integrator, "spectral_radius": radius},
+    )  # fmt: skip
+    x = problem.positions - problem.positions.mean(axis=0)
+    noise = np.random.default_rng(8).normal(size=x.shape)
+    velocities = np.cross([15.0, -9.0, 21.0], x) + [1.0, -2.0, 0.5] + 0.05 * noise
+    return problem, pc.State(disturbed(problem, 0.03), velocities)
+
+
+def momenta(problem, run):
+    """Linear and angular momentum of every frame, with the mass matrix."""
+    impulse = np.array([problem.mass_times(v) for v in run.velocities])
+    return impulse.sum(axis=1), np.cross(run.positions, impulse).sum(axis=1)
+
+
+def drift(values):
+    return np.linalg.norm(values - values[0], axis=1).max() / np.linalg.norm(values[0])
+
+
+STEPPERS = {
+    "newton": lambda problem: pc.Newton(problem, tolerance=1e-12),
+    "pd": lambda problem: pc.ProjectiveDynamics(problem, tolerance=1e-10),
+}
+
+
+@pytest.mark.parametrize("solver", STEPPERS)
+@on_every_integrator
+def test_free_flight_keeps_linear_momentum(name, radius, solver):
+    problem, state = flight("hex8-bubble", "consistent", name, radius)
+    run = pc.rollout(STEPPERS[solver](problem), 50, state=state)
+    assert set(run.stats["status"]) == {"CONVERGED"}
+    assert drift(momenta(problem, run)[0]) < (1e-12 if solver == "newton" else 1e-11)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+def test_the_midpoint_rule_keeps_angular_momentum_and_backward_euler_does_not(element, mass):
+    problem, state = flight(element, mass, "midpoint")
+    run = pc.rollout(pc.Newton(problem, tolerance=1e-12), 50, state=state)
+    assert drift(momenta(problem, run)[1]) < 1e-9
+    problem, state = flight(element, mass, "backward-euler")
+    run = pc.rollout(pc.Newton(problem, tolerance=1e-12), 50, state=state)
+    assert drift(momenta(problem, run)[1]) > 1e-2
+
+
+@on_every_integrator
+def test_gravity_adds_momentum_at_its_own_rate(name, radius):
+    problem, state = flight("hex8", "consistent", name, radius, GRAVITY)
+    run = pc.rollout(pc.Newton(problem, tolerance=1e-12), 20, state=state)
+    found, _ = momenta(problem, run)
+    fall = np.outer(run.times, [0.0, 0.0, -9.81]) * problem.mass.sum()
+    np.testing.assert_allclose(found, found[0] + fall, rtol=0, atol=1e-11 * np.abs(found).max())
+
+
+# --- damping ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize(
+    ("mass", "stiffness"), [(0.4, 0.0), (0.0, 5e-2), (0.2, 3e-2)], ids=["mass", "stiffness", "both"]
+)
+def test_the_first_mode_decays_at_the_rate_of_rayleigh(mass, stiffness, element):
+    """Amplitudes fall by exp(-(alpha + beta w^2) t / 2)."""
+    problem = problem_on(
+        box_mesh((4, 1, 1), (0.4, 0.1, 0.08), 0.0), element, clamps=CLAMPED,
+        material={"young": 2e4, "poisson": 0.3}, solver={"mass": "consistent"},
+        damping={"mass": mass, "stiffness": stiffness},
+    )  # fmt: skip
+    free = problem.free.ravel()
+    K = problem.stiffness(problem.positions).toarray()[np.ix_(free, free)]
+    M = np.kron(problem.mass_matrix.toarray(), np.eye(3))[np.ix_(free, free)]
+    values, modes = sla.eigh(K, M)
+    omega, mode = np.sqrt(values[0]), modes[:, 0]
+    start = problem.positions.copy()
+    start[problem.free] += 1e-5 * mode / np.abs(mode).max()
+    period = 2 * np.pi / omega
+    stepper = pc.Newton(problem, integrator="midpoint", time_step=period / 60, tolerance=1e-12)
+    run = pc.rollout(stepper, 120, state=pc.State(start, np.zeros_like(start)))
+    q = (run.positions - problem.positions)[:, problem.free] @ (M @ mode)
+    speed = run.velocities[:, problem.free] @ (M @ mode)
+    energy = 0.5 * speed**2 + 0.5 * (omega * q) ** 2
+    rate = -np.log(energy[-1] / energy[0]) / (2 * run.times[-1])
+    expected = (mass + stiffness * omega**2) / 2
+    assert 0.02 < expected / omega < 0.3
+    assert rate == pytest.approx(expected, rel=0.02)
+    others = run.positions[-1][problem.free] - problem.positions[problem.free] - q[-1] * mode
+    assert np.abs(others).max() < 0.02 * 1e-5
+
+
+def test_stiffness_damping_hardly_slows_a_rigid_rotation():
+    """K is that of the start of the step: what it takes falls with the step."""
+    losses = []
+    for h in (0.004, 0.002, 0.001):
+        mesh = box_mesh((2, 1, 1), (0.04, 0.02, 0.03))
+        problem = problem_on(
+            mesh, damping={"stiffness": 0.005}, time={"integrator": "midpoint"},
+            material={"young": 1e5, "poisson": 0.3},
+        )  # fmt: skip
+        x = problem.positions - problem.positions.mean(axis=0)
+        start = pc.State(problem.positions, np.cross([4.0, 2.0, -3.0], x))
+        kinetic = 0.5 * np.vdot(start.velocities, problem.mass_times(start.velocities))
+        stepper = pc.Newton(problem, time_step=h, tolerance=1e-9)
+        run = pc.rollout(stepper, round(0.04 / h), state=start)
+        assert set(run.stats["status"]) == {"CONVERGED"}
+        losses.append(run.stats["damping_loss"].sum() / kinetic)
+    assert losses[-1] < 5e-2
+    assert losses[0] > 1.7 * losses[1] > 1.7**2 * losses[2] > 0
+
+
+# --- the solvers agree -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "radius"),
+    [*DYNAMIC, ("quasi-static", 0.0)],
+    ids=names([*DYNAMIC, ("quasi-static", 0)]),
+)
+def test_projective_dynamics_is_newton_for_every_integrator(name, radius):
+    motion = {"times": [0.0, 0.1], "displacement": [[0, 0, 0], [0.01, 0.004, 0.0]]}
+    problem = problem_on(
+        MESHES["random"](), "hex8-bubble", material={"young": 3e5},
+        clamps=[{**CLAMPED[0], "motion": motion}], loads=GRAVITY, solver={"mass": "consistent"},
+        damping={"mass": 0.5, "stiffness": 2e-3},
+        time={"step": 0.01, "integrator": name, "spectral_radius": radius},
+    )  # fmt: skip
+    by_pd = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-8), frames=6)
+    by_newton = pc.rollout(pc.Newton(problem, tolerance=1e-11), frames=6)
+    assert np.abs(by_newton.positions - problem.positions).max() > 0.1 * problem.cell_size
+    assert np.abs(by_pd.positions - by_newton.positions).max() < 1e-8
+    assert set(by_pd.stats["status"]) == set(by_newton.stats["status"]) == {"CONVERGED"}
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("energy", ["neo-hookean", "st-venant-kirchhoff"])
+def test_lbfgs_is_newton_for_other_energies(energy, element):
+    problem = problem_on(
+        MESHES["random"](), element, material={"young": 3e5, "energy": energy, "poisson": 0.4},
+        clamps=CLAMPED, loads=[*GRAVITY, {"kind": "torsion", "strength": 6e4}],
+    )  # fmt: skip
+    by_pd = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-8), frames=6)
+    by_newton = pc.rollout(pc.Newton(problem, tolerance=1e-11), frames=6)
+    assert np.abs(by_newton.positions - problem.positions).max() > 0.1 * problem.cell_size
+    assert np.abs(by_pd.positions - by_newton.positions).max() < 1e-8
