@@ -29,34 +29,45 @@ def inside_out(problem):
     return p
 
 
-def smallest_determinant(problem, positions):
-    displacement = problem.relaxed(positions).copy()
-    displacement[: len(positions)] -= problem.positions
-    u = displacement[problem.space.local]
-    F = np.eye(3) + np.einsum("cki,cqkj->cqij", u, problem.quadrature.gradients)
-    return np.linalg.det(F).min()
+STARTS = [flattened, scrambled, inside_out]
+CASES = [(e, s) for e in ELEMENTS for s in STARTS if (e, s) != ("hex8-bubble", inside_out)]
 
 
-@pytest.mark.parametrize("start", [flattened, scrambled, inside_out])
-@pytest.mark.parametrize("element", ELEMENTS)
-def test_a_clamped_beam_comes_back_to_rest(start, element):
-    problem = pc.discretise(beam((6, 2, 2), loads=[], poisson=0.4), element=element)
+def damped_beam():
+    return beam((6, 2, 2), loads=[], poisson=0.4, damping={"mass": 20.0})
+
+
+def released(solver, problem, start, frames=40):
+    """A run from a state without velocity, which is flat or inverted somewhere."""
     positions = start(problem)
-    assert smallest_determinant(problem, positions) < 1e-9
-    state = pc.State(positions, np.zeros_like(positions))
-    run = pc.rollout(pc.ProjectiveDynamics(problem), 60, state=state)
-    assert smallest_determinant(problem, run.positions[-1]) > 0.5
-    left = np.linalg.norm(run.positions[-1] - problem.positions, axis=1).max()
-    assert left < 0.02 * problem.cell_size
-    assert run.stats["elastic_energy"][-1] < 1e-4 * problem.energy(positions)
+    assert problem.volume_ratios(positions).min() < 1e-9
+    return pc.rollout(solver(problem), frames, state=pc.State(positions, np.zeros_like(positions)))
 
 
-@pytest.mark.parametrize("start", [flattened, scrambled, inside_out])
+@pytest.mark.parametrize(("element", "start"), CASES)
+def test_a_clamped_beam_comes_back_to_rest(element, start):
+    problem = pc.discretise(damped_beam(), element=element)
+    run = released(pc.ProjectiveDynamics, problem, start)
+    assert set(run.stats["status"]) <= {"CONVERGED", "RECOVERED", "SUBSTEPPED"}
+    assert run.stats["smallest_volume_ratio"].min() > 0.5
+    assert np.abs(run.positions[-1] - problem.positions).max() < 1e-4 * problem.cell_size
+
+
+@pytest.mark.parametrize("start", STARTS)
 def test_newton_comes_back_too(start):
-    problem = pc.discretise(beam((6, 2, 2), loads=[], poisson=0.4))
-    positions = start(problem)
-    state = pc.State(positions, np.zeros_like(positions))
-    run = pc.rollout(pc.Newton(problem), 40, state=state)
-    assert smallest_determinant(problem, run.positions[-1]) > 0.5
-    left = np.linalg.norm(run.positions[-1] - problem.positions, axis=1).max()
-    assert left < 0.05 * problem.cell_size
+    problem = pc.discretise(damped_beam())
+    run = released(pc.Newton, problem, start)
+    assert set(run.stats["status"]) <= {"CONVERGED", "RECOVERED", "SUBSTEPPED"}
+    assert np.abs(run.positions[-1] - problem.positions).max() < 1e-4 * problem.cell_size
+
+
+def test_incompatible_modes_can_hold_a_folded_cell_and_the_status_says_so():
+    """The modes of hex8-bubble let every quadrature point of a folded cell look right.
+
+    That is a true minimum of the element's energy.
+    """
+    problem = pc.discretise(damped_beam(), element="hex8-bubble")
+    run = released(pc.ProjectiveDynamics, problem, inside_out)
+    assert run.stats["status"][-1] == "INVERTED"
+    assert run.stats["smallest_volume_ratio"][-1] < 0
+    assert np.abs(run.velocities[-1]).max() < 1e-6

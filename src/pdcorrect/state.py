@@ -33,6 +33,7 @@ class Status(Enum):
     CONVERGED = "converged"
     RECOVERED = "converged after falling back to Newton-CG"
     SUBSTEPPED = "converged only with smaller time steps inside the frame"
+    INVERTED = "converged, but with cells that are inverted or folded"
     ITERATION_LIMIT = "failed: iteration limit reached before the tolerance"
     LINE_SEARCH = "failed: no decrease along the search direction"
     NOT_FINITE = "failed: the state became infinite or NaN"
@@ -40,7 +41,7 @@ class Status(Enum):
     @property
     def ok(self) -> bool:
         """Whether the step's equations are satisfied."""
-        return self in (Status.CONVERGED, Status.RECOVERED, Status.SUBSTEPPED)
+        return self in (Status.CONVERGED, Status.RECOVERED, Status.SUBSTEPPED, Status.INVERTED)
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,6 +116,25 @@ def cell_energy_and_forces(  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
+def smallest_determinants(u, cells, gradients, out):  # type: ignore[no-untyped-def]
+    """Smallest det F of each cell, out (C,), of the nodes' displacements u alone."""
+    count, lanes = cells.shape[0], gradients.shape[3]
+    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+        F = np.empty((9, lanes))
+        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+            deformation(u, cells[c], gradients[c], 1.0, F)
+            least = np.inf
+            for q in range(lanes):
+                determinant = (
+                    F[0, q] * (F[4, q] * F[8, q] - F[5, q] * F[7, q])
+                    + F[1, q] * (F[5, q] * F[6, q] - F[3, q] * F[8, q])
+                    + F[2, q] * (F[3, q] * F[7, q] - F[4, q] * F[6, q])
+                )
+                least = min(least, determinant)
+            out[c] = least
+
+
+@njit(**PARALLEL)
 def linearise_cells(  # type: ignore[no-untyped-def]
     model, u, cells, gradients, shear, volume, first, project, left, right, tangent
 ):

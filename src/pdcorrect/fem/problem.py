@@ -224,6 +224,19 @@ class Problem:
         )  # fmt: skip
         return float(energy.sum()), self.assembly.vector(by_cell)
 
+    def volume_ratios(self, positions: Array) -> Array:
+        """Smallest det F over the quadrature points of each cell, (C,).
+
+        Of the nodes' displacements alone: a cell that is turned inside out or folded
+        has a value below zero, whatever its internal modes do.
+        """
+        self._check(positions, len(self.positions))
+        out = np.empty(len(self.cells))
+        kernels.smallest_determinants(
+            positions - self.positions, self.cells, self.quadrature.lanes, out
+        )
+        return out
+
     def linearise(self, configuration: Array, project: bool = False) -> Linearisation:
         """The tangent at a configuration, ready to be applied or assembled.
 

@@ -242,11 +242,13 @@ class ImplicitStepper:
             "external_work": outcome.external_work,
             "clamp_work": outcome.clamp_work,
             "damping_loss": outcome.damping_loss,
+            "smallest_volume_ratio": float(self.problem.volume_ratios(state.positions).min()),
         }
+        status = minimum.status
+        if status.ok and stats["smallest_volume_ratio"] <= 0.0:
+            status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
-        return StepResult(
-            state, minimum.status, effort.iterations, residual, minimum.estimate, stats
-        )
+        return StepResult(state, status, effort.iterations, residual, minimum.estimate, stats)
 
 
 def _outcome(
