@@ -34,6 +34,7 @@ ORDER = [
     "fem.kernels",
     "fem.internal_modes",
     "fem.conjugate_gradients",
+    "fem.multigrid",
     "fem.factorisation",
     "fem.selection",
     "fem.loads",

@@ -1,35 +1,49 @@
-"""Newton's method on the assembled tangent: the trusted reference."""
+"""Newton's method on the exact tangent: the trusted reference."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, factorise
+from pdcorrect.errors import InputError
+from pdcorrect.fem.conjugate_gradients import Solution, conjugate_gradients
+from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
+from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
-from pdcorrect.solvers.newton_loop import newton_loop
-from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, largest_displacement
+from pdcorrect.solvers.newton_loop import Direction, newton_loop
+from pdcorrect.solvers.step import HessianOperator, StepObjective
 
 Array = NDArray[np.float64]
+LinearSolver = Literal["auto", "direct", "cg"]
 
 _SHIFTS = (1e-10, 1e-6, 1e-2)
 """Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
 
 
+DIRECT_UNKNOWNS = 6000
+"""Free components up to which "auto" factorises the tangent."""
+_CG_TOLERANCE = 1e-3
+"""Of the residual of a Newton step."""
+_CG_LENGTH = 1e-2
+"""Of a Newton step's length: the last change at which it has settled."""
+_CG_STEPS = 500
+
+
 class Newton(ImplicitStepper):
     """Steps a problem by Newton's method with a line search.
 
-    The exact tangent is assembled cell by cell and factorised in each
-    iteration.  Where it is not positive definite, the tangent with negative
-    eigenvalues raised to zero at each quadrature point (Teran et al. 2005) takes
-    its place for that iteration, with a shift if it is singular.
+    The exact tangent is factorised in each iteration, or, for large meshes, the
+    Newton step is found by conjugate gradients with the exact tangent,
+    preconditioned by multigrid.  Where the tangent is not positive definite, the
+    one with negative eigenvalues raised to zero at each quadrature point (Teran et
+    al. 2005) takes its place for that iteration, with a shift if it is singular.
 
     Parameters
     ----------
@@ -38,6 +52,10 @@ class Newton(ImplicitStepper):
         Of the coarse cell size: the length of the Newton step at which the
         iteration stops.
     max_iterations : int
+    linear_solver : {"auto", "direct", "cg"}
+        "auto" factorises up to `DIRECT_UNKNOWNS` unknowns and where a direct
+        ``backend`` is asked for by name.  Conjugate gradients may miss a direction
+        of negative curvature that neither the force nor a fixed random vector excites.
     time_step, integrator, backend, recover
         See `ImplicitStepper`.
     """
@@ -50,17 +68,27 @@ class Newton(ImplicitStepper):
         tolerance: float = 1e-10,
         *,
         max_iterations: int = 100,
+        linear_solver: LinearSolver = "auto",
         time_step: float | None = None,
         integrator: str | None = None,
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
+        if linear_solver not in ("auto", "direct", "cg"):
+            raise InputError(
+                f"linear_solver = {linear_solver!r}: expected 'auto', 'direct' or 'cg'."
+            )
         super().__init__(problem, tolerance, time_step, integrator, backend, recover)
         self._options = replace(
             self._options, max_iterations=whole("max_iterations", max_iterations)
         )
         self._free = np.flatnonzero(problem.free_unknowns.ravel())
         self._used_backend = "none yet"
+        small = len(self._free) <= DIRECT_UNKNOWNS
+        direct = backend != "amg" and (backend != "auto" or small)
+        self.linear_solver = linear_solver
+        if linear_solver == "auto":
+            self.linear_solver = "direct" if direct else "cg"
 
     def prepare(self) -> Self:
         """Assemble and factorise once at rest, so that the first step is like the others."""
@@ -68,23 +96,30 @@ class Newton(ImplicitStepper):
         stage = self._integrator(self.problem, state, self.time_step)
         objective = StepObjective(self.problem, state, stage, np.zeros_like(state.positions))
         _, gradient = objective.value_and_gradient(objective.start)
-        self._direction(objective, objective.start, gradient)
+        self._solver(objective)(objective.start, gradient)
         return self
 
     def _factorisation(self) -> str:
         return self._used_backend
 
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        return newton_loop(
-            objective, objective.start, lambda p, g: self._direction(objective, p, g), options
-        )
+        return newton_loop(objective, objective.start, self._solver(objective, options), options)
+
+    def _solver(
+        self, objective: StepObjective, options: MinimiserOptions | None = None
+    ) -> Direction:
+        """What gives the Newton steps of one time step."""
+        if self.linear_solver == "cg":
+            self._used_backend = "amg"
+            return _IterativeSteps(objective, self._free, (options or self._options).tolerance)
+        return lambda p, g: self._direction(objective, p, g)
 
     def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:
-        """Minus the Newton step, and whether the exact tangent was used."""
+        """The Newton step, and whether the exact tangent gave it."""
         direction = np.zeros(p.size)
-        for matrix, exact in self._candidates(objective, p):
+        for matrix, exact in _candidates(objective, p, self._free):
             try:
-                factor = factorise(matrix, self._backend, unknowns=3)
+                factor = factorise(matrix, self._backend, 3, rigid_motions(p)[self._free])
                 direction[self._free] = -factor.solve(g.ravel()[self._free])
             except NotPositiveDefinite:
                 continue
@@ -92,13 +127,85 @@ class Newton(ImplicitStepper):
             return direction.reshape(p.shape), exact
         return direction.reshape(p.shape), False  # no descent: the line search says so
 
-    def _candidates(
-        self, objective: StepObjective, p: Array
-    ) -> Iterator[tuple[sp.csr_matrix, bool]]:
-        """The exact tangent, the projected one, and that with a growing shift."""
-        yield objective.hessian(p)[self._free][:, self._free], True
-        matrix = objective.hessian(p, project=True)[self._free][:, self._free]
-        yield matrix, False
-        for shift in _SHIFTS:
-            size = shift * matrix.diagonal().max()
-            yield sp.csr_matrix(matrix + size * sp.eye_array(matrix.shape[0])), False
+
+class _IterativeSteps:
+    """Newton steps of one time step by multigrid-preconditioned conjugate gradients.
+
+    The preconditioner is made from the projected tangent, which is never indefinite,
+    and kept until the steps it needs have doubled.
+    """
+
+    def __init__(self, objective: StepObjective, free: NDArray[np.int64], tolerance: float) -> None:
+        self._objective = objective
+        self._free = free
+        self._tolerance = tolerance
+        self._cycle: Factor | None = None
+        self._first = self._last = 0
+
+    def __call__(self, p: Array, gradient: Array) -> tuple[Array, bool]:
+        """The Newton step, and whether the exact tangent gave it and is positive definite."""
+        if self._cycle is None or self._last > 2 * self._first:
+            self._renew(p)
+        found = self._solve(p, -gradient)
+        if found.convex and not found.converged:
+            self._renew(p)
+            found = self._solve(p, -gradient)
+        if found.converged and (
+            largest_displacement(found.x) > self._tolerance or self._positive(p)
+        ):
+            return found.x, True
+        return self._solve(p, -gradient, project=True).x, False
+
+    def _renew(self, p: Array) -> None:
+        """Make the preconditioner at p."""
+        self._first = self._last = 0
+        modes = rigid_motions(p)
+        modes[3 * len(self._objective.problem.positions) :] = 0.0  # internal modes
+        for matrix, exact in _candidates(self._objective, p, self._free):
+            if exact:
+                continue
+            try:
+                self._cycle = factorise(matrix, "amg", 3, modes[self._free], approximate=True)
+            except NotPositiveDefinite:
+                continue
+            return
+
+    def _solve(self, p: Array, b: Array, project: bool = False) -> Solution:
+        objective = self._objective
+        found = conjugate_gradients(
+            HessianOperator(objective, objective.problem.linearise(p, project)),
+            b,
+            self._precondition,
+            tolerance=_CG_TOLERANCE,
+            max_steps=_CG_STEPS,
+            settled=lambda x, change: (
+                largest_displacement(change) <= _CG_LENGTH * largest_displacement(x)
+            ),
+        )
+        self._last = found.steps
+        self._first = self._first or found.steps
+        return found
+
+    def _positive(self, p: Array) -> bool:
+        """Whether no negative curvature is met with a right-hand side that has all modes in it."""
+        b = np.zeros(p.shape)
+        b.ravel()[self._free] = np.random.default_rng(0).normal(size=len(self._free))
+        return self._solve(p, b).convex
+
+    def _precondition(self, r: Array) -> Array:
+        out = np.zeros(r.shape)
+        if self._cycle is not None:
+            out.ravel()[self._free] = self._cycle.solve(r.ravel()[self._free])
+        return out
+
+
+def _candidates(
+    objective: StepObjective, p: Array, free: NDArray[np.int64]
+) -> Iterator[tuple[sp.csr_matrix, bool]]:
+    """The exact tangent, the projected one, and that with a growing shift."""
+    yield objective.hessian(p)[free][:, free], True
+    matrix = objective.hessian(p, project=True)[free][:, free]
+    yield matrix, False
+    for shift in _SHIFTS:
+        size = shift * matrix.diagonal().max()
+        yield sp.csr_matrix(matrix + size * sp.eye_array(matrix.shape[0])), False
