@@ -127,13 +127,12 @@ def test_errors_fall_with_the_orders_of_the_element(element, mesh, energy):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("energy", ["corotated", "neo-hookean", "st-venant-kirchhoff"])
 @pytest.mark.parametrize("mesh", MESHES)
 @pytest.mark.parametrize("element", ELEMENTS)
-def test_errors_fall_so_on_finer_meshes_of_every_kind(element, mesh, energy, poisson):
+def test_errors_fall_so_on_finer_meshes_of_every_kind(element, mesh, energy):
     counts = (4, 6, 8) if element == "hex27" else (6, 9, 13)
-    field, gradient = orders(counts, MESHES[mesh], element, energy, poisson)
+    field, gradient = orders(counts, MESHES[mesh], element, energy, 0.3)
     wanted = WANTED[nodes_of(element)]
     assert wanted[0] <= field <= wanted[0] + 0.3
     assert wanted[1] <= gradient <= wanted[1] + 0.3

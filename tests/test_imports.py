@@ -35,6 +35,7 @@ ORDER = [
     "fem.kernels",
     "fem.internal_modes",
     "fem.conjugate_gradients",
+    "fem.multigrid",
     "fem.factorisation",
     "fem.banded",
     "fem.selection",

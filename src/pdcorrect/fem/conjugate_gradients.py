@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 Product = Callable[[Array], Array]
 
 
+class NotPositiveDefinite(ArithmeticError):
+    """The matrix has a pivot or a direction of curvature that is zero or negative."""
+
+
 @dataclass(eq=False)
 class Solution:
     """Outcome of `conjugate_gradients`.

@@ -22,6 +22,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.conjugate_gradients import NotPositiveDefinite as NotPositiveDefinite
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
@@ -31,10 +32,6 @@ _AMG_TOLERANCE = 1e-12
 _AMG_STEPS = 500
 MEMORY_SHARE = 0.5
 """Share of the free memory that a factor may be expected to take."""
-
-
-class NotPositiveDefinite(ArithmeticError):
-    """The matrix has a pivot that is zero or negative."""
 
 
 class Factor(Protocol):
@@ -99,49 +96,80 @@ class LUFactor:
 
 
 class MultigridSolver:
-    """Conjugate gradients preconditioned by smoothed aggregation, to near machine accuracy."""
+    """Conjugate gradients preconditioned by smoothed aggregation, to near machine accuracy.
+
+    The columns of a right-hand side advance together, as one system.
+
+    Parameters
+    ----------
+    matrix, near_nullspace
+        See `factorise`.
+
+    Attributes
+    ----------
+    hierarchy : Multigrid
+    steps : int
+        Conjugate gradient steps of the last solve.
+    """
 
     backend = "amg"
 
-    def __init__(self, matrix: sp.csc_matrix) -> None:
-        import pyamg
+    def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
+        from pdcorrect.fem.multigrid import Multigrid  # pyamg only where it is needed
 
         self._matrix = sp.csr_matrix(matrix)
-        if not (self._matrix.diagonal() > 0).all():
-            raise NotPositiveDefinite("the matrix has diagonal entries that are not positive")
-        self._hierarchy = pyamg.smoothed_aggregation_solver(self._matrix)
-        self._cycle = self._hierarchy.aspreconditioner(cycle="V")
+        self.hierarchy = Multigrid(self._matrix, near_nullspace)
+        self.steps = 0
 
     def solve(self, b: Array) -> Array:
         b = np.asarray(b, dtype=np.float64)
-        columns = b.reshape(len(b), -1)
-        out = np.empty_like(columns)
-        for i, column in enumerate(columns.T):
-            found = conjugate_gradients(
-                self._matrix.__matmul__,
-                column,
-                self._cycle.matvec,
-                tolerance=_AMG_TOLERANCE,
-                max_steps=_AMG_STEPS,
+        if not np.isfinite(b).all():  # as the direct back ends do
+            return np.full_like(b, np.nan)
+        found = conjugate_gradients(
+            self._matrix.__matmul__,
+            b.reshape(len(b), -1),
+            self.hierarchy.cycle,
+            tolerance=_AMG_TOLERANCE,
+            max_steps=_AMG_STEPS,
+        )
+        self.steps = found.steps
+        if not found.convex:
+            raise NotPositiveDefinite("multigrid-preconditioned CG met negative curvature")
+        if not found.converged:
+            raise NotPositiveDefinite(
+                f"multigrid-preconditioned CG did not converge in {found.steps} steps"
             )
-            if not found.convex:
-                raise NotPositiveDefinite("multigrid-preconditioned CG met negative curvature")
-            if not found.converged:
-                raise NotPositiveDefinite(
-                    f"multigrid-preconditioned CG did not converge in {found.steps} steps"
-                )
-            out[:, i] = found.x
-        return out.reshape(b.shape)
+        return found.x.reshape(b.shape)
 
 
-_BACKENDS: dict[str, Callable[[sp.csc_matrix], Factor]] = {
+class MultigridCycle:
+    """One V-cycle in place of a solve: a fixed symmetric positive approximation of A^-1."""
+
+    backend = "amg"
+
+    def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
+        from pdcorrect.fem.multigrid import Multigrid
+
+        self._hierarchy = Multigrid(matrix, near_nullspace)
+
+    def solve(self, b: Array) -> Array:
+        b = np.asarray(b, dtype=np.float64)
+        return self._hierarchy.cycle(b.reshape(len(b), -1)).reshape(b.shape)
+
+
+_DIRECT: dict[str, Callable[[sp.csc_matrix], Factor]] = {
     "cholespy": CholeskyFactor,
     "splu": LUFactor,
-    "amg": MultigridSolver,
 }
 
 
-def factorise(matrix: sp.spmatrix, backend: Backend = "auto", unknowns: int = 1) -> Factor:
+def factorise(
+    matrix: sp.spmatrix,
+    backend: Backend = "auto",
+    unknowns: int = 1,
+    near_nullspace: Array | None = None,
+    approximate: bool = False,
+) -> Factor:
     """Factorise a symmetric positive definite matrix.
 
     Parameters
@@ -153,22 +181,31 @@ def factorise(matrix: sp.spmatrix, backend: Backend = "auto", unknowns: int = 1)
         choice for tangents only (`BandOrder`).
     unknowns : int
         For each node: 1 for G, 3 for a tangent.
+    near_nullspace : (n, k), optional
+        For multigrid: vectors that the matrix hardly resists.  The constant, which
+        is the default, is right for G; a tangent needs the `rigid_motions`.
+    approximate : bool
+        Whether a fixed symmetric approximation of the inverse will do, as it does for
+        a preconditioner or a first Hessian: with multigrid, one V-cycle.
 
     Raises
     ------
     NotPositiveDefinite
-        If a pivot is not positive.
+        If a pivot is not positive.  Multigrid may notice only when solving.
     """
     check_backend(backend)
     if backend in ("auto", "band"):
         backend = choose_backend(matrix.shape[0], unknowns)
-    return _BACKENDS[backend](sp.csc_matrix(matrix))
+    if backend == "amg":
+        return (MultigridCycle if approximate else MultigridSolver)(matrix, near_nullspace)
+    return _DIRECT[backend](sp.csc_matrix(matrix))
 
 
 def check_backend(backend: str) -> None:
     """Refuse a name that is none of the back ends, "band" (for tangents) or "auto"."""
-    if backend not in ("auto", "band", *_BACKENDS):
-        raise InputError(f"backend {backend!r}: expected auto, band, {', '.join(_BACKENDS)}.")
+    names = ("auto", "band", *_DIRECT, "amg")
+    if backend not in names:
+        raise InputError(f"backend {backend!r}: expected {', '.join(names)}.")
 
 
 def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) -> Backend:

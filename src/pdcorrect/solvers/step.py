@@ -195,7 +195,7 @@ class GlobalSolver:
     @staticmethod
     def _factorise(matrix: sp.csr_matrix, backend: Backend) -> Factor:
         try:
-            return factorise(matrix, backend)
+            return factorise(matrix, backend, approximate=True)
         except NotPositiveDefinite as error:
             raise ConvergenceError(
                 f"the global matrix of the step is singular to working precision ({error}): "

@@ -5,6 +5,8 @@ Internal modes are eliminated cell by cell, so the matrix has the nodes' unknown
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -20,11 +22,14 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.internal_modes import Condensed
+from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]
 
+_CG_SECONDS = 5e-5
+"""Of a Newton step by conjugate gradients, for each cell (``benchmarks``, case newton)."""
 _SHIFTS = (1e-10, 1e-6, 1e-2)
 """Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
 
@@ -77,6 +82,12 @@ class TangentFactory:
     def _solve_seconds(self) -> float:
         return 3.5e-9 * self.order.rows * self.order.bandwidth
 
+    @property
+    def direct_pays(self) -> bool:
+        """Whether a band factor beats multigrid-preconditioned conjugate gradients."""
+        seconds = 1e-10 * self.order.factor_flops + 5e-9 * self.order.rows * self.order.bandwidth
+        return self.backend == "band" and seconds < _CG_SECONDS * len(self.problem.cells)
+
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
         """A factor of the Hessian at a configuration, and whether it is the exact one.
 
@@ -90,36 +101,55 @@ class TangentFactory:
             If all of that fails.
         """
         try:
-            return self._solver(objective, y, project=False), True
+            return self._solver(objective, y, self.backend), True
         except (NotPositiveDefinite, np.linalg.LinAlgError):
-            pass
+            return self._projected(objective, y, self.backend), False
+
+    def approximate(self, objective: StepObjective, y: Array) -> TangentSolver:
+        """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap.
+
+        Raises
+        ------
+        NotPositiveDefinite
+            If no shift made it so.
+        """
+        return self._projected(objective, y, "amg", approximate=True)
+
+    def _projected(
+        self, objective: StepObjective, y: Array, backend: Backend, approximate: bool = False
+    ) -> TangentSolver:
         for shift in (0.0, *_SHIFTS):
-            try:
-                return self._solver(objective, y, project=True, shift=shift), False
-            except (NotPositiveDefinite, np.linalg.LinAlgError):
-                continue
+            with suppress(NotPositiveDefinite, np.linalg.LinAlgError):
+                return self._solver(objective, y, backend, shift, True, approximate)
         raise NotPositiveDefinite("no shift made the projected tangent positive definite")
 
     def _solver(
-        self, objective: StepObjective, y: Array, project: bool, shift: float = 0.0
+        self,
+        objective: StepObjective,
+        y: Array,
+        backend: Backend,
+        shift: float = 0.0,
+        project: bool = False,
+        approximate: bool = False,
     ) -> TangentSolver:
+        problem, mass_factor = self.problem, objective.factors[0]
         blocks, modes = objective.cell_hessians(y, project), None
-        if self.problem.space.internal:
-            modes = Condensed(blocks, self.problem.space.local, self.problem.cells.shape[1])
+        if problem.space.internal:
+            modes = Condensed(blocks, problem.space.local, problem.cells.shape[1])
             blocks = modes.blocks
-        mass_factor = objective.factors[0]
-        if self.backend == "band":
-            band = self.order.assemble(blocks, self.problem.mass_matrix, mass_factor)
+        if backend == "band":
+            band = self.order.assemble(blocks, problem.mass_matrix, mass_factor)
             band[:, 0] += shift * band[:, 0].max()
-            return TangentSolver(self.problem, self.order.factorise(band), None, modes)
+            return TangentSolver(problem, self.order.factorise(band), None, modes)
         matrix = self._nodes.matrix(blocks)
         if mass_factor:
-            matrix = matrix + mass_factor * sp.kron(self.problem.mass_matrix, sp.eye_array(3))
+            matrix = matrix + mass_factor * sp.kron(problem.mass_matrix, sp.eye_array(3))
         if shift:
             matrix = matrix + shift * matrix.diagonal().max() * sp.eye_array(matrix.shape[0])
         matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
-        factor = factorise(matrix, self.backend, unknowns=3)
-        return TangentSolver(self.problem, factor, self._free, modes)
+        motions = rigid_motions(y[: len(problem.positions)])[self._free]
+        factor = factorise(matrix, backend, 3, motions, approximate)
+        return TangentSolver(problem, factor, self._free, modes)
 
 
 class TangentSolver:
