@@ -94,11 +94,31 @@ def threads() -> list[dict[str, Any]]:
 
 
 def first_hessian() -> list[dict[str, Any]]:
+    """Mean iterations and milliseconds over eight frames, by the first Hessian of L-BFGS."""
+    rows = []
+    for motion in ("twist", "bending", "flight"):
+        for poisson in (0.3, 0.45):
+            for young in (1e5, 1e6, 1e7):
+                scene = example_beam(motion, poisson).with_changes(material={"young": young})
+                problem = pc.discretise(scene, refine=2)
+                row: dict[str, Any] = {"motion": motion, "poisson": poisson, "young": young}
+                for kind in ("G", "G-scaled", "lagged"):
+                    stepper = pc.ProjectiveDynamics(problem, first_hessian=kind).prepare()
+                    run = pc.rollout(stepper, 8, state=initial_state(problem, motion))
+                    row[kind] = {
+                        "iterations": float(run.stats["iterations"].mean()),
+                        "milliseconds": 1e3 * float(run.stats["seconds"].mean()),
+                    }
+                rows.append(row)
+    return rows
+
+
+def volume_scale() -> list[dict[str, Any]]:
     """Mean L-BFGS iterations over eight frames, by the scale of the volume weight in G."""
     rows = []
     for motion in ("twist", "bending", "flight"):
         for poisson in (0.3, 0.45):
-            problem = pc.discretise(_beam(motion, poisson), refine=2)
+            problem = pc.discretise(example_beam(motion, poisson), refine=2)
             row: dict[str, Any] = {"motion": motion, "poisson": poisson, "history": 16}
             for scale in (1.0, 0.5, 0.25, 0.1):
                 row[f"scale {scale:g}"] = _mean_iterations(problem, motion, scale)
@@ -110,7 +130,7 @@ def factor_size() -> list[dict[str, Any]]:
     """Bytes of a symmetric factor (12 for each entry) against the estimate, blocks and beams."""
     rows = []
     for cells in ((8, 8, 8), (16, 16, 16), (24, 24, 24), (96, 8, 8), (224, 8, 8)):
-        problem = pc.discretise(_beam("bending", 0.3, cells))
+        problem = pc.discretise(example_beam("bending", 0.3, cells))
         matrix = problem.global_matrix(0.01)
         started = time.perf_counter()
         factor = factorise(matrix, "cholespy")
@@ -135,7 +155,8 @@ def factor_size() -> list[dict[str, Any]]:
     return rows
 
 
-def _beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12, 2, 2)) -> pc.Scene:
+def example_beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12, 2, 2)) -> pc.Scene:
+    """A soft beam that is twisted, bends under its weight, or flies freely."""
     loads = {
         "twist": [{"kind": "torsion", "strength": 2e5}],
         "bending": [{"kind": "gravity", "acceleration": [0, 0, -9.81]}],
@@ -150,13 +171,19 @@ def _beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12, 2, 2))
     )
 
 
+def initial_state(problem: pc.Problem, motion: str) -> pc.State:
+    """At rest, or spinning and vibrating in free flight."""
+    state = problem.rest_state()
+    if motion != "flight":
+        return state
+    spin = np.cross([5.0, 3.0, 2.0], state.positions - 0.03)
+    noise = 0.3 * np.random.default_rng(0).normal(size=spin.shape)
+    return pc.State(state.positions, spin + noise)
+
+
 def _mean_iterations(problem: pc.Problem, motion: str, scale: float) -> float:
     solve = GlobalSolver(problem, (1e4, 1.0), volume_scale=scale)
-    state = problem.rest_state()
-    if motion == "flight":
-        spin = np.cross([5.0, 3.0, 2.0], state.positions - 0.03)
-        noise = 0.3 * np.random.default_rng(0).normal(size=spin.shape)
-        state = pc.State(state.positions, spin + noise)
+    state = initial_state(problem, motion)
     options = MinimiserOptions(1e-4 * problem.cell_size, history=16, max_iterations=5000)
     counts = []
     for _ in range(8):
@@ -174,5 +201,6 @@ CASES: dict[str, Callable[[], Any]] = {
     "steps": steps,
     "threads": threads,
     "first_hessian": first_hessian,
+    "volume_scale": volume_scale,
     "factor_size": factor_size,
 }

@@ -9,16 +9,18 @@ import time
 from pathlib import Path
 
 import cases
+import solver_cases
 
 from pdcorrect.environment import environment
 
 
 def main() -> None:
     """Run the cases named on the command line, or all."""
-    names = sys.argv[1:] or list(cases.CASES)
-    unknown = set(names) - set(cases.CASES)
+    known = {**cases.CASES, **solver_cases.CASES}
+    names = sys.argv[1:] or list(known)
+    unknown = set(names) - set(known)
     if unknown:
-        sys.exit(f"unknown: {sorted(unknown)}; expected some of {list(cases.CASES)}")
+        sys.exit(f"unknown: {sorted(unknown)}; expected some of {list(known)}")
     machine = environment()
     folder = Path(__file__).parent / "results"
     folder.mkdir(exist_ok=True)
@@ -31,7 +33,7 @@ def main() -> None:
             "date": time.strftime("%Y-%m-%d"),
             "command": f"python benchmarks/run.py {name}",
             "environment": machine,
-            "results": cases.CASES[name](),
+            "results": known[name](),
         }
         print(json.dumps(record[name]["results"], indent=2))
         path.write_text(json.dumps(record, indent=2) + "\n")

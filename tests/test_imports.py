@@ -50,7 +50,7 @@ ORDER = [
     "solvers.integrators",
     "solvers.step",
     "solvers.tangent_solver",
-    "solvers.lagged",
+    "solvers.first_hessian",
     "solvers.reactions",
     "solvers.lbfgs",
     "solvers.newton_loop",

@@ -17,25 +17,26 @@ Array = NDArray[np.float64]
 
 
 class Assembly:
-    """Connectivity of ``cells`` (C, K) between ``count`` nodes."""
+    """Connectivity of ``cells`` (C, K) between ``count`` nodes.
+
+    Attributes
+    ----------
+    cells : (C, K)
+    start : (count + 1,), slots : (C K,)
+        The places of each node in the raveled cells, compressed rows.
+    """
 
     def __init__(self, cells: NDArray[np.int64], count: int) -> None:
         self.cells = cells
         self._count = count
         flat = cells.ravel()
-        self._start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
-        self._slots = np.argsort(flat, kind="stable")
+        self.start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
+        self.slots = np.argsort(flat, kind="stable")
 
     def check(self, x: Array) -> None:
         """Refuse a nodal vector that is not (N, 3)."""
         if np.shape(x) != (self._count, 3):
             raise InputError(f"x {np.shape(x)}: expected ({self._count}, 3), one row a node.")
-
-    def vector(self, by_cell: Array) -> Array:
-        """Sum cell-wise nodal values (C, K, 3) into (N, 3)."""
-        out = np.empty((self._count, 3))
-        kernels.gather_nodes(self._start, self._slots, by_cell.reshape(-1, 3), out)
-        return out
 
     def matrix(self, blocks: Array) -> sp.csr_matrix:
         """Sum cell-wise node blocks (C, K, K, 3, 3) into (3N, 3N)."""
@@ -77,12 +78,12 @@ class Linearisation:
     def apply(self, x: Array) -> Array:
         """Tangent times x, both (N, 3), without assembling."""
         self.assembly.check(x)
-        by_cell = np.empty((*self.assembly.cells.shape, 3))
+        assembly, out = self.assembly, np.empty_like(x)
         kernels.apply_linearised(
-            x, self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
-            by_cell,
+            x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
+            np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
         )  # fmt: skip
-        return self.assembly.vector(by_cell)
+        return out
 
     def assemble(self) -> sp.csr_matrix:
         """The tangent as a sparse matrix (3N, 3N), N/m."""

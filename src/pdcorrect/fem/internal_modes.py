@@ -35,7 +35,7 @@ def relax(  # type: ignore[no-untyped-def]
     Newton's method with the projected tangent in each cell, at most ``steps``
     times or until no mode changes by more than ``tolerance`` (m).  ``nodes`` is
     the number of nodes a cell; its other local shape functions are modes.
-    Other arguments as `kernels.cell_energy_and_forces`.
+    Other arguments as `kernels.energy_and_forces`.
     """
     count, lanes = cells.shape[0], shear.shape[1]
     width = cells.shape[1] - nodes
@@ -118,6 +118,61 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
         x[i] /= M[i, i]
 
 
+@njit(**PARALLEL)
+def _eliminate(blocks, nodes, condensed, inverse, solved):  # type: ignore[no-untyped-def]
+    """Fill K_uu - K_ub K_bb^-1 K_bu, K_bb^-1 and K_bb^-1 K_bu; whether all K_bb are positive."""
+    count, width = blocks.shape[:2]
+    m, n = 3 * (width - nodes), 3 * nodes
+    failed = np.zeros(count, dtype=np.int64)
+    for c in prange(count):
+        K, right = np.empty((m, m)), np.zeros((m, m + n))
+        for i in range(m):
+            k, a = nodes + i // 3, i % 3
+            right[i, i] = 1.0
+            for j in range(m):
+                K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
+            for j in range(n):
+                right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
+        if not _cholesky_solve(K, right):
+            failed[c] = 1
+        inverse[c] = right[:, :m]
+        solved[c] = right[:, m:]
+        for i in range(n):
+            for j in range(n):
+                value = blocks[c, i // 3, j // 3, i % 3, j % 3]
+                for b in range(m):
+                    value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
+                condensed[c, i // 3, j // 3, i % 3, j % 3] = value
+    return failed.sum() == 0
+
+
+@njit(**OPTIONS)
+def _cholesky_solve(K, right):  # type: ignore[no-untyped-def]
+    """Overwrite ``right`` by K^-1 right; False where K is not positive definite."""
+    size = len(K)
+    for i in range(size):
+        for j in range(i):
+            for b in range(j):
+                K[i, j] -= K[i, b] * K[j, b]
+            K[i, j] /= K[j, j]
+            for b in range(right.shape[1]):
+                right[i, b] -= K[i, j] * right[j, b]
+        for b in range(i):
+            K[i, i] -= K[i, b] * K[i, b]
+        if not K[i, i] > 0.0:
+            return False
+        K[i, i] = np.sqrt(K[i, i])
+        for b in range(right.shape[1]):
+            right[i, b] /= K[i, i]
+    for i in range(size - 1, -1, -1):
+        for j in range(i + 1, size):
+            for b in range(right.shape[1]):
+                right[i, b] -= K[j, i] * right[j, b]
+        for b in range(right.shape[1]):
+            right[i, b] /= K[i, i]
+    return True
+
+
 class Condensed:
     """Tangents of cells with their internal modes eliminated.
 
@@ -144,16 +199,12 @@ class Condensed:
 
     def __init__(self, blocks: Array, local: NDArray[np.int64], nodes: int) -> None:
         count, width = blocks.shape[:2]
-        full = blocks.transpose(0, 1, 3, 2, 4).reshape(count, 3 * width, 3 * width)
-        n = 3 * nodes
-        np.linalg.cholesky(full[:, n:, n:])
-        self._inverse = np.linalg.inv(full[:, n:, n:])
-        self._coupling = full[:, n:, :n]
-        self._solved = self._inverse @ self._coupling
-        small = full[:, :n, :n] - full[:, :n, n:] @ self._solved
-        self.blocks = np.ascontiguousarray(
-            small.reshape(count, nodes, 3, nodes, 3).transpose(0, 1, 3, 2, 4)
-        )
+        m = 3 * (width - nodes)
+        self.blocks = np.empty((count, nodes, nodes, 3, 3))
+        self._inverse = np.empty((count, m, m))
+        self._solved = np.empty((count, m, 3 * nodes))
+        if not _eliminate(blocks, nodes, self.blocks, self._inverse, self._solved):
+            raise np.linalg.LinAlgError("the modes of a cell have an indefinite tangent")
         self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
 
     def reduced(self, r: Array) -> Array:

@@ -77,10 +77,30 @@ def total(a):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def cell_energy_and_forces(  # type: ignore[no-untyped-def]
-    model, u, cells, gradients, shear, volume, first, energy, forces
+def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
+    """out[n] = sum of values[slot] over the (cell, local node) slots of node n.
+
+    Parameters
+    ----------
+    start : (N + 1,), slots : (C K,)
+        Slots of each node, compressed rows.
+    values : (C K, 3), out : (N, 3)
+    """
+    for n in prange(len(start) - 1):
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(start[n], start[n + 1]):
+            slot = slots[i]
+            x += values[slot, 0]
+            y += values[slot, 1]
+            z += values[slot, 2]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+
+
+@njit(**PARALLEL)
+def energy_and_forces(  # type: ignore[no-untyped-def]
+    model, u, cells, gradients, shear, volume, first, energy, by_cell, start, slots, out
 ):
-    """Elastic energy (C,), J, and nodal forces (C, K, 3), N, of each cell.
+    """Elastic energy (C,), J, of each cell, and forces out (N, 3), N.
 
     Parameters
     ----------
@@ -94,6 +114,10 @@ def cell_energy_and_forces(  # type: ignore[no-untyped-def]
     first : int
         Lanes below it have no volume term, and no volume projection is computed
         for them.
+    by_cell : (C, K, 3)
+        Scratch.
+    start, slots
+        See `gather_nodes`.
     """
     count, lanes = cells.shape[0], shear.shape[1]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
@@ -105,14 +129,15 @@ def cell_energy_and_forces(  # type: ignore[no-untyped-def]
             deformation(u, cells[c], gradients[c], 1.0, F)
             signed_svd_lanes(F, U, s, V, B, S)
             if model == COROTATED:
-                start = first if volume[c, lanes - 1] > 0.0 else lanes
-                nearest_volume_lanes(s, v, k, start)
-                corotated_lanes(s, v, k, shear[c], volume[c], start, density, t)
+                lane = first if volume[c, lanes - 1] > 0.0 else lanes
+                nearest_volume_lanes(s, v, k, lane)
+                corotated_lanes(s, v, k, shear[c], volume[c], lane, density, t)
             else:
                 hyperelastic_lanes(model, s, shear[c], volume[c], density, t)
             stress_lanes(U, t, V, P)
             energy[c] = total(density)
-            nodal_forces(P, gradients[c], -1.0, forces[c])
+            nodal_forces(P, gradients[c], -1.0, by_cell[c])
+    gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
 
 
 @njit(**PARALLEL)
@@ -160,8 +185,10 @@ def linearise_cells(  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
-    """Tangent times x (N, 3), written by cell to ``out`` (C, K, 3)."""
+def apply_linearised(  # type: ignore[no-untyped-def]
+    x, cells, gradients, left, right, tangent, by_cell, start, slots, out
+):
+    """Tangent times x (N, 3), out (N, 3); other arguments as `energy_and_forces`."""
     count, lanes = cells.shape[0], tangent.shape[2]
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         D, A = np.empty((9, lanes)), np.empty((9, lanes))
@@ -170,7 +197,8 @@ def apply_linearised(x, cells, gradients, left, right, tangent, out):  # type: i
             _transform(left[c], D, right[c], A, True)
             _tangent_product(tangent[c], A)
             _transform(left[c], A, right[c], D, False)
-            nodal_forces(D, gradients[c], 1.0, out[c])
+            nodal_forces(D, gradients[c], 1.0, by_cell[c])
+    gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
 
 
 @njit(**OPTIONS)
@@ -251,26 +279,6 @@ def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
                             + P[3 * j + 2, q] * gradients[l, 2, q]
                         )
                     out[k, i, l, j] = total
-
-
-@njit(**PARALLEL)
-def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
-    """out[n] = sum of values[slot] over the (cell, local node) slots of node n.
-
-    Parameters
-    ----------
-    start : (N + 1,), slots : (C K,)
-        Slots of each node, compressed rows.
-    values : (C K, 3), out : (N, 3)
-    """
-    for n in prange(len(start) - 1):
-        x, y, z = 0.0, 0.0, 0.0
-        for i in range(start[n], start[n + 1]):
-            slot = slots[i]
-            x += values[slot, 0]
-            y += values[slot, 1]
-            z += values[slot, 2]
-        out[n, 0], out[n, 1], out[n, 2] = x, y, z
 
 
 @njit(**OPTIONS)

@@ -108,7 +108,8 @@ class Space:
         """Gradients and volumes at the quadrature points."""
         local = [self._basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, C, Q)
         lanes = np.ascontiguousarray(np.transpose(np.stack(local), (2, 0, 1, 3)))  # (C, K, 3, Q)
-        out = Quadrature.create(lanes, np.ascontiguousarray(self._basis.dx))
+        weights = np.ascontiguousarray(self._basis.dx)
+        out = Quadrature(lanes, weights, weights)
         if self._kind.bubbles:
             out = out.with_incompatible_modes(self._corners, self._basis.quadrature[0].T)
         return out.with_mean_volume() if self._kind.mean_volume else out

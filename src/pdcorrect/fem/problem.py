@@ -215,14 +215,15 @@ class Problem:
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
-        cells = self.space.local
-        energy = np.empty(len(cells))
-        by_cell = np.empty((*cells.shape, 3))
-        kernels.cell_energy_and_forces(
-            self.materials.model, self._displacement(configuration), cells, self.quadrature.lanes,
+        assembly, u = self.assembly, self._displacement(configuration)
+        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
+        forces = np.empty_like(u)
+        kernels.energy_and_forces(
+            self.materials.model, u, assembly.cells, self.quadrature.lanes,
             *self._stiffness_weights, self.quadrature.first_volume, energy, by_cell,
+            assembly.start, assembly.slots, forces,
         )  # fmt: skip
-        return float(energy.sum()), self.assembly.vector(by_cell)
+        return float(energy.sum()), forces
 
     def volume_ratios(self, positions: Array) -> Array:
         """Smallest det F over the quadrature points of each cell, (C,).
@@ -360,7 +361,7 @@ def _build(
     matrix = mass_matrix(scene.solver.mass, space, materials.density)
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
-    _freeze(space.positions, space.cells, clamps.free, quadrature.gradients, quadrature.weights)
+    _freeze(space.positions, space.cells, clamps.free, quadrature.lanes, quadrature.weights)
     _freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         scene, refine, mesh, space, quadrature, materials, clamps, loads, matrix, cell_size

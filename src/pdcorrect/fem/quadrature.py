@@ -34,11 +34,10 @@ class Quadrature:
 
     Attributes
     ----------
-    gradients : (C, Q, L, 3)
+    lanes : (C, L, 3, Q)
         Gradient of each local shape function with respect to rest coordinates,
-        1/m; nodes first, then internal modes.  A view of a lane-ordered
-        (C, L, 3, Q) array, in which one cell's quadrature points are neighbours
-        in memory.
+        1/m; nodes first, then internal modes.  One cell's quadrature points are
+        neighbours in memory.
     weights : (C, Q)
         Rest volume of each point in the corotated term, m3.
     volume_weights : (C, Q)
@@ -47,20 +46,15 @@ class Quadrature:
         Points before it have no volume term.
     """
 
-    gradients: Array
+    lanes: Array
     weights: Array
     volume_weights: Array
     first_volume: int = 0
 
-    @classmethod
-    def create(cls, lanes: Array, weights: Array) -> Quadrature:
-        """Of gradients (C, L, 3, Q), both terms at every point."""
-        return cls(np.moveaxis(lanes, 3, 1), weights, weights)
-
     @property
-    def lanes(self) -> Array:
-        """The gradients as stored, (C, L, 3, Q), C-contiguous."""
-        return np.moveaxis(self.gradients, 1, 3)
+    def gradients(self) -> Array:
+        """The gradients, (C, Q, L, 3), 1/m: a view of ``lanes``."""
+        return np.moveaxis(self.lanes, 3, 1)
 
     def with_mean_volume(self) -> Quadrature:
         """The volume term moved to one more point with the cell's mean gradients."""
@@ -69,7 +63,7 @@ class Quadrature:
         nothing = np.zeros_like(self.weights)
         return replace(
             self,
-            gradients=np.moveaxis(np.concatenate([self.lanes, mean[..., None]], axis=3), 3, 1),
+            lanes=np.concatenate([self.lanes, mean[..., None]], axis=3),
             weights=np.pad(self.weights, ((0, 0), (0, 1))),
             volume_weights=np.concatenate([nothing, volume[:, None]], axis=1),
             first_volume=self.weights.shape[1],
@@ -84,8 +78,7 @@ class Quadrature:
         slopes = -4.0 * (2.0 * points - 1.0)  # dB_m/dxi_m, (Q, 3)
         inverse = np.linalg.inv(centre)  # (C, m, i): dxi_m/dx_i
         modes = np.einsum("cq,qm,cmi->cmiq", ratio, slopes, inverse)
-        lanes = np.concatenate([self.lanes, modes], axis=1)
-        return replace(self, gradients=np.moveaxis(lanes, 3, 1))
+        return replace(self, lanes=np.concatenate([self.lanes, modes], axis=1))
 
     def laplacian(self, coefficient: Array, local: NDArray[np.int64], size: int) -> sp.csr_matrix:
         """Sum of coefficient grad u . grad v, (size, size), for coefficients (C, Q).

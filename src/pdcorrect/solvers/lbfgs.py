@@ -100,22 +100,20 @@ class History:
 
     Only S, Z, R^-1, D and Y Z^T are kept; products with Y follow from those with
     Z, because y_i . x = z_i . g for x = G^-1 g.  A new pair overwrites the oldest
-    one's rows of S and Z; ``_rows`` says where the pairs are, from old to new.
+    one's rows; ``_rows`` says where the pairs are, from old to new.
     """
 
     def __init__(self, size: int, length: int) -> None:
-        self._s = np.empty((size, length))
-        self._z = np.empty((size, length))
+        self._pairs = np.empty((2, size, length))  # S and Z
         self.clear()
 
     def clear(self) -> None:
         """Forget all pairs."""
-        self._rows = np.empty(0, dtype=np.intp)
+        self._rows: list[int] = []
         self._r_inverse = np.empty((0, 0))
-        self._d = np.empty(0)
         self._yz = np.empty((0, 0))
-        self._sg = np.empty(0)
-        self._zg = np.empty(0)
+        self._d: list[float] = []
+        self._products = np.empty((2, 0))  # S g and Z g
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -125,60 +123,60 @@ class History:
         m = len(self)
         if m == 0:
             return -x
-        w = self._r_inverse @ self._sg
+        sg, zg = self._products
+        w = self._r_inverse @ sg
         weights = np.empty((2, m))
-        weights[0, self._rows] = self._r_inverse.T @ (self._d * w + self._yz @ w - self._zg)
+        weights[0, self._rows] = self._r_inverse.T @ (self._d * w + self._yz @ w - zg)
         weights[1, self._rows] = w
-        out = weights[1] @ self._z[:m]
-        out -= weights[0] @ self._s[:m]
+        out = weights[1] @ self._pairs[1, :m]
+        out -= weights[0] @ self._pairs[0, :m]
         out -= x
         return out
 
     def observe(self, gradient: Array) -> None:
         """Take the products of the stored pairs with a gradient."""
-        m = len(self)
-        self._sg = (self._s[:m] @ gradient)[self._rows]
-        self._zg = (self._z[:m] @ gradient)[self._rows]
+        self._products = (self._pairs[:, : len(self)] @ gradient)[:, self._rows]
 
     def append(self, step: Array, change: Array, gradient: Array, new_gradient: Array) -> None:
         """Add s = ``step``, z = ``change`` of G^-1 g, for the move between two gradients.
 
         A pair without positive curvature is not stored.
         """
-        s_new, z_new = float(step @ new_gradient), float(change @ new_gradient)
-        y_s, y_z = s_new - float(step @ gradient), z_new - float(change @ gradient)
-        old_sg, old_zg = self._sg, self._zg
+        new = np.array([step @ new_gradient, change @ new_gradient])
+        y_s, y_z = float(new[0] - step @ gradient), float(new[1] - change @ gradient)
+        old = self._products
         self.observe(new_gradient)
         if not (y_s > 1e-12 * math.sqrt(abs(y_z) * abs(float(step @ step))) and y_z > 0):
             return
-        s_y, z_y = self._sg - old_sg, self._zg - old_zg
+        both = self._products - old  # S y and Z y
         row = len(self)
-        if row == len(self._s):
-            row = int(self._rows[0])
+        if row == self._pairs.shape[1]:
+            row = self._rows[0]
             self._drop_oldest()
-            s_y, z_y = s_y[1:], z_y[1:]
-        self._s[row], self._z[row] = step, change
-        m = len(self)
-        r_inverse = np.zeros((m + 1, m + 1))
-        r_inverse[:m, :m] = self._r_inverse
-        r_inverse[:m, m] = (self._r_inverse @ s_y) / -y_s
-        r_inverse[m, m] = 1.0 / y_s
-        yz = np.empty((m + 1, m + 1))
-        yz[:m, :m] = self._yz
-        yz[m, :m] = yz[:m, m] = z_y
-        yz[m, m] = y_z
-        self._r_inverse, self._yz = r_inverse, yz
-        self._rows = np.append(self._rows, row)
-        self._d = np.append(self._d, y_s)
-        self._sg = np.append(self._sg, s_new)
-        self._zg = np.append(self._zg, z_new)
+            both = both[:, 1:]
+        self._pairs[0, row], self._pairs[1, row] = step, change
+        self._r_inverse = _bordered(self._r_inverse, (self._r_inverse @ both[0]) / -y_s, 1.0 / y_s)
+        self._yz = _bordered(self._yz, both[1], y_z)
+        self._yz[-1, :-1] = both[1]
+        self._rows = [*self._rows, row]
+        self._d = [*self._d, y_s]
+        self._products = np.column_stack([self._products, new])
 
     def _drop_oldest(self) -> None:
         """R is upper triangular, so the inverse of its trailing part is the trailing part."""
-        self._rows = self._rows[1:]
-        self._r_inverse = self._r_inverse[1:, 1:]
-        self._d, self._yz = self._d[1:], self._yz[1:, 1:]
-        self._sg, self._zg = self._sg[1:], self._zg[1:]
+        self._rows, self._d = self._rows[1:], self._d[1:]
+        self._r_inverse, self._yz = self._r_inverse[1:, 1:], self._yz[1:, 1:]
+        self._products = self._products[:, 1:]
+
+
+def _bordered(matrix: Array, column: Array, corner: float) -> Array:
+    """[[matrix, column], [0, corner]]."""
+    m = len(matrix)
+    out = np.zeros((m + 1, m + 1))
+    out[:m, :m] = matrix
+    out[:m, m] = column
+    out[m, m] = corner
+    return out
 
 
 def minimise(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend
 from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.first_hessian import TrueHessian
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lagged import LaggedHessian
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, minimise
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory
@@ -21,10 +21,10 @@ from pdcorrect.state import State, Status, StepResult, Trajectory
 
 Array = NDArray[np.float64]
 Method = Literal["lbfgs", "local-global"]
-FirstHessian = Literal["auto", "G", "G-scaled", "lagged"]
+FirstHessian = Literal["auto", "G", "G-scaled", "rest", "lagged"]
 
 _PATIENCE = 40
-"""Iterations with one lagged Hessian before it is renewed within the step."""
+"""Iterations with one true Hessian before it is renewed within the step."""
 _DEAREST = 3.0
 """Cost of an iteration with a band factor, in iterations with G, up to which it is the default.
 
@@ -36,7 +36,7 @@ VOLUME_SCALE = 0.25
 G overestimates the stiffness of the volume term where it acts.  In twist,
 bending and free flight at Poisson's ratio 0.3 and 0.45 a quarter took 21 to 46
 per cent fewer iterations than 1, and was the best or within a tenth of it
-(``benchmarks``, case first_hessian).
+(``benchmarks``, case volume_scale).
 """
 
 
@@ -53,12 +53,13 @@ class ProjectiveDynamics(ImplicitStepper):
         Of the coarse cell size; the scene's by default.
     method : {"lbfgs", "local-global"}
         L-BFGS with a line search, or the plain alternation of the thesis.
-    first_hessian : {"auto", "G", "G-scaled", "lagged"}
+    first_hessian : {"auto", "G", "G-scaled", "rest", "lagged"}
         L-BFGS's first approximation: G as in the thesis; G with its volume
-        weight scaled by `VOLUME_SCALE`; or the true Hessian of an earlier frame,
-        factorised again when the iteration counts say that it pays.  "auto"
-        takes the last where its factor is cheap (`lagged_pays`).  The energy,
-        and so the answer, is the same.
+        weight scaled by `VOLUME_SCALE`; the true Hessian of the rest shape, turned
+        with the body (`TrueHessian`), like G factorised once; or that of an earlier
+        frame, factorised again when the iteration counts say that it pays.  "auto"
+        takes "rest" where its factor is cheap (`rest_pays`), else "G-scaled".  The
+        energy, and so the answer, is the same.
     max_iterations : int, optional
         1000 for L-BFGS and 20000 for local/global by default.
     time_step, integrator, backend, recover
@@ -85,11 +86,10 @@ class ProjectiveDynamics(ImplicitStepper):
     ) -> None:
         if method not in ("lbfgs", "local-global"):
             raise InputError(f"method = {method!r}: expected 'lbfgs' or 'local-global'.")
-        if first_hessian not in ("auto", "G", "G-scaled", "lagged"):
-            raise InputError(
-                f"first_hessian = {first_hessian!r}: expected 'auto', 'G', 'G-scaled' or 'lagged'."
-            )
-        if method == "local-global" and first_hessian in ("G-scaled", "lagged"):
+        names = get_args(FirstHessian)
+        if first_hessian not in names:
+            raise InputError(f"first_hessian = {first_hessian!r}: expected {', '.join(names)}.")
+        if method == "local-global" and first_hessian not in ("auto", "G"):
             raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
         if method == "local-global" and problem.materials.model != COROTATED:
             raise InputError(
@@ -101,11 +101,13 @@ class ProjectiveDynamics(ImplicitStepper):
         self.method = method
         self.name = f"projective dynamics ({method})"
         self.first_hessian = "G" if method == "local-global" else first_hessian
-        self._lagged: LaggedHessian | None = None
-        if self.first_hessian in ("auto", "lagged"):
+        self._true: TrueHessian | None = None
+        if self.first_hessian in ("auto", "rest", "lagged"):
             tangents = TangentFactory(problem, backend)
-            if first_hessian == "lagged" or lagged_pays(tangents):
-                self._lagged = LaggedHessian(tangents)
+            if self.first_hessian == "auto":
+                self.first_hessian = "rest" if rest_pays(tangents) else "G-scaled"
+            if self.first_hessian != "G-scaled":
+                self._true = TrueHessian(tangents, lagged=self.first_hessian == "lagged")
         plain = method == "local-global"
         limit = (20000 if plain else 1000) if max_iterations is None else max_iterations
         self._options = replace(
@@ -116,66 +118,72 @@ class ProjectiveDynamics(ImplicitStepper):
 
     def describe(self) -> dict[str, str]:
         """Method, first Hessian, tolerance, step and factorisation in use."""
-        if self._lagged is not None:
-            name = "true Hessian of an earlier frame"
-        else:
-            name = "G" if self._volume_scale() == 1.0 else f"G, volume weight x {VOLUME_SCALE:g}"
-        return {**super().describe(), "first_hessian": name}
+        return {**super().describe(), "first_hessian": _NAMES[self.first_hessian]}
 
     def restore(self, run: Trajectory) -> None:
         """Go on as if this stepper had made ``run``, bit by bit."""
-        if self._lagged is None or not len(run):
+        if self._true is None or not self._true.lagged or not len(run):
             return
         age = int(run.stats["hessian_age"][-1])
         made = len(run) - 1 - max(age, 0)
         state = run.state(made)
         objective = self._objective(state, None, self.time_step, self._integrator)
         counts = [int(n) for n in run.stats["iterations"][made:]]
-        self._lagged.restore(age, counts, objective, run.state(-1).time)
+        self._true.restore(age, counts, objective, run.state(-1).time)
 
     def _factorisation(self) -> str:
-        if self._lagged is not None:
-            return self._lagged.tangents.backend
+        if self._true is not None:
+            return self._true.tangents.backend
         return super()._factorisation()
 
     def _volume_scale(self) -> float:
         return 1.0 if self.first_hessian == "G" else VOLUME_SCALE
 
     def _prepare(self, objective: StepObjective) -> None:
-        if self._lagged is None:
+        if self._true is None:
             super()._prepare(objective)
         else:
-            self._lagged.renew(objective, objective.start)(objective.start)
+            self._true.solver(objective)(objective.start)
+            if self._true.lagged:
+                self._true.forget()
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         result = super()._step(state, forces, h)
-        if self._lagged is None:
+        if self._true is None or not self._true.lagged:
             return result
-        self._lagged.note(result.iterations, result.state.time)
-        return replace(result, stats={**result.stats, "hessian_age": float(self._lagged.age)})
+        self._true.note(result.iterations, result.state.time)
+        return replace(result, stats={**result.stats, "hessian_age": float(self._true.age)})
 
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        if self._lagged is None:
+        if self._true is None:
             solver = self._global_solver(objective.factors)
             return minimise(objective, objective.start, solver, options)
-        return self._minimise_lagged(self._lagged, objective, options)
+        return self._minimise_true(self._true, objective, options)
 
-    def _minimise_lagged(
-        self, lagged: LaggedHessian, objective: StepObjective, options: MinimiserOptions
+    def _minimise_true(
+        self, hessian: TrueHessian, objective: StepObjective, options: MinimiserOptions
     ) -> Minimum:
         """L-BFGS; a Hessian that has not led to the minimum after a while is renewed on the way."""
         limit, most = min(_PATIENCE, options.max_iterations), options.max_iterations
-        solver, start = lagged.solver(objective), objective.start
+        solver, start = hessian.solver(objective), objective.start
         found = minimise(objective, start, solver, replace(options, max_iterations=limit))
         while found.status is Status.ITERATION_LIMIT and found.iterations < most:
-            solver = lagged.renew(objective, found.positions)
+            solver = hessian.renew(objective, found.positions)
             limit = min(_PATIENCE, most - found.iterations)
             again = replace(options, max_iterations=limit)
             found = _after(found, minimise(objective, found.positions, solver, again))
         return found
 
 
-def lagged_pays(tangents: TangentFactory) -> bool:
+_NAMES = {
+    "G": "G",
+    "G-scaled": f"G, volume weight x {VOLUME_SCALE:g}",
+    "rest": "true Hessian of the rest shape, turned with the body",
+    "lagged": "true Hessian of an earlier frame, turned with the body",
+}
+
+
+def rest_pays(tangents: TangentFactory) -> bool:
     """Whether a factor of the true Hessian is small and quick enough to be the default."""
     return tangents.backend == "band" and tangents.iteration_cost < _DEAREST
 

@@ -105,6 +105,12 @@ class TangentFactory:
         except (NotPositiveDefinite, np.linalg.LinAlgError):
             return self._projected(objective, y, self.backend), False
 
+    def first_hessian(self, objective: StepObjective, y: Array) -> TangentSolver:
+        """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid."""
+        if self.backend == "amg":
+            return self.approximate(objective, y)
+        return self.factorise(objective, y)[0]
+
     def approximate(self, objective: StepObjective, y: Array) -> TangentSolver:
         """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap.
 

@@ -1,0 +1,162 @@
+"""Cases that time the solvers on the beam of `beam.py`, each measurement in its own process."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pdcorrect as pc
+from pdcorrect.solvers.integrators import backward_euler
+from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
+from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.tangent_solver import TangentFactory
+
+SIZES = ((24, 1), (24, 2), (24, 4), (56, 4))
+"""(length, refine): 225, 1 225, 7 857 and 18 225 nodes."""
+
+
+def measure(threads: int, name: str, **arguments: Any) -> Any:
+    """What `beam.py` prints."""
+    script = str(Path(__file__).parent / "beam.py")
+    pairs = [f"{key}={value}" for key, value in arguments.items()]
+    command = [sys.executable, script, str(threads), name, *pairs]
+    out = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(out.stdout.splitlines()[-1])
+
+
+def kernel() -> list[dict[str, Any]]:
+    """Nanoseconds a quadrature point, one and two threads."""
+    rows = []
+    for length, refine in SIZES:
+        for threads in (1, 2):
+            row = measure(threads, "kernel", length=length, refine=refine)
+            rows.append({"threads": threads, **row})
+    for element in ("hex8-mean", "hex8-bubble", "hex27"):
+        row = measure(2, "kernel", length=24, refine=2, element=element)
+        rows.append({"threads": 2, "element": element, **row})
+    return rows
+
+
+def beam_steps() -> list[dict[str, Any]]:
+    """Time against tip error: DiffPD's rules and ours, G and the lagged Hessian."""
+    rows = []
+    for length, refine in SIZES:
+        frames = 50 if refine == 1 else 10
+        for threads in (1, 2):
+            for rules in ("diffpd", "ours"):
+                for first in ("G-scaled", "lagged"):
+                    found = measure(
+                        threads, "step", length=length, refine=refine, rules=rules,
+                        first_hessian=first, frames=frames,
+                    )  # fmt: skip
+                    rows += [{"threads": threads, **row} for row in found]
+    return rows
+
+
+def newton() -> list[dict[str, Any]]:
+    """Seconds of a Newton step, direct and by conjugate gradients."""
+    rows = []
+    for length, refine in SIZES:
+        for rules in ("diffpd", "ours"):
+            for linear_solver in ("direct", "cg"):
+                row = measure(
+                    2, "newton", length=length, refine=refine, rules=rules,
+                    linear_solver=linear_solver,
+                )  # fmt: skip
+                rows.append({"threads": 2, **row})
+    return rows
+
+
+def memory() -> list[dict[str, Any]]:
+    """Peak memory of whole processes."""
+    return [
+        measure(2, "memory", length=length, refine=refine, first_hessian=first)
+        for length, refine in SIZES
+        for first in ("G-scaled", "lagged")
+    ]
+
+
+def tangent_factors() -> list[dict[str, Any]]:
+    """Band against cholespy on tangents."""
+    return [measure(1, "tangents", length=length, refine=refine) for length, refine in SIZES]
+
+
+def growth() -> dict[str, Any]:
+    """Time and memory from 225 to 180 000 nodes by the solver of the linear systems."""
+    rows = []
+    for refine in (1, 2, 3, 4, 6, 8, 12):
+        for method in ("cholesky", "amg", "band"):
+            if method != "band" or refine <= 6:
+                rows.append(measure(2, "growth", refine=refine, method=method))
+                print(rows[-1], flush=True)
+    return {"rows": rows, "powers": powers(rows)}
+
+
+def powers(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Exponents of the number of nodes, fitted over meshes of 4 000 nodes and more."""
+    out: dict[str, dict[str, float]] = {}
+    for method in sorted({row["method"] for row in rows}):
+        large = [row for row in rows if row["method"] == method and row["nodes"] > 3000]
+        nodes = np.log([row["nodes"] for row in large])
+        out[method] = {
+            key: float(np.polyfit(nodes, np.log([row[key] for row in large]), 1)[0])
+            for key in ("prepare_s", "step_s", "peak_megabytes")
+        }
+    return out
+
+
+def first_guesses() -> list[dict[str, Any]]:
+    """Mean iterations of a step by where it starts, with a Hessian of the step's start.
+
+    "position" p, "inertial" p + h v (for backward Euler the previous increment repeated),
+    "extrapolated" p + h v + h (v - v_).
+    """
+    from cases import example_beam
+
+    rows = []
+    for motion in ("twist", "bending", "flight"):
+        problem = pc.discretise(example_beam(motion, 0.45), refine=2)
+        tangents = TangentFactory(problem)
+        row: dict[str, Any] = {"motion": motion, "poisson": 0.45}
+        for name in ("position", "inertial", "extrapolated"):
+            row[name] = _iterations(problem, tangents, motion, name)
+        rows.append(row)
+    return rows
+
+
+def _iterations(problem: pc.Problem, tangents: TangentFactory, motion: str, start: str) -> float:
+    from cases import initial_state
+
+    state = initial_state(problem, motion)
+    before, counts = state.velocities, []
+    options = MinimiserOptions(1e-5 * problem.cell_size)
+    for _ in range(8):
+        h, p, v = problem.time_step, state.positions, state.velocities
+        stage = backward_euler(problem, state, h)
+        guess = {"position": p, "inertial": p + h * v, "extrapolated": p + h * (2 * v - before)}
+        stage = replace(stage, start=np.where(problem.free, guess[start], stage.start))
+        loads = problem.external_forces(state.time, state.time + h)
+        objective = StepObjective(problem, state, stage, loads)
+        solver, _ = tangents.factorise(objective, p)
+        found = minimise(objective, objective.start, solver, options)
+        counts.append(found.iterations)
+        before, state = v, stage.finish(found.positions)
+    return float(np.mean(counts))
+
+
+CASES: dict[str, Callable[[], Any]] = {
+    "kernel": kernel,
+    "beam_steps": beam_steps,
+    "newton": newton,
+    "memory": memory,
+    "tangent_factors": tangent_factors,
+    "growth": growth,
+    "first_guesses": first_guesses,
+}

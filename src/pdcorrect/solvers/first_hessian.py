@@ -1,0 +1,177 @@
+"""First Hessians of L-BFGS from the true second derivative, turned with the body.
+
+The Hessian H of an earlier shape is a poor model of the present one mostly because the
+body has turned since, each part by its own rotation.  With R the block diagonal of the
+nodes' rotations since then, R H R^T is again symmetric and positive definite, and needs
+no new factor (the idea of stiffness warping, Mueller et al. 2002, used for a first
+Hessian, so the answer does not depend on it).  Turned in this way even the Hessian of the
+rest shape serves a whole run: like G, it is factorised once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from pdcorrect.fem.energies import nearest_rotation
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.tangent_solver import TangentFactory, TangentSolver
+
+Array = NDArray[np.float64]
+
+INSIDE = -1
+"""Age of a Hessian that was factorised within a step, at no frame."""
+_MODE_STEPS = 2
+"""Newton steps of each cell's internal modes before its Hessian is taken."""
+
+
+class Rotations:
+    """How the parts of a body have turned: rotations of cells and nodes.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        cells, count = problem.cells, len(problem.positions)
+        weights = problem.space.volumes()[:, None]
+        quadrature = problem.quadrature
+        shares = quadrature.weights / weights
+        lanes = quadrature.lanes[:, : cells.shape[1]]
+        self._mean = np.einsum("cq,clxq->clx", shares, lanes, optimize=True)
+        owners = np.repeat(np.arange(len(cells)), cells.shape[1])
+        ones = np.ones(cells.size)
+        self._gather = sp.csr_matrix((ones, (cells.ravel(), owners)), shape=(count, len(cells)))
+        self._held = ~problem.free.all(axis=1)
+
+    def of_cells(self, y: Array) -> Array:
+        """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3)."""
+        u = y[: len(self._problem.positions)] - self._problem.positions
+        mean = np.einsum("cki,ckj->cij", u[self._problem.cells], self._mean, optimize=True)
+        return nearest_rotation(np.eye(3) + mean)
+
+    def since(self, before: Array, y: Array) -> Array:
+        """Rotations (N + B, 3, 3) of nodes and modes from cells' ``before`` (C, 3, 3) to y.
+
+        A node turns as its cells do on average; one with a clamped component does not.
+        """
+        turns = self.of_cells(y) @ np.swapaxes(before, -1, -2)
+        total = (self._gather @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
+        nodes = nearest_rotation(total)
+        nodes[self._held] = np.eye(3)
+        modes = self._problem.space.internal // len(turns)
+        return np.concatenate([nodes, np.repeat(turns, modes, axis=0)]) if modes else nodes
+
+
+class TurnedSolver:
+    """r -> R H^-1 R^T r on configurations (N + B, 3)."""
+
+    def __init__(self, solver: TangentSolver, rotations: Array) -> None:
+        self._solver = solver
+        self._turn = np.ascontiguousarray(rotations)
+        self._back = np.ascontiguousarray(np.swapaxes(rotations, -1, -2))
+
+    def __call__(self, r: Array) -> Array:
+        return _turned(self._turn, self._solver(_turned(self._back, r)))
+
+
+def _turned(rotations: Array, x: Array) -> Array:
+    return np.matmul(rotations, x[..., None])[..., 0]
+
+
+class TrueHessian:
+    """A factor of the Hessian at some shape, turned to each step's first iterate.
+
+    Parameters
+    ----------
+    tangents : TangentFactory
+    lagged : bool
+        Whether to take a new factor when that pays; otherwise the rest shape's is
+        kept, and steps do not depend on those before.
+
+    Attributes
+    ----------
+    age : int
+        Steps since the factor in use was made, 0 in the step that made it; `INSIDE`
+        if that was not at the start of a step.
+
+    Notes
+    -----
+    A factor's first step needs the fewest iterations; what later steps need more is
+    its loss.  When the losses since the last factorisation add up to the cost of one,
+    it is time for the next: this keeps the total within twice the best possible.  The
+    rule counts iterations, not seconds, and a state that does not continue the run at
+    hand gets a new factor, so runs can be repeated exactly.
+    """
+
+    def __init__(self, tangents: TangentFactory, lagged: bool) -> None:
+        self.tangents = tangents
+        self.lagged = lagged
+        self.age = INSIDE
+        self._problem = tangents.problem
+        self._rotations = Rotations(tangents.problem)
+        self._cost = tangents.factor_cost
+        self._solver: TangentSolver | None = None  # none has been made
+        self._factors = (0.0, 0.0)
+        self._shape = np.empty(0)  # rotations of the cells where the factor was made
+        self._counts: list[int] = []
+        self._time = 0.0
+
+    def solver(self, objective: StepObjective) -> TurnedSolver:
+        """H^-1 for the step that ``objective`` belongs to."""
+        if self._solver is None or self._stale(objective):
+            y = self._at_start(objective) if self.lagged else self._at_rest()
+            return self._turned(self._renew(objective, y, 0), objective.start)
+        self.age += 1
+        return self._turned(self._solver, objective.start)
+
+    def renew(self, objective: StepObjective, y: Array) -> TurnedSolver:
+        """H^-1 at a configuration within the step, which the next step will not keep."""
+        return self._turned(self._renew(objective, y, INSIDE), y)
+
+    def forget(self) -> None:
+        """Take a new factor at the next step."""
+        self.age = INSIDE
+
+    def note(self, iterations: int, time: float) -> None:
+        """What the step took, and the time that it led to (s)."""
+        self._counts.append(iterations)
+        self._time = time
+
+    def restore(self, age: int, counts: list[int], objective: StepObjective, time: float) -> None:
+        """Take up a factor made ``age`` steps before the last one, in the step of ``objective``.
+
+        ``counts`` are the iterations of that step and of those since; ``time`` (s) is
+        where the run goes on.
+        """
+        if self.lagged and age != INSIDE:
+            self._renew(objective, self._at_start(objective), age)
+            self._counts, self._time = counts, time
+
+    def _at_start(self, objective: StepObjective) -> Array:
+        return self._problem.relaxed(objective.state.positions, steps=_MODE_STEPS)
+
+    def _at_rest(self) -> Array:
+        return self._problem.extended(self._problem.positions)
+
+    def _stale(self, objective: StepObjective) -> bool:
+        if self.age == INSIDE or objective.factors != self._factors:
+            return True
+        return self.lagged and (objective.state.time != self._time or self._spent())
+
+    def _renew(self, objective: StepObjective, y: Array, age: int) -> TangentSolver:
+        self._solver = self.tangents.first_hessian(objective, y)
+        self._shape = self._rotations.of_cells(y)
+        self._factors, self.age, self._counts = objective.factors, age, []
+        return self._solver
+
+    def _turned(self, solver: TangentSolver, y: Array) -> TurnedSolver:
+        return TurnedSolver(solver, self._rotations.since(self._shape, y))
+
+    def _spent(self) -> bool:
+        fewest = min(self._counts, default=0)
+        return sum(n - fewest for n in self._counts) >= self._cost
