@@ -116,6 +116,7 @@ def drift(values):
 STEPPERS = {
     "newton": lambda problem: pc.Newton(problem, tolerance=1e-12),
     "pd": lambda problem: pc.ProjectiveDynamics(problem, tolerance=1e-10),
+    "pd, not even converged well": lambda problem: pc.ProjectiveDynamics(problem, tolerance=1e-4),
 }
 
 
@@ -125,7 +126,7 @@ def test_free_flight_keeps_linear_momentum(name, radius, solver):
     problem, state = flight("hex8-bubble", "consistent", name, radius)
     run = pc.rollout(STEPPERS[solver](problem), 50, state=state)
     assert set(run.stats["status"]) == {"CONVERGED"}
-    assert drift(momenta(problem, run)[0]) < (1e-12 if solver == "newton" else 1e-11)
+    assert drift(momenta(problem, run)[0]) < 1e-12
 
 
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])

@@ -99,6 +99,7 @@ class ImplicitStepper:
         self._backend = backend
         self._recover = recover
         self._solvers: dict[tuple[float, float], GlobalSolver] = {}
+        self._adrift = bool(problem.free.all(axis=0).any())
 
     def __call__(
         self, state: State, forces: Array | None = None, time_step: float | None = None
@@ -211,6 +212,9 @@ class ImplicitStepper:
             effort.add(minimum)
             if minimum.status is Status.CONVERGED:
                 minimum.status = Status.RECOVERED
+        if minimum.status.ok and self._adrift:
+            y, gradient = objective.carried(minimum.positions, minimum.gradient)
+            minimum = replace(minimum, positions=y, gradient=gradient)
         minimum.estimate *= stage.gain
         return _outcome(self.problem, state, objective, minimum, h)
 

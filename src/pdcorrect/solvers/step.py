@@ -92,6 +92,24 @@ class StepObjective:
             gradient += force
         return float(value), gradient
 
+    def carried(self, y: Array, gradient: Array) -> tuple[Array, Array]:
+        """Y moved as a whole to where the forces on the body add up to its inertia.
+
+        And the gradient there.  Only along axes without a clamp: a translation changes
+        nothing but inertia, so this minimises gamma along it exactly, and linear momentum
+        does not depend on the accuracy of the rest.
+        """
+        nodes, factor = len(self.problem.positions), self.factors[0]
+        if not factor:
+            return y, gradient
+        mass = self.problem.mass
+        shift = -gradient[:nodes].sum(axis=0) / (factor * mass.sum())
+        shift *= self.problem.free.all(axis=0)
+        y, gradient = y.copy(), gradient.copy()
+        y[:nodes] += shift
+        gradient[:nodes] += factor * mass[:, None] * shift
+        return y, gradient
+
     def damping_loss(self, y: Array, h: float) -> float:
         """Energy that the damping takes out in a step of h seconds, J."""
         if self._damping is None:
