@@ -48,7 +48,7 @@ class Damping(Strict):
         1/s.
     stiffness
         s; K is the tangent stiffness at the start of each step, made positive
-        semi-definite, so rigid motion is not damped by it.
+        semi-definite.  It turns with the body, a step late.
     """
 
     mass: NonNegative = 0.0
