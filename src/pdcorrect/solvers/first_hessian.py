@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 INSIDE = -1
 """Age of a Hessian that was factorised within a step, at no frame."""
+_LARGEST = 1e50
+"""Deformation gradients are cut off here, so that their squares' squares are finite."""
 _MODE_STEPS = 2
 """Newton steps of each cell's internal modes before its Hessian is taken."""
 
@@ -49,10 +51,13 @@ class Rotations:
         self._held = ~problem.free.all(axis=1)
 
     def of_cells(self, y: Array) -> Array:
-        """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3)."""
+        """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3).
+
+        Those of absurd or infinite deformations mean nothing: such a step fails by name.
+        """
         u = y[: len(self._problem.positions)] - self._problem.positions
         mean = np.einsum("cki,ckj->cij", u[self._problem.cells], self._mean, optimize=True)
-        return nearest_rotation(np.eye(3) + mean)
+        return nearest_rotation(np.eye(3) + np.clip(np.nan_to_num(mean), -_LARGEST, _LARGEST))
 
     def since(self, before: Array, y: Array) -> Array:
         """Rotations (N + B, 3, 3) of nodes and modes from cells' ``before`` (C, 3, 3) to y.
