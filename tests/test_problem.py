@@ -440,6 +440,19 @@ def test_the_default_torsion_axis_is_the_middle_of_the_body():
     np.testing.assert_allclose(torque[1:], 0, atol=1e-12)
 
 
+@pytest.mark.parametrize("refine", [1, 4])
+@pytest.mark.parametrize("distribution", ["nodal", "consistent"])
+@pytest.mark.parametrize("element", ["hex8", "hex27"])
+def test_rounded_coordinates_on_the_torsion_axis_have_no_direction(element, distribution, refine):
+    """Of 1 and 6 cells: the axis goes through points of the quadrature, or through nodes."""
+    for width in (1, 6):
+        load = {"kind": "torsion", "strength": 1.0, "distribution": distribution}
+        body = {"shape": "beam", "cells": [2, width, width], "cell_size": 0.07}
+        scene = beam(clamps=[], loads=[load]).with_changes(body=body)
+        forces = pc.discretise(scene, refine, element=element).external_forces(0.0)
+        np.testing.assert_allclose(forces.sum(axis=0), 0, atol=1e-10 * np.abs(forces).max())
+
+
 def test_other_materials_make_another_problem():
     problem = pc.discretise(beam(poisson=0.3))
     other = problem.with_material(young=2e6, poisson=0.3, density=500.0)

@@ -236,3 +236,12 @@ def test_any_text_gives_a_scene_or_a_scene_error(text):
         pc.Scene.from_toml(text)
     except SceneError as error:
         assert str(error)
+
+
+def test_best_coarse_changes_element_and_mass_only():
+    scene = cross(solver={"tolerance": 1e-3})
+    best = pc.best_coarse(scene)
+    assert (best.solver.element, best.solver.mass) == ("hex8-bubble-mean", "averaged")
+    assert best.with_changes(solver=scene.solver.model_dump()) == scene
+    assert pc.best_coarse(best) == best
+    assert (scene.solver.element, scene.solver.mass) == ("hex8", "lumped")

@@ -2,18 +2,22 @@
 
 import importlib.util
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
+import pdcorrect as pc
+
 FOLDER = Path(__file__).parent.parent / "validation"
-CASES = ("cantilever", "cook", "locking")
+CASES = ("best_coarse", "cantilever", "cook", "locking")
 
 
 def case(name):
     """The module of a case; its folder is no package."""
     spec = importlib.util.spec_from_file_location(f"{name}_run", FOLDER / name / "run.py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
@@ -51,6 +55,16 @@ def test_shear_locking_and_distortion():
     run = case("locking")
     check("locking", run.shear(("hex8", "hex8-bubble", "hex8-bubble-mean"), (50,)))
     check("locking", run.distortion(("hex8-bubble", "hex27")))
+
+
+def test_best_coarse_model_of_a_short_beam():
+    run = case("best_coarse")
+    best = pc.best_coarse(run.scene("short beam, bend")).solver
+    assert (best.element, best.mass) == (run.BEST.element, "averaged")
+    assert run.BEST.lumped == 0.5
+    check("best_coarse", run.shares("short beam, bend", (run.BEST,)))
+    for modes, count in (("3 warping", 6), ("6 products", 9)):
+        assert run.zero_modes(modes) == count
 
 
 @pytest.mark.parametrize("name", CASES)

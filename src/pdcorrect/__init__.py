@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Scene": "pdcorrect.scene",
+    "best_coarse": "pdcorrect.scene",
     "State": "pdcorrect.state",
     "Status": "pdcorrect.state",
     "StepResult": "pdcorrect.state",
@@ -45,6 +46,7 @@ _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
 __all__ = [  # noqa: RUF022
     "Scene",
+    "best_coarse",
     "State",
     "Status",
     "StepResult",
@@ -83,7 +85,7 @@ if TYPE_CHECKING:
     from pdcorrect.figures import render
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
     from pdcorrect.io.vtk import write_vtu_series
-    from pdcorrect.scene import Scene
+    from pdcorrect.scene import Scene, best_coarse
     from pdcorrect.solvers.newton import Newton
     from pdcorrect.solvers.projective import ProjectiveDynamics
     from pdcorrect.solvers.reactions import reactions

@@ -224,16 +224,22 @@ _SAMPLERS: dict[type, Callable[..., Sampler]] = {
 }
 
 
+_ON_AXIS = 1e-9
+"""Distance from the axis, of the body's extent, that is taken as zero."""
+
+
 def torsion_field(points: Array, attraction: float, stretch: float) -> Array:
     """Unit rotational field of the thesis, eq. 6-1 to 6-3, at ``points`` (..., 3).
 
     f = (stretch, -z - attraction y, y - attraction z) / |...|, and 0 where the
-    numerator vanishes (on the axis with no stretch).
+    numerator vanishes (on the axis with no stretch) or is only a rounding error
+    of the coordinates.
     """
     y, z = points[..., 1], points[..., 2]
     f = np.stack([np.full_like(y, stretch), -z - attraction * y, y - attraction * z], axis=-1)
     length = np.linalg.norm(f, axis=-1, keepdims=True)
-    return np.divide(f, length, out=np.zeros_like(f), where=length > 0)
+    rounding = _ON_AXIS * np.abs(points).max(initial=0.0)
+    return np.divide(f, length, out=np.zeros_like(f), where=length > rounding)
 
 
 def cofactor(F: Array) -> Array:

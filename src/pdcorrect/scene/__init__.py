@@ -12,7 +12,7 @@ from pdcorrect.scene.clamps import Clamp, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region
-from pdcorrect.scene.scene import Damping, Scene, Solver, Time
+from pdcorrect.scene.scene import Damping, Scene, Solver, Time, best_coarse
 
 __all__ = [
     "Beam",
@@ -38,4 +38,5 @@ __all__ = [
     "Traction",
     "Voxels",
     "Weight",
+    "best_coarse",
 ]

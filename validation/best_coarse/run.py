@@ -1,0 +1,398 @@
+"""How much of the plain coarse mesh's error better elements, masses and loads remove."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+import pdcorrect as pc
+from pdcorrect.fem.loads import Amplitude, NodalLoad, torsion_field
+from pdcorrect.fem.operators import Space
+from pdcorrect.fem.quadrature import Quadrature
+from pdcorrect.scene import Torsion
+
+Array = np.ndarray
+
+CELL = 0.05
+FRAMES = 25
+TOLERANCE = 1e-6
+"""Of the coarse cell size, of every run."""
+
+BODIES: dict[str, dict[str, Any]] = {
+    "beam": {"shape": "beam", "cells": [12, 2, 2], "cell_size": CELL},
+    "short beam": {"shape": "beam", "cells": [4, 2, 2], "cell_size": CELL},
+    "thin beam": {"shape": "beam", "cells": [12, 1, 1], "cell_size": CELL},
+    "cross": {
+        "shape": "cross", "cells": [8, 2, 2], "cell_size": CELL,
+        "arm_start": 5, "arm_width": 2, "arm_length": 2,
+    },
+    "weight": {
+        "shape": "weight", "cell_size": CELL, "support_cells": [6, 2, 2], "pendulum_start": 2,
+        "pendulum_cells": [2, 2, 6], "weight_start": 2, "weight_cells": [4, 4, 2],
+    },
+}  # fmt: skip
+MATERIAL = {"young": 3e5, "poisson": 0.4, "density": 1e3}
+LEFT = {"region": {"plane": "x", "at": "min"}}
+RIGHT = {"region": {"plane": "x", "at": "max"}}
+BOTTOM = {"plane": "z", "at": "min"}
+CLAMPS = {"weight": [LEFT, RIGHT]}
+"""Of the bodies that are not held at the left only."""
+
+Loads = dict[str, Any]
+
+
+def gravity(*acceleration: float) -> Loads:
+    """Uniform acceleration, m/s2."""
+    return {"kind": "gravity", "acceleration": acceleration}
+
+
+def force(region: dict[str, Any], *total: float, window: Sequence[float] | None = None) -> Loads:
+    """Total force on a plane, N."""
+    load = {"kind": "force", "force": total, "region": region}
+    return load if window is None else {**load, "window": window}
+
+
+def twist(strength: float, linear: bool = False) -> Loads:
+    """The thesis's field of unit vectors (N/m3), or one linear in the distance (N/m3 a cell)."""
+    return {"kind": "torsion", "strength": strength, "linear": linear}
+
+
+IMPULSE = (0.0, 0.03)
+MOTIONS: dict[str, Loads] = {
+    "beam, bend": gravity(0, 0, -9.81),
+    "beam, impulse": force(RIGHT["region"], 0, 30, 60, window=IMPULSE),
+    "beam, stretch": force(RIGHT["region"], 400, 0, 0),
+    "beam, twist unit": twist(4e4),
+    "beam, twist linear": twist(4e4, True),
+    "cross, bend": gravity(0, 0, -15.0),
+    "cross, impulse": force(RIGHT["region"], 0, 80, 120, window=IMPULSE),
+    "cross, stretch": force(RIGHT["region"], 300, 0, 0),
+    "cross, twist unit": twist(4e4),
+    "cross, twist linear": twist(2e4, True),
+    "weight, bend": gravity(0, 15.0, 0),
+    "weight, impulse": force(BOTTOM, 60, 90, 0, window=IMPULSE),
+    "weight, stretch": force(BOTTOM, 0, 0, -300),
+    "weight, twist unit": twist(4e4),
+    "weight, twist linear": twist(1e4, True),
+}
+
+
+CHECKS: dict[str, Loads] = {
+    "short beam, bend": gravity(0, 0, -9.81),
+    "short beam, twist unit": twist(4e4),
+}
+"""For the reference's own error, which takes an 8x8x8 mesh."""
+THIN: dict[str, Loads] = {
+    "thin beam, bend": gravity(0, 0, -4.0),
+    "thin beam, stretch": force(RIGHT["region"], 100, 0, 0),
+    "thin beam, twist unit": twist(6e4),
+}
+"""One cell through the thickness."""
+ALL = MOTIONS | CHECKS | THIN
+
+
+@dataclass(frozen=True)
+class Model:
+    """A discretisation.
+
+    Attributes
+    ----------
+    lumped : float
+        Share a of the lumped mass in M = a lumped + (1 - a) consistent.
+    integrated : bool
+        Force densities integrated with the shape functions; otherwise their values at the
+        nodes times the nodes' volumes.  Both are the same for a uniform density.
+    modes : str
+        Name of further internal modes in `MODES`.
+    """
+
+    element: str
+    lumped: float = 1.0
+    integrated: bool = False
+    refine: int = 1
+    modes: str = ""
+
+    @property
+    def label(self) -> str:
+        """Its row in the tables."""
+        names = {0.0: "consistent", 0.5: "averaged", 1.0: "lumped"}
+        mass = names.get(self.lumped, f"{self.lumped:g} lumped")
+        cells = "" if self.refine == 1 else f" {self.refine}x"
+        modes = f" + {self.modes}" if self.modes else ""
+        loads = "integrated" if self.integrated else "nodal"
+        return f"{self.element}{modes}{cells}, {mass}, {loads}"
+
+
+PLAIN = Model("hex8")
+DEFAULT = Model("hex8", 1.0, True)
+"""What a scene gives that says nothing."""
+REFERENCE = Model("hex8-bubble", 0.5, True, refine=4)
+BEST = Model("hex8-bubble-mean", 0.5, True)
+"""What `pdcorrect.best_coarse` chooses."""
+MODELS = (
+    Model("hex8", refine=2),
+    DEFAULT,
+    Model("hex8", 0.5, True),
+    Model("hex8", 0.0, True),
+    Model("hex8-mean", 0.5, True),
+    Model("hex8-bubble", 1.0, False),
+    Model("hex8-bubble", 0.5, False),
+    Model("hex8-bubble", 0.0, False),
+    Model("hex8-bubble-mean", 1.0, False),
+    *(Model("hex8-bubble", a, True) for a in (1.0, 0.75, 0.5, 0.25, 0.0)),
+    *(Model("hex8-bubble-mean", a, True) for a in (1.0, 0.75, 0.5, 0.25, 0.0)),
+    *(Model("hex8-bubble", a, True, modes="3 warping") for a in (0.5, 0.0)),
+    Model("hex27", 0.5, True),
+)
+THIN_MODELS = (
+    Model("hex8", 0.5, True), Model("hex8-mean", 0.5, True), Model("hex8-bubble", 0.5, True),
+    BEST, Model("hex27", 0.5, True),
+)  # fmt: skip
+THESIS = ("beam, twist unit", "cross, twist unit", "weight, impulse")
+THESIS_MODELS = (
+    Model("hex8", refine=2), Model("hex8", 0.5), Model("hex8", 0.0), Model("hex8-mean", 0.5),
+    *(Model("hex8-bubble", a) for a in (1.0, 0.5, 0.0)),
+    *(Model("hex8-bubble-mean", a) for a in (1.0, 0.5, 0.0)),
+    Model("hex27", 0.5),
+)  # fmt: skip
+
+
+# --- further internal modes ----------------------------------------------------------------
+
+
+def _quadratic(points: Array, pairs: Iterable[tuple[int, int]]) -> Array:
+    """Gradients of s_n (1/3 - s_m^2), (Q, modes, 3), on the cell [-1, 1]^3 for pairs (m, n)."""
+    s = 2.0 * points - 1.0
+    out = []
+    for m, n in pairs:
+        gradient = np.zeros_like(s)
+        gradient[:, n] = 1.0 / 3.0 - s[:, m] ** 2
+        gradient[:, m] = -2.0 * s[:, m] * s[:, n]
+        out.append(2.0 * gradient)
+    return np.stack(out, axis=1)
+
+
+def _antisymmetric(points: Array) -> Array:
+    """Warping of a quarter of a square section: s_n (1/3 - s_m^2) - s_m (1/3 - s_n^2)."""
+    pairs = [(0, 1), (1, 2), (2, 0)]
+    return _quadratic(points, pairs) - _quadratic(points, [(n, m) for m, n in pairs])
+
+
+def _all(points: Array) -> Array:
+    """All six products of a bubble and another coordinate."""
+    return _quadratic(points, [(m, n) for m in range(3) for n in range(3) if m != n])
+
+
+MODES: dict[str, Callable[[Array], Array]] = {"3 warping": _antisymmetric, "6 products": _all}
+"""Gradients (Q, modes, 3) on the unit cell; their mean over the Gauss points is zero."""
+
+
+class EnrichedSpace(Space):
+    """A space with more internal modes, on cells that are cubes."""
+
+    def __init__(self, plain: Space, gradients: Callable[[Array], Array], size: float) -> None:
+        self.__dict__.update(plain.__dict__)
+        points = self._basis.quadrature[0].T
+        self._more = gradients(points) / size
+        cells, count = len(self.cells), self._more.shape[1]
+        modes = len(self.positions) + self.internal + np.arange(cells * count)
+        self.local = np.concatenate([self.local, modes.reshape(cells, count)], axis=1)
+        self.internal += cells * count
+
+    def quadrature(self) -> Quadrature:
+        """Gradients and volumes at the quadrature points."""
+        plain = super().quadrature()
+        more = np.broadcast_to(self._more, (len(self.cells), *self._more.shape))
+        return Quadrature.create(
+            np.ascontiguousarray(
+                np.moveaxis(np.concatenate([plain.gradients, more], axis=2), 1, 3)
+            ),
+            plain.weights,
+        )
+
+
+def enriched(problem: pc.Problem, modes: str) -> pc.Problem:
+    """The problem with the further internal modes of a name."""
+    if not modes:
+        return problem
+    space = EnrichedSpace(problem.space, MODES[modes], problem.cell_size / problem.refine)
+    return replace(problem, space=space, quadrature=space.quadrature())
+
+
+# --- problems ------------------------------------------------------------------------------
+
+
+def scene(motion: str, frames: int = FRAMES, **load: Any) -> pc.Scene:
+    """The scene of a motion; ``load`` changes keys of its load."""
+    body = motion.split(",")[0]
+    keys = {**ALL[motion], **load}
+    keys.pop("linear", None)
+    return pc.Scene(
+        name=motion, body=BODIES[body], material=MATERIAL, loads=[keys],
+        clamps=CLAMPS.get(body, [LEFT]), time={"step": 0.01, "frames": frames},
+        solver={"tolerance": TOLERANCE},
+    )  # fmt: skip
+
+
+def discretised(motion: str, model: Model, frames: int = FRAMES) -> pc.Problem:
+    """A motion's problem."""
+    keys, told = ALL[motion], scene(motion, frames)
+    problem = pc.discretise(told, model.refine, "consistent", model.element)
+    problem = enriched(problem, model.modes)
+    share = model.lumped
+    lumped = pc.discretise(told, model.refine, "lumped", model.element).mass_matrix
+    matrix = lumped if share == 1.0 else share * lumped + (1.0 - share) * problem.mass_matrix
+    loads = problem.loads
+    if isinstance(told.loads[0], Torsion):
+        loads = (torsion(problem, told.loads[0], keys["linear"], model.integrated),)
+    return replace(problem, mass_matrix=matrix.tocsr(), loads=loads)
+
+
+def torsion(problem: pc.Problem, load: Torsion, linear: bool, integrated: bool) -> NodalLoad:
+    """A rotational force density, integrated, or its value at each node times the node's volume."""
+    x = problem.positions
+    centre = 0.5 * (x.min(axis=0) + x.max(axis=0))
+
+    def density(points: Array) -> Array:
+        if not linear:
+            return load.strength * torsion_field(points - centre, 0.0, 0.0)
+        y, z = np.moveaxis(points - centre, -1, 0)[1:]
+        return load.strength / problem.cell_size * np.stack([np.zeros_like(y), -z, y], axis=-1)
+
+    if integrated:
+        pattern = problem.space.body_load(density(problem.space.interpolate(x)))
+    else:
+        pattern = density(x) * (problem.mass / MATERIAL["density"])[:, None]
+    return NodalLoad(Amplitude(load), pattern)
+
+
+def thesis_problem(motion: str, model: Model) -> pc.Problem:
+    """Forces on the coarse nodes only, on every mesh: ``distribution = "nodal"``."""
+    keys: dict[str, Any] = {"distribution": "nodal"}
+    if ALL[motion]["kind"] == "torsion":
+        keys["strength"] = ALL[motion]["strength"] * CELL**3 / 4  # N on each coarse node
+    mass = {0.0: "consistent", 0.5: "averaged", 1.0: "lumped"}[model.lumped]
+    return pc.discretise(scene(motion, **keys), model.refine, mass, model.element)
+
+
+# --- figures -------------------------------------------------------------------------------
+
+
+def run(problem: pc.Problem, first_hessian: str = "auto") -> pc.Trajectory:
+    """All frames by projective dynamics."""
+    return pc.rollout(pc.ProjectiveDynamics(problem, first_hessian=first_hessian))
+
+
+def on_coarse(trajectory: pc.Trajectory, coarse: pc.Trajectory) -> Array:
+    """Positions (T+1, N, 3) on the plain coarse nodes."""
+    return pc.restrict(trajectory, to=coarse).positions
+
+
+def shares(
+    motion: str,
+    models: Sequence[Model],
+    make: Callable[[str, Model], pc.Problem] = discretised,
+    title: str = "",
+) -> common.Figures:
+    """Omega of each model, and in cells what it is a share of."""
+    plain = run(make(motion, PLAIN))
+    truth = on_coarse(run(make(motion, REFERENCE)), plain)
+    name = f"{title}{motion}"
+    figures = {
+        f"{name}, displacement": pc.metrics.largest_displacement(truth) / CELL,
+        f"{name}, plain error": pc.metrics.rms_error(plain, truth) / CELL,
+    }
+    for model in models:
+        found = on_coarse(run(make(motion, model)), plain)
+        figures[f"{name}, {model.label}"] = pc.metrics.error_corrected(found, plain, truth)
+    return figures
+
+
+def reference_error(motion: str) -> common.Figures:
+    """Omega of the reference and of the best coarse model against a mesh twice as fine."""
+    plain = run(discretised(motion, PLAIN))
+    truth = on_coarse(run(discretised(motion, replace(REFERENCE, refine=8))), plain)
+    figures: common.Figures = {}
+    for model in (REFERENCE, BEST):
+        found = on_coarse(run(discretised(motion, model)), plain)
+        label = f"{motion}, {model.label}, against 8x"
+        figures[label] = pc.metrics.error_corrected(found, plain, truth)
+        figures[f"{label}, error"] = pc.metrics.rms_error(found, truth) / CELL
+    return figures
+
+
+def iterations(motion: str) -> common.Figures:
+    """Mean PD iterations a frame."""
+    figures: common.Figures = {}
+    for model in (PLAIN, Model("hex8-bubble", 0.5, True), BEST):
+        problem = discretised(motion, model)
+        for hessian in ("G-scaled", "lagged"):
+            mean = run(problem, hessian).stats["iterations"].mean()
+            figures[f"iterations, {motion}, {model.element}, {hessian}"] = float(mean)
+    return figures
+
+
+def zero_modes(modes: str) -> int:
+    """Motions of one free cell, internal modes included, that cost no energy."""
+    body = {"shape": "beam", "cells": [1, 1, 1], "cell_size": CELL}
+    told = pc.Scene(body=body, material=MATERIAL, time={"step": 1.0, "frames": 1})
+    problem = enriched(pc.discretise(told, element="hex8-bubble"), modes)
+    tangent = problem.linearise(problem.extended(problem.positions)).assemble().toarray()
+    values = np.linalg.eigvalsh(0.5 * (tangent + tangent.T))
+    return int((values < 1e-10 * values[-1]).sum())
+
+
+def summary(figures: common.Figures) -> common.Figures:
+    """Over all motions: Omega of the summed squared errors, mean and least Omega.
+
+    Against the plain mesh, and against what a scene's defaults give.
+    """
+    plain = np.array([figures[f"{motion}, plain error"] for motion in MOTIONS]) ** 2
+    out: common.Figures = {}
+    left = {
+        model: np.array([1.0 - figures[f"{motion}, {model.label}"] / 100.0 for motion in MOTIONS])
+        for model in (DEFAULT, *MODELS)
+    }
+    for against, base in (("", np.ones(len(plain))), (" against defaults", left[DEFAULT])):
+        for model in MODELS:
+            row = 100.0 * (1.0 - left[model] / base)
+            pooled = 1.0 - (plain @ left[model]) / (plain @ base)
+            out[f"pooled{against}, {model.label}"] = float(100.0 * pooled)
+            out[f"mean{against}, {model.label}"] = float(row.mean())
+            out[f"least{against}, {model.label}"] = float(row.min())
+    return out
+
+
+def compute() -> common.Figures:
+    """All figures."""
+    figures: common.Figures = {}
+    for motion in MOTIONS:
+        figures |= shares(motion, MODELS)
+        figures |= iterations(motion)
+    for motion in THESIS:
+        figures |= shares(motion, THESIS_MODELS, thesis_problem, "nodal forces, ")
+    for motion in THIN:
+        figures |= shares(motion, THIN_MODELS)
+    for motion in CHECKS:
+        figures |= shares(motion, (BEST,))
+        figures |= reference_error(motion)
+    for modes in MODES:
+        figures[f"zero modes, {modes}"] = zero_modes(modes)
+    return figures | summary(figures)
+
+
+def main() -> int:
+    """Compute and compare."""
+    return common.finish(Path(__file__).parent, compute())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
