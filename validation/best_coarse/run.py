@@ -211,12 +211,8 @@ class EnrichedSpace(Space):
         """Gradients and volumes at the quadrature points."""
         plain = super().quadrature()
         more = np.broadcast_to(self._more, (len(self.cells), *self._more.shape))
-        return Quadrature.create(
-            np.ascontiguousarray(
-                np.moveaxis(np.concatenate([plain.gradients, more], axis=2), 1, 3)
-            ),
-            plain.weights,
-        )
+        lanes = np.concatenate([plain.lanes, np.moveaxis(more, 1, 3)], axis=1)
+        return replace(plain, lanes=lanes)
 
 
 def enriched(problem: pc.Problem, modes: str) -> pc.Problem:

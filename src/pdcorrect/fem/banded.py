@@ -105,9 +105,7 @@ class BandFactor:
     def solve(self, b: Array) -> Array:
         """X (N, 3) with A x = b on the free components, zero elsewhere."""
         out = np.zeros(b.size)
-        out[self._flat] = la.cho_solve_banded(
-            (self._factor, True), b.ravel()[self._flat], overwrite_b=True, check_finite=False
-        )
+        out[self._flat], _ = la.lapack.dpbtrs(self._factor, b.ravel()[self._flat], lower=1)
         return out.reshape(b.shape)
 
 

@@ -28,6 +28,8 @@ OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"
 
 _SWEEPS = 12
 _NEWTON_STEPS = 40
+_SETTLED = 1e-9
+"""Last change of the smallest stretch: its error is of the order of the square."""
 _LARGE_VOLUME = 4.0
 """Above this det F the nearest unit-determinant matrix may not be unique."""
 
@@ -203,7 +205,13 @@ def nearest_volume_lanes(s, v, k, first):  # type: ignore[no-untyped-def]
     """
     lanes = s.shape[1]
     for l in range(first, lanes):
-        v[2, l] = 1.0
+        # near the unit of volume a step of Newton's method for k, from k = 0
+        a, b, c = s[0, l], s[1, l], s[2, l]
+        volume = a * b * c
+        squares = a * a * b * b + (a * a + b * b) * c * c
+        guess = c + (1.0 - volume) * a * b / squares
+        near = c > 0.5 and volume > 0.5 and volume < 2.0
+        v[2, l] = guess if near and guess > 0.2 else 1.0
     for _ in range(_NEWTON_STEPS):
         change = 0.0
         for l in range(first, lanes):
@@ -221,7 +229,7 @@ def nearest_volume_lanes(s, v, k, first):  # type: ignore[no-untyped-def]
             c_new = max(c - step, 0.1 * c)
             change = max(change, abs(c_new - c) - 1e-15 * c)
             v[0, l], v[1, l], v[2, l], k[l] = a, b, c_new, kappa
-        if not change > 1e-14:
+        if not change > _SETTLED:
             break
     for l in range(first, lanes):
         volume = s[0, l] * s[1, l] * s[2, l]

@@ -165,7 +165,8 @@ def _project_diagonal(T, l):  # type: ignore[no-untyped-def]
 def signed_svd(F: Array) -> tuple[Array, Array, Array]:
     """U (..., 3, 3), s (..., 3), V (..., 3, 3) with F = U diag(s) V^T, both rotations proper."""
     flat, shape = _to_lanes(F)
-    U, s, V, *_ = _decompose(flat)
+    U, s, V, B, S, _, _ = scratch(flat.shape[1])
+    signed_svd_lanes(flat, U, s, V, B, S)
     return _from_lanes(U, shape), s.T.reshape(*shape, 3).copy(), _from_lanes(V, shape)
 
 

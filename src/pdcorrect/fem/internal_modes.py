@@ -28,7 +28,7 @@ _BACKTRACKS = 30
 
 @njit(**PARALLEL)
 def relax(  # type: ignore[no-untyped-def]
-    model, u, cells, nodes, gradients, shear, volume, first, steps, tolerance
+    model, u, cells, nodes, gradients, weights, first, steps, tolerance
 ):
     """Bring the internal modes in u (N + B, 3) to equilibrium with the nodes, in place.
 
@@ -37,7 +37,7 @@ def relax(  # type: ignore[no-untyped-def]
     the number of nodes a cell; its other local shape functions are modes.
     Other arguments as `kernels.energy_and_forces`.
     """
-    count, lanes = cells.shape[0], shear.shape[1]
+    count, lanes = cells.shape[0], weights.shape[2]
     width = cells.shape[1] - nodes
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
@@ -48,7 +48,8 @@ def relax(  # type: ignore[no-untyped-def]
         K, A = np.empty((width, 3, width, 3)), np.empty((9, lanes))
         for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
             modes, here = cells[c, nodes:], gradients[c, nodes:]
-            start = first if volume[c, lanes - 1] > 0.0 else lanes
+            shear, volume = weights[c, 0], weights[c, 1]
+            start = first if volume[lanes - 1] > 0.0 else lanes
             energy, scale = np.inf, 1.0
             step, tried = np.zeros((width, 3)), 0
             for _ in range(steps + _BACKTRACKS):
@@ -56,9 +57,9 @@ def relax(  # type: ignore[no-untyped-def]
                 signed_svd_lanes(F, U, s, V, B, S)
                 if model == COROTATED:
                     nearest_volume_lanes(s, v, k, start)
-                    corotated_lanes(s, v, k, shear[c], volume[c], start, density, t)
+                    corotated_lanes(s, v, k, shear, volume, start, density, t)
                 else:
-                    hyperelastic_lanes(model, s, shear[c], volume[c], density, t)
+                    hyperelastic_lanes(model, s, shear, volume, density, t)
                 new = total(density)
                 if not new <= energy + 1e-13 * abs(energy):
                     scale *= 0.5
@@ -76,9 +77,9 @@ def relax(  # type: ignore[no-untyped-def]
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
                 if model == COROTATED:
-                    corotated_tangent_lanes(s, v, k, shear[c], volume[c], start, T)
+                    corotated_tangent_lanes(s, v, k, shear, volume, start, T)
                 else:
-                    hyperelastic_tangent_lanes(model, s, shear[c], volume[c], T)
+                    hyperelastic_tangent_lanes(model, s, shear, volume, T)
                 finish_tangent_lanes(T, True)
                 stiffness(here, U, V, T, A, P, K)
                 _solve(K, forces, step)

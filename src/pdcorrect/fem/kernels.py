@@ -28,12 +28,20 @@ from pdcorrect.fem.hyperelasticity import (
 
 # GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
 # takes longer as soon as other processes want the cores (benchmarks, case threads).
-os.environ.setdefault("GOMP_SPINCOUNT", "2000")
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
 _REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
 _CHUNK = 16
 """Cells that one thread takes at a time."""
+_LANES = 32
+"""Quadrature points that are decomposed together.
+
+Divisions and square roots take long to answer, but several can be under way: 32 take half the
+time of four times 8 (``benchmarks``, case kernel).
+"""
+_WIDTH = 8
+"""Lanes are filled up to a multiple of this, the numbers in the widest SIMD register."""
 
 
 @njit(**OPTIONS)
@@ -96,9 +104,71 @@ def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
 
 
+@njit(**OPTIONS)
+def _shape(points):  # type: ignore[no-untyped-def]
+    """Cells of ``points`` quadrature points in a block, and its lanes."""
+    cells = max(1, _LANES // points)
+    return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
+
+
+@njit(**OPTIONS)
+def _put(one, j, cells, first, block):  # type: ignore[no-untyped-def]
+    """Copy cell j's lanes (n, Q) into a block's (n, lanes).
+
+    All cells' lanes without a volume term come before those with one.
+    """
+    points = one.shape[1]
+    low, high = j * first, cells * first + j * (points - first)
+    for i in range(one.shape[0]):
+        for q in range(first):
+            block[i, low + q] = one[i, q]
+        for q in range(points - first):
+            block[i, high + q] = one[i, first + q]
+
+
+@njit(**OPTIONS)
+def _take(block, j, cells, first, one):  # type: ignore[no-untyped-def]
+    """The reverse of `_put`."""
+    points = one.shape[1]
+    low, high = j * first, cells * first + j * (points - first)
+    for i in range(one.shape[0]):
+        for q in range(first):
+            one[i, q] = block[i, low + q]
+        for q in range(points - first):
+            one[i, first + q] = block[i, high + q]
+
+
+@njit(**OPTIONS)
+def _fill(u, cells, gradients, weights, begin, end, first, one, F, w):  # type: ignore[no-untyped-def]
+    """Deformation gradients F (9, lanes) and weights w (2, lanes) of cells begin ... end - 1.
+
+    Lanes that no cell uses hold the identity and no weight.
+    """
+    size, _ = _shape(one.shape[1])
+    for i in range(9):
+        for l in range(F.shape[1]):
+            F[i, l] = 1.0 if i % 4 == 0 else 0.0
+    w[:] = 0.0
+    for c in range(begin, end):
+        deformation(u, cells[c], gradients[c], 1.0, one)
+        _put(one, c - begin, size, first, F)
+        _put(weights[c], c - begin, size, first, w)
+
+
+@njit(**OPTIONS)
+def _first_volume(first, points, w):  # type: ignore[no-untyped-def]
+    """First lane of a block with a volume term; the number of lanes where there is none."""
+    size, lanes = _shape(points)
+    start = size * first
+    for l in range(start, lanes):
+        if w[1, l] > 0.0:
+            return start
+    return lanes
+
+
 @njit(**PARALLEL)
 def energy_and_forces(  # type: ignore[no-untyped-def]
-    model, u, cells, gradients, shear, volume, first, energy, by_cell, start, slots, out
+    model, u, cells, gradients, weights, first, energy, by_cell, start, slots, out
 ):
     """Elastic energy (C,), J, of each cell, and forces out (N, 3), N.
 
@@ -109,34 +179,41 @@ def energy_and_forces(  # type: ignore[no-untyped-def]
     u : (N, 3)
         Displacements, m.
     cells : (C, K), gradients : (C, K, 3, Q)
-    shear, volume : (C, Q)
-        Weights of the two terms times rest volume, J.
+    weights : (C, 2, Q)
+        Weights of the two terms, mu and omega, times rest volume, J.
     first : int
-        Lanes below it have no volume term, and no volume projection is computed
+        Points below it have no volume term, and no volume projection is computed
         for them.
     by_cell : (C, K, 3)
         Scratch.
     start, slots
         See `gather_nodes`.
     """
-    count, lanes = cells.shape[0], shear.shape[1]
+    count, points = cells.shape[0], weights.shape[2]
+    size, lanes = _shape(points)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
         U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
         s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
-        k, density = np.empty(lanes), np.empty(lanes)
-        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            deformation(u, cells[c], gradients[c], 1.0, F)
+        k, w, one = np.empty(lanes), np.empty((2, lanes)), np.empty((9, points))
+        density, part = np.empty((1, lanes)), np.empty((1, points))
+        last = min(count, (chunk + 1) * _CHUNK)
+        for begin in range(chunk * _CHUNK, last, size):
+            end = min(last, begin + size)
+            _fill(u, cells, gradients, weights, begin, end, first, one, F, w)
             signed_svd_lanes(F, U, s, V, B, S)
             if model == COROTATED:
-                lane = first if volume[c, lanes - 1] > 0.0 else lanes
+                lane = _first_volume(first, points, w)
                 nearest_volume_lanes(s, v, k, lane)
-                corotated_lanes(s, v, k, shear[c], volume[c], lane, density, t)
+                corotated_lanes(s, v, k, w[0], w[1], lane, density[0], t)
             else:
-                hyperelastic_lanes(model, s, shear[c], volume[c], density, t)
+                hyperelastic_lanes(model, s, w[0], w[1], density[0], t)
             stress_lanes(U, t, V, P)
-            energy[c] = total(density)
-            nodal_forces(P, gradients[c], -1.0, by_cell[c])
+            for c in range(begin, end):
+                _take(density, c - begin, size, first, part)
+                energy[c] = total(part[0])
+                _take(P, c - begin, size, first, one)
+                nodal_forces(one, gradients[c], -1.0, by_cell[c])
     gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
 
 
@@ -161,27 +238,36 @@ def smallest_determinants(u, cells, gradients, out):  # type: ignore[no-untyped-
 
 @njit(**PARALLEL)
 def linearise_cells(  # type: ignore[no-untyped-def]
-    model, u, cells, gradients, shear, volume, first, project, left, right, tangent
+    model, u, cells, gradients, weights, first, project, left, right, tangent
 ):
     """Everything the tangent needs at displacements u, for each cell.
 
     Writes ``left`` and ``right`` (C, 9, Q), the factors U and V of the signed
     SVD, and ``tangent`` (C, 12, Q), see `finish_tangent_lanes`, in J.
     """
-    count, lanes = cells.shape[0], shear.shape[1]
+    count, points = cells.shape[0], weights.shape[2]
+    size, lanes = _shape(points)
     for chunk in prange((count + _CHUNK - 1) // _CHUNK):
         F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
+        U, V, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
         s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
-        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
-            deformation(u, cells[c], gradients[c], 1.0, F)
-            signed_svd_lanes(F, left[c], s, right[c], B, S)
+        w, one = np.empty((2, lanes)), np.empty((9, points))
+        last = min(count, (chunk + 1) * _CHUNK)
+        for begin in range(chunk * _CHUNK, last, size):
+            end = min(last, begin + size)
+            _fill(u, cells, gradients, weights, begin, end, first, one, F, w)
+            signed_svd_lanes(F, U, s, V, B, S)
             if model == COROTATED:
-                start = first if volume[c, lanes - 1] > 0.0 else lanes
-                nearest_volume_lanes(s, v, k, start)
-                corotated_tangent_lanes(s, v, k, shear[c], volume[c], start, tangent[c])
+                lane = _first_volume(first, points, w)
+                nearest_volume_lanes(s, v, k, lane)
+                corotated_tangent_lanes(s, v, k, w[0], w[1], lane, T)
             else:
-                hyperelastic_tangent_lanes(model, s, shear[c], volume[c], tangent[c])
-            finish_tangent_lanes(tangent[c], project)
+                hyperelastic_tangent_lanes(model, s, w[0], w[1], T)
+            finish_tangent_lanes(T, project)
+            for c in range(begin, end):
+                _take(U, c - begin, size, first, left[c])
+                _take(V, c - begin, size, first, right[c])
+                _take(T, c - begin, size, first, tangent[c])
 
 
 @njit(**PARALLEL)

@@ -186,7 +186,7 @@ class Problem:
         x = self.extended(positions - self.positions)
         internal_modes.relax(
             self.materials.model, x, self.space.local, self.cells.shape[1],
-            self.quadrature.lanes, *self._stiffness_weights, self.quadrature.first_volume,
+            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
             steps, _RELAXED * self.cell_size,
         )  # fmt: skip
         x[: len(positions)] = positions
@@ -220,7 +220,7 @@ class Problem:
         forces = np.empty_like(u)
         kernels.energy_and_forces(
             self.materials.model, u, assembly.cells, self.quadrature.lanes,
-            *self._stiffness_weights, self.quadrature.first_volume, energy, by_cell,
+            self._point_weights, self.quadrature.first_volume, energy, by_cell,
             assembly.start, assembly.slots, forces,
         )  # fmt: skip
         return float(energy.sum()), forces
@@ -248,17 +248,20 @@ class Problem:
         tangent = np.empty((count, 12, lanes))
         kernels.linearise_cells(
             self.materials.model, self._displacement(configuration), self.space.local,
-            self.quadrature.lanes, *self._stiffness_weights, self.quadrature.first_volume,
+            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
             project, left, right, tangent,
         )  # fmt: skip
         return Linearisation(self.assembly, self.quadrature, left, right, tangent)
 
     @cached_property
-    def _stiffness_weights(self) -> tuple[Array, Array]:
-        """Mu w and omega w at the quadrature points, (C, Q) each, J."""
-        return (
-            self.materials.mu[:, None] * self.quadrature.weights,
-            self.materials.volume_weight[:, None] * self.quadrature.volume_weights,
+    def _point_weights(self) -> Array:
+        """Mu w and omega w at the quadrature points, (C, 2, Q), J."""
+        return np.stack(
+            [
+                self.materials.mu[:, None] * self.quadrature.weights,
+                self.materials.volume_weight[:, None] * self.quadrature.volume_weights,
+            ],
+            axis=1,
         )
 
     def global_matrix(self, time_step: float, volume_scale: float = 1.0) -> sp.csr_matrix:
@@ -272,7 +275,7 @@ class Problem:
         self, mass_factor: float, stiffness_factor: float, volume_scale: float = 1.0
     ) -> sp.csr_matrix:
         """A M + b sum (2 mu + omega) w D^T D for factors a (1/s2) and b: G of any integrator."""
-        shear, volume = self._stiffness_weights
+        shear, volume = self._point_weights[:, 0], self._point_weights[:, 1]
         coefficient = stiffness_factor * (2 * shear + volume_scale * volume)
         matrix = self.quadrature.laplacian(coefficient, self.space.local, self.unknowns)
         mass = self.mass_matrix.copy()

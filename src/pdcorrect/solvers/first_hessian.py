@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
 
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.energies import nearest_rotation
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.step import StepObjective
@@ -77,15 +79,32 @@ class TurnedSolver:
 
     def __init__(self, solver: TangentSolver, rotations: Array) -> None:
         self._solver = solver
-        self._turn = np.ascontiguousarray(rotations)
-        self._back = np.ascontiguousarray(np.swapaxes(rotations, -1, -2))
+        self._rotations = np.ascontiguousarray(rotations)
 
     def __call__(self, r: Array) -> Array:
-        return _turned(self._turn, self._solver(_turned(self._back, r)))
+        back = np.empty_like(r)
+        _turn_back(self._rotations, r, back)
+        out = self._solver(back)
+        _turn(self._rotations, out)
+        return out
 
 
-def _turned(rotations: Array, x: Array) -> Array:
-    return np.matmul(rotations, x[..., None])[..., 0]
+@njit(**OPTIONS)
+def _turn(rotations, x):  # type: ignore[no-untyped-def]
+    """Multiply each row of x (n, 3) by its rotation, in place."""
+    for n in range(len(x)):
+        a, b, c = x[n, 0], x[n, 1], x[n, 2]
+        for i in range(3):
+            x[n, i] = rotations[n, i, 0] * a + rotations[n, i, 1] * b + rotations[n, i, 2] * c
+
+
+@njit(**OPTIONS)
+def _turn_back(rotations, x, out):  # type: ignore[no-untyped-def]
+    """Multiply each row of x (n, 3) by its rotation's transpose."""
+    for n in range(len(x)):
+        a, b, c = x[n, 0], x[n, 1], x[n, 2]
+        for i in range(3):
+            out[n, i] = rotations[n, 0, i] * a + rotations[n, 1, i] * b + rotations[n, 2, i] * c
 
 
 class TrueHessian:

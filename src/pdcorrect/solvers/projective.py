@@ -25,10 +25,10 @@ FirstHessian = Literal["auto", "G", "G-scaled", "rest", "lagged"]
 
 _PATIENCE = 40
 """Iterations with one true Hessian before it is renewed within the step."""
-_DEAREST = 3.0
+_DEAREST = 4.0
 """Cost of an iteration with a band factor, in iterations with G, up to which it is the default.
 
-It takes a third to a tenth of the iterations (``benchmarks``, case first_hessian).
+It takes a fifth to a tenth of the iterations (``benchmarks``, case first_hessian).
 """
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".

@@ -28,7 +28,7 @@ from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]
 
-_CG_SECONDS = 5e-5
+_CG_SECONDS = 4e-5
 """Of a Newton step by conjugate gradients, for each cell (``benchmarks``, case newton)."""
 _SHIFTS = (1e-10, 1e-6, 1e-2)
 """Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
@@ -66,8 +66,8 @@ class TangentFactory:
     def factor_cost(self) -> float:
         """Cost of a band factorisation in iterations of L-BFGS with it."""
         rows, band = self.order.rows, self.order.bandwidth
-        assembly = 1e-3 + 6e-6 * len(self.problem.cells) + 2e-9 * rows * band
-        seconds = assembly + 1e-10 * self.order.factor_flops
+        assembly = 1e-3 + 5e-6 * len(self.problem.cells) + 2e-9 * rows * band
+        seconds = assembly + 3.5e-11 * self.order.factor_flops
         return seconds / (self._other_seconds + self._solve_seconds)
 
     @property
@@ -76,16 +76,16 @@ class TangentFactory:
 
         From measured speeds (``benchmarks``, case tangent_factors).
         """
-        return 1e-4 + 1.2e-7 * self.problem.quadrature.weights.size
+        return 1e-4 + 1.6e-7 * self.problem.quadrature.weights.size
 
     @property
     def _solve_seconds(self) -> float:
-        return 3.5e-9 * self.order.rows * self.order.bandwidth
+        return 1.1e-9 * self.order.rows * self.order.bandwidth
 
     @property
     def direct_pays(self) -> bool:
         """Whether a band factor beats multigrid-preconditioned conjugate gradients."""
-        seconds = 1e-10 * self.order.factor_flops + 5e-9 * self.order.rows * self.order.bandwidth
+        seconds = 3.5e-11 * self.order.factor_flops + 3e-9 * self.order.rows * self.order.bandwidth
         return self.backend == "band" and seconds < _CG_SECONDS * len(self.problem.cells)
 
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
