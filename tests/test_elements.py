@@ -8,6 +8,7 @@ from block_meshes import o_grid, spokes, warped
 from conftest import (
     ELEMENTS,
     GRAVITY,
+    beam,
     boundary_nodes,
     box_mesh,
     disturbed,
@@ -15,6 +16,7 @@ from conftest import (
     problem_on,
     rotation,
 )
+from pdcorrect.errors import SceneError
 
 every_element = pytest.mark.parametrize("element", ELEMENTS)
 SIZE = (0.10, 0.07, 0.12)
@@ -218,3 +220,10 @@ def test_projective_dynamics_is_newton_for_every_element(make, element):
     moved = np.abs(by_newton.positions - problem.positions).max()
     assert moved > 0.1 * problem.cell_size
     assert np.abs(by_pd.positions - by_newton.positions).max() < 1e-8
+
+
+def test_modes_that_nothing_resists_are_refused():
+    scene = beam((2, 1, 1), material={"energy": "volume-only"})
+    with pytest.raises(SceneError, match="nothing resists the element's modes"):
+        pc.discretise(scene, element="hex8-bubble-mean")
+    assert pc.discretise(scene, element="hex8-bubble").element == "hex8-bubble"

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, Linearisation
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
@@ -342,6 +342,12 @@ def discretise(
     changes = {k: v for k, v in {"mass": mass, "element": element}.items() if v is not None}
     if changes:
         scene = scene.with_changes(solver=changes)
+    if scene.material.energy == "volume-only" and scene.solver.element == "hex8-bubble-mean":
+        raise SceneError(
+            "material.energy = 'volume-only' with solver.element = 'hex8-bubble-mean': nothing "
+            "resists the element's modes, for the volume term sees the mean deformation only. "
+            "Use hex8-bubble, or an energy with a corotated part."
+        )
     coarse = _coarse_mesh(scene)
     mesh = refine_mesh(coarse, refine)
     space = Space(mesh, scene.solver.element)

@@ -1,0 +1,56 @@
+"""Draw the case "growth" of a machine's results: time and memory against nodes.
+
+python benchmarks/plot_growth.py benchmarks/results/MACHINE.json docs/images/growth.png
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+NAMES = {
+    "cholesky": "G, Cholesky",
+    "amg": "G, multigrid cycle",
+    "band": "rest Hessian, band",
+    "rest-amg": "rest Hessian, multigrid cycle",
+}
+PANELS = (
+    ("step_s", "time of a step, s"),
+    ("prepare_s", "preparation (factorise), s"),
+    ("peak_megabytes", "peak memory of the process, MB"),
+)
+
+
+def main() -> None:
+    """Three panels, one line a method, with the fitted exponent in the legend."""
+    source, target = sys.argv[1:]
+    results = json.loads(Path(source).read_text())["growth"]["results"]
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+    for axis, (key, title) in zip(axes, PANELS, strict=True):
+        for marker, (method, name) in zip("os^D", NAMES.items(), strict=True):
+            rows = [row for row in results["rows"] if row["method"] == method]
+            if not rows:
+                continue
+            power = results["powers"][method][key]
+            axis.loglog(
+                [row["nodes"] for row in rows],
+                [row[key] for row in rows],
+                marker=marker,
+                label=f"{name}: N^{power:.2f}",
+            )
+        axis.set_xlabel("nodes N")
+        axis.set_title(title)
+        axis.grid(visible=True, which="major", alpha=0.3)
+        axis.legend(fontsize=8)
+    figure.savefig(target, dpi=130)
+    print(f"wrote {target}")
+
+
+if __name__ == "__main__":
+    main()
