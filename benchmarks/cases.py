@@ -102,7 +102,7 @@ def first_hessian() -> list[dict[str, Any]]:
                 scene = example_beam(motion, poisson).with_changes(material={"young": young})
                 problem = pc.discretise(scene, refine=2)
                 row: dict[str, Any] = {"motion": motion, "poisson": poisson, "young": young}
-                for kind in ("G", "G-scaled", "lagged"):
+                for kind in ("G", "G-scaled", "rest", "lagged"):
                     stepper = pc.ProjectiveDynamics(problem, first_hessian=kind).prepare()
                     run = pc.rollout(stepper, 8, state=initial_state(problem, motion))
                     row[kind] = {

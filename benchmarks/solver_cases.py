@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 import pdcorrect as pc
+from pdcorrect.solvers.first_hessian import TrueHessian
 from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
 from pdcorrect.solvers.step import StepObjective
@@ -51,13 +52,30 @@ def beam_steps() -> list[dict[str, Any]]:
         frames = 50 if refine == 1 else 10
         for threads in (1, 2):
             for rules in ("diffpd", "ours"):
-                for first in ("G-scaled", "lagged"):
+                for first in ("G-scaled", "rest"):
                     found = measure(
                         threads, "step", length=length, refine=refine, rules=rules,
                         first_hessian=first, frames=frames,
                     )  # fmt: skip
                     rows += [{"threads": threads, **row} for row in found]
     return rows
+
+
+def iteration() -> list[dict[str, Any]]:
+    """Milliseconds of one iteration of L-BFGS, one and two threads."""
+    return [
+        {
+            "threads": threads,
+            **measure(
+                threads, "iteration", length=length, refine=refine, rules=rules,
+                first_hessian=first,
+            ),
+        }
+        for length, refine in SIZES
+        for threads in (1, 2)
+        for rules in ("diffpd", "ours")
+        for first in ("G-scaled", "rest")
+    ]  # fmt: skip
 
 
 def newton() -> list[dict[str, Any]]:
@@ -79,7 +97,7 @@ def memory() -> list[dict[str, Any]]:
     return [
         measure(2, "memory", length=length, refine=refine, first_hessian=first)
         for length, refine in SIZES
-        for first in ("G-scaled", "lagged")
+        for first in ("G-scaled", "rest")
     ]
 
 
@@ -92,8 +110,8 @@ def growth() -> dict[str, Any]:
     """Time and memory from 225 to 180 000 nodes by the solver of the linear systems."""
     rows = []
     for refine in (1, 2, 3, 4, 6, 8, 12):
-        for method in ("cholesky", "amg", "band"):
-            if method != "band" or refine <= 6:
+        for method in ("cholesky", "amg", "band", "rest-amg"):
+            if method != "band" or refine <= 8:
                 rows.append(measure(2, "growth", refine=refine, method=method))
                 print(rows[-1], flush=True)
     return {"rows": rows, "powers": powers(rows)}
@@ -113,7 +131,7 @@ def powers(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
 
 
 def first_guesses() -> list[dict[str, Any]]:
-    """Mean iterations of a step by where it starts, with a Hessian of the step's start.
+    """Mean iterations of a step by where it starts, with the rest shape's turned Hessian.
 
     "position" p, "inertial" p + h v (for backward Euler the previous increment repeated),
     "extrapolated" p + h v + h (v - v_).
@@ -123,18 +141,18 @@ def first_guesses() -> list[dict[str, Any]]:
     rows = []
     for motion in ("twist", "bending", "flight"):
         problem = pc.discretise(example_beam(motion, 0.45), refine=2)
-        tangents = TangentFactory(problem)
         row: dict[str, Any] = {"motion": motion, "poisson": 0.45}
         for name in ("position", "inertial", "extrapolated"):
-            row[name] = _iterations(problem, tangents, motion, name)
+            row[name] = _iterations(problem, motion, name)
         rows.append(row)
     return rows
 
 
-def _iterations(problem: pc.Problem, tangents: TangentFactory, motion: str, start: str) -> float:
+def _iterations(problem: pc.Problem, motion: str, start: str) -> float:
     from cases import initial_state
 
     state = initial_state(problem, motion)
+    hessian = TrueHessian(TangentFactory(problem), lagged=False)
     before, counts = state.velocities, []
     options = MinimiserOptions(1e-5 * problem.cell_size)
     for _ in range(8):
@@ -144,8 +162,7 @@ def _iterations(problem: pc.Problem, tangents: TangentFactory, motion: str, star
         stage = replace(stage, start=np.where(problem.free, guess[start], stage.start))
         loads = problem.external_forces(state.time, state.time + h)
         objective = StepObjective(problem, state, stage, loads)
-        solver, _ = tangents.factorise(objective, p)
-        found = minimise(objective, objective.start, solver, options)
+        found = minimise(objective, objective.start, hessian.solver(objective), options)
         counts.append(found.iterations)
         before, state = v, stage.finish(found.positions)
     return float(np.mean(counts))
@@ -154,6 +171,7 @@ def _iterations(problem: pc.Problem, tangents: TangentFactory, motion: str, star
 CASES: dict[str, Callable[[], Any]] = {
     "kernel": kernel,
     "beam_steps": beam_steps,
+    "iteration": iteration,
     "newton": newton,
     "memory": memory,
     "tangent_factors": tangent_factors,

@@ -128,9 +128,22 @@ def test_a_hessian_that_does_not_serve_is_renewed_within_the_step(kind):
     assert np.abs(result.state.positions - exact.state.positions).max() < 2e-5 * problem.cell_size
 
 
-def test_auto_takes_the_rest_shape_where_its_factor_is_small():
+def test_auto_takes_the_rest_shape_in_a_band_or_by_multigrid():
     small = pc.ProjectiveDynamics(pc.discretise(beam()))
     assert small.first_hessian == "rest"
     assert small.describe()["factorisation"] == "band"
     assert "rest shape" in small.describe()["first_hessian"]
-    assert pc.ProjectiveDynamics(pc.discretise(beam()), backend="amg").first_hessian == "G-scaled"
+    slab = TangentFactory(pc.discretise(beam((30, 30, 2))))
+    assert slab.backend == "band"
+    block = TangentFactory(pc.discretise(beam((30, 30, 30))))
+    assert block.backend == "amg"
+    assert pc.ProjectiveDynamics(pc.discretise(beam()), backend="splu").first_hessian == "G-scaled"
+
+
+def test_a_cycle_of_multigrid_is_a_first_hessian_too():
+    problem = pc.discretise(cross())
+    band = pc.rollout(pc.ProjectiveDynamics(problem, 1e-8), 4)
+    cycle = pc.rollout(pc.ProjectiveDynamics(problem, 1e-8, backend="amg"), 4)
+    assert np.abs(cycle.positions - band.positions).max() < 1e-8
+    by_g = pc.rollout(pc.ProjectiveDynamics(problem, 1e-8, first_hessian="G-scaled"), 4)
+    assert cycle.stats["iterations"].sum() < 0.6 * by_g.stats["iterations"].sum()

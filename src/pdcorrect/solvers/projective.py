@@ -25,11 +25,6 @@ FirstHessian = Literal["auto", "G", "G-scaled", "rest", "lagged"]
 
 _PATIENCE = 40
 """Iterations with one true Hessian before it is renewed within the step."""
-_DEAREST = 4.0
-"""Cost of an iteration with a band factor, in iterations with G, up to which it is the default.
-
-It takes a fifth to a tenth of the iterations (``benchmarks``, case first_hessian).
-"""
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
@@ -58,8 +53,8 @@ class ProjectiveDynamics(ImplicitStepper):
         weight scaled by `VOLUME_SCALE`; the true Hessian of the rest shape, turned
         with the body (`TrueHessian`), like G factorised once; or that of an earlier
         frame, factorised again when the iteration counts say that it pays.  "auto"
-        takes "rest" where its factor is cheap (`rest_pays`), else "G-scaled".  The
-        energy, and so the answer, is the same.
+        is "rest", or "G-scaled" where ``backend`` asks for a general factorisation.
+        The energy, and so the answer, is the same.
     max_iterations : int, optional
         1000 for L-BFGS and 20000 for local/global by default.
     time_step, integrator, backend, recover
@@ -103,10 +98,10 @@ class ProjectiveDynamics(ImplicitStepper):
         self.first_hessian = "G" if method == "local-global" else first_hessian
         self._true: TrueHessian | None = None
         if self.first_hessian in ("auto", "rest", "lagged"):
-            tangents = TangentFactory(problem, backend)
             if self.first_hessian == "auto":
-                self.first_hessian = "rest" if rest_pays(tangents) else "G-scaled"
+                self.first_hessian = "G-scaled" if backend in ("cholespy", "splu") else "rest"
             if self.first_hessian != "G-scaled":
+                tangents = TangentFactory(problem, backend)
                 self._true = TrueHessian(tangents, lagged=self.first_hessian == "lagged")
         plain = method == "local-global"
         limit = (20000 if plain else 1000) if max_iterations is None else max_iterations
@@ -181,11 +176,6 @@ _NAMES = {
     "rest": "true Hessian of the rest shape, turned with the body",
     "lagged": "true Hessian of an earlier frame, turned with the body",
 }
-
-
-def rest_pays(tangents: TangentFactory) -> bool:
-    """Whether a factor of the true Hessian is small and quick enough to be the default."""
-    return tangents.backend == "band" and tangents.iteration_cost < _DEAREST
 
 
 def _after(earlier: Minimum, later: Minimum) -> Minimum:

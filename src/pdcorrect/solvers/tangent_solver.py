@@ -28,8 +28,15 @@ from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]
 
-_CG_SECONDS = 4e-5
-"""Of a Newton step by conjugate gradients, for each cell (``benchmarks``, case newton)."""
+_CG_SECONDS = 7e-8
+"""Of a Newton step by conjugate gradients, for each entry of the cells' tangents (case newton)."""
+_CYCLE_SECONDS = 1.7e-8
+"""Worth of a band's solve against a multigrid cycle, for each such entry (case growth).
+
+The cycle is cheaper on large meshes, but takes three to four times the iterations.
+"""
+_SOLVES = 50
+"""Solves over which a factorisation should have paid."""
 _SHIFTS = (1e-10, 1e-6, 1e-2)
 """Of the largest diagonal entry, tried in turn where even the projected tangent is singular."""
 
@@ -41,7 +48,8 @@ class TangentFactory:
     ----------
     problem : Problem
     backend : str
-        See `factorise`; "auto" is a band where that fits into memory, else multigrid.
+        See `factorise`; "auto" is a band where that pays and fits into memory, else
+        multigrid.
 
     Attributes
     ----------
@@ -52,41 +60,44 @@ class TangentFactory:
     def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
         self.problem = problem
         self.order = BandOrder(problem.positions, problem.cells, problem.free)
-        fits = self.order.factor_bytes < MEMORY_SHARE * available_memory()
-        self.backend = ("band" if fits else "amg") if backend == "auto" else backend
+        self.backend = ("band" if self._band_pays else "amg") if backend == "auto" else backend
         self._nodes = Assembly(problem.cells, len(problem.positions))
         self._free = np.flatnonzero(problem.free.ravel())
 
     @property
-    def iteration_cost(self) -> float:
-        """Cost of an iteration of L-BFGS with a band factor, in iterations with G."""
-        return 1.0 + self._solve_seconds / self._other_seconds
-
-    @property
     def factor_cost(self) -> float:
         """Cost of a band factorisation in iterations of L-BFGS with it."""
-        rows, band = self.order.rows, self.order.bandwidth
-        assembly = 1e-3 + 5e-6 * len(self.problem.cells) + 2e-9 * rows * band
-        seconds = assembly + 3.5e-11 * self.order.factor_flops
-        return seconds / (self._other_seconds + self._solve_seconds)
-
-    @property
-    def _other_seconds(self) -> float:
-        """An iteration without its solve; estimates by size, of which only ratios matter.
-
-        From measured speeds (``benchmarks``, case tangent_factors).
-        """
-        return 1e-4 + 1.6e-7 * self.problem.quadrature.weights.size
-
-    @property
-    def _solve_seconds(self) -> float:
-        return 1.1e-9 * self.order.rows * self.order.bandwidth
+        iteration = 1e-4 + 1.6e-7 * self.problem.quadrature.weights.size + self._solve_seconds
+        assembly = 1e-3 + 5e-6 * len(self.problem.cells)
+        return (assembly + self._factor_seconds) / iteration
 
     @property
     def direct_pays(self) -> bool:
-        """Whether a band factor beats multigrid-preconditioned conjugate gradients."""
-        seconds = 3.5e-11 * self.order.factor_flops + 3e-9 * self.order.rows * self.order.bandwidth
-        return self.backend == "band" and seconds < _CG_SECONDS * len(self.problem.cells)
+        """Whether a band factor in each iteration beats conjugate gradients with multigrid."""
+        return self.backend == "band" and (
+            self._factor_seconds + self._solve_seconds < _CG_SECONDS * self._entries
+        )
+
+    @property
+    def _solve_seconds(self) -> float:
+        """Estimates by size, of which only ratios matter (``benchmarks``, tangent_factors)."""
+        return 1.1e-9 * self.order.rows * self.order.bandwidth
+
+    @property
+    def _factor_seconds(self) -> float:
+        return 3.5e-11 * self.order.factor_flops + 2e-9 * self.order.rows * self.order.bandwidth
+
+    @property
+    def _entries(self) -> int:
+        """Of all cells' tangents: a measure of a sparse matrix product."""
+        return len(self.problem.cells) * (3 * self.problem.cells.shape[1]) ** 2
+
+    @property
+    def _band_pays(self) -> bool:
+        """Whether a band factor, kept for a run, beats multigrid as a first Hessian."""
+        seconds = self._solve_seconds + self._factor_seconds / _SOLVES
+        fits = self.order.factor_bytes < MEMORY_SHARE * available_memory()
+        return fits and seconds < _CYCLE_SECONDS * self._entries
 
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
         """A factor of the Hessian at a configuration, and whether it is the exact one.
