@@ -60,12 +60,12 @@ def threads() -> list[dict[str, Any]]:
     script = str(Path(__file__).parent / "threads.py")
     rows = []
     for refine, spin, blas, busy in (
-        (2, "2000", "1", 0),
+        (2, "10000", "1", 0),
         (2, "system's", "1", 0),
-        (2, "2000", "1", 2),
+        (2, "10000", "1", 2),
         (2, "system's", "1", 2),
-        (4, "2000", "1", 0),
-        (4, "2000", "all", 0),
+        (4, "10000", "1", 0),
+        (4, "10000", "all", 0),
         (4, "system's", "all", 0),
     ):
         loop = [sys.executable, "-c", "while True: pass"]
