@@ -17,6 +17,7 @@ from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
 from pdcorrect.state import Status, Stepper, StepResult, Trajectory
 
+_FALLBACKS = [Status.RECOVERED.name, Status.SUBSTEPPED.name]
 OnStep = Callable[[str, int, StepResult], None]
 """Called with a case's label, its frame, and the step's result."""
 
@@ -161,7 +162,7 @@ def compare(
                 seconds_a_frame=float(np.median(run.stats["seconds"])),
                 setup_seconds=setup[case.label],
                 iterations_a_frame=float(np.mean(run.stats["iterations"])),
-                unusual_frames=int((run.stats["status"] != Status.CONVERGED.name).sum()),
+                unusual_frames=int(np.isin(run.stats["status"], _FALLBACKS).sum()),
             )
         )
     return Comparison(

@@ -14,7 +14,7 @@ import pdcorrect.figures as figures
 from pdcorrect.environment import environment
 from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
-from pdcorrect.metrics import largest_displacement
+from pdcorrect.metrics import energy_balance, largest_displacement
 from pdcorrect.state import Trajectory
 
 HEADINGS = (
@@ -71,8 +71,9 @@ def notes(comparison: Comparison) -> list[str]:
     lost = _lost_share(comparison.runs[comparison.reference])
     if lost is not None:
         out.append(
-            f"Backward Euler at this step dissipates {100 * lost:.0f} % of the work that the loads "
-            "do on the reference (time error, which all rows share)."
+            f"The time integrator ({scene.time.integrator}, {scene.time.step:g} s) dissipates "
+            f"{100 * lost:.0f} % of the work that the loads do on the reference (time error, which "
+            "all rows share)."
         )
     if comparison.solver_error is not None:
         out.append(
@@ -90,13 +91,13 @@ def notes(comparison: Comparison) -> list[str]:
 
 
 def _lost_share(run: Trajectory) -> float | None:
-    """Share of the loads' work that is neither elastic nor kinetic at the end; None if unclear."""
-    problem = run.problem
-    if problem is None or problem.clamps.moving:  # moving clamps do work as well
+    """Share of the work of loads and clamps that the integrator lost; None if unclear."""
+    if run.problem is None or run.problem.scene.time.integrator == "quasi-static":
         return None
-    work = float(run.stats["external_work"].sum())
-    stored = float(run.stats["elastic_energy"][-1] + run.stats["kinetic_energy"][-1])
-    return (work - stored) / work if work > stored > 0 else None
+    balance = energy_balance(run)
+    work = float(balance.external_work[-1] + balance.clamp_work[-1])
+    lost = float(balance.dissipation[-1])
+    return lost / work if work > lost > 0 else None
 
 
 def to_markdown(comparison: Comparison, pictures: list[str]) -> str:

@@ -52,7 +52,8 @@ class State:
     ----------
     memory : mapping of str to (N, 3) float64
         What a time integrator needs besides to take the next step, by name:
-        accelerations, or positions and velocities of an earlier frame.
+        accelerations, or positions and velocities of an earlier frame.  It belongs to
+        these positions and velocities: leave it out when you change them.
     """
 
     positions: Array

@@ -31,7 +31,7 @@ Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
 _AMG_TOLERANCE = 1e-12
 _AMG_STEPS = 500
 LARGEST_DIRECT = 100_000
-"""Rows of G above which multigrid takes over.
+"""Rows of G, or nodes of a tangent, above which multigrid takes over.
 
 At 180 000 nodes a step takes less time with it, and the preparation 2 s instead of 37 s; at
 56 000 nodes a step takes more (``benchmarks``, case growth).
@@ -220,7 +220,7 @@ def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) ->
     ``memory`` (bytes) defaults to what is available.
     """
     memory = available_memory() if memory is None else memory
-    if factor_bytes(size, unknowns) > MEMORY_SHARE * memory or size > LARGEST_DIRECT:
+    if factor_bytes(size, unknowns) > MEMORY_SHARE * memory or size > unknowns * LARGEST_DIRECT:
         return "amg"
     return "cholespy" if importlib.util.find_spec("cholespy") else "splu"
 

@@ -120,7 +120,7 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def _eliminate(blocks, nodes, condensed, inverse, solved):  # type: ignore[no-untyped-def]
+def _eliminate(blocks, nodes, shift, condensed, inverse, solved):  # type: ignore[no-untyped-def]
     """Fill K_uu - K_ub K_bb^-1 K_bu, K_bb^-1 and K_bb^-1 K_bu; whether all K_bb are positive."""
     count, width = blocks.shape[:2]
     m, n = 3 * (width - nodes), 3 * nodes
@@ -134,6 +134,11 @@ def _eliminate(blocks, nodes, condensed, inverse, solved):  # type: ignore[no-un
                 K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
             for j in range(n):
                 right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
+        largest = 0.0
+        for i in range(m):
+            largest = max(largest, K[i, i])
+        for i in range(m):
+            K[i, i] += shift * largest
         if not _cholesky_solve(K, right):
             failed[c] = 1
         inverse[c] = right[:, :m]
@@ -185,6 +190,8 @@ class Condensed:
         Numbers of nodes and modes in a configuration.
     nodes : int
         Nodes of a cell.
+    shift : float
+        Added to the diagonal of the modes' tangents, of its largest entry.
 
     Attributes
     ----------
@@ -198,13 +205,15 @@ class Condensed:
         If K_bb of a cell is not positive definite.
     """
 
-    def __init__(self, blocks: Array, local: NDArray[np.int64], nodes: int) -> None:
+    def __init__(
+        self, blocks: Array, local: NDArray[np.int64], nodes: int, shift: float = 0.0
+    ) -> None:
         count, width = blocks.shape[:2]
         m = 3 * (width - nodes)
         self.blocks = np.empty((count, nodes, nodes, 3, 3))
         self._inverse = np.empty((count, m, m))
         self._solved = np.empty((count, m, 3 * nodes))
-        if not _eliminate(blocks, nodes, self.blocks, self._inverse, self._solved):
+        if not _eliminate(blocks, nodes, shift, self.blocks, self._inverse, self._solved):
             raise np.linalg.LinAlgError("the modes of a cell have an indefinite tangent")
         self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.factorisation import NotPositiveDefinite, factorise
+from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -69,7 +70,9 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     K = problem.stiffness(at)[free][:, free]
     M = sp.csr_matrix(sp.kron(problem.mass_matrix, sp.eye_array(3)))[free][:, free]
     shift = _SHIFT * float((K.diagonal() / M.diagonal()).max())
-    inverse = spla.LinearOperator(K.shape, matvec=_inverse(K + shift * M), dtype=np.float64)
+    inverse = spla.LinearOperator(
+        K.shape, matvec=_inverse(K + shift * M, rigid_motions(at)[free]), dtype=np.float64
+    )
     start = np.random.default_rng(0).normal(size=len(free))  # for the same digits every time
     values, vectors = spla.eigsh(K, count, M, sigma=-shift, OPinv=inverse, v0=start)
     order = np.argsort(values)
@@ -79,9 +82,9 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     return Modes(frequencies, shapes.reshape(count, -1, 3))
 
 
-def _inverse(matrix: sp.csr_matrix) -> Callable[[Array], Array]:
+def _inverse(matrix: sp.csr_matrix, motions: Array) -> Callable[[Array], Array]:
     try:
-        return factorise(matrix, unknowns=3).solve
+        return factorise(matrix, unknowns=3, near_nullspace=motions).solve
     except NotPositiveDefinite as error:
         raise ConvergenceError(
             f"the tangent stiffness is not positive semi-definite ({error}): expected positions "

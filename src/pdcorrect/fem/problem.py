@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError, SceneError
+from pdcorrect.errors import ConvergenceError, InputError, SceneError
 from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, Linearisation
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
@@ -210,7 +210,15 @@ class Problem:
         tangent = self.linearise(self.relaxed(positions), project)
         if not self.space.internal:
             return tangent.assemble()
-        modes = internal_modes.Condensed(tangent.blocks(), self.space.local, self.cells.shape[1])
+        try:
+            modes = internal_modes.Condensed(
+                tangent.blocks(), self.space.local, self.cells.shape[1]
+            )
+        except np.linalg.LinAlgError:
+            raise ConvergenceError(
+                "the internal modes of a cell are not in stable equilibrium at these positions: "
+                "expected a shape that is strained less. Use project=True."
+            ) from None
         return Assembly(self.cells, len(self.positions)).matrix(modes.blocks)
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
@@ -371,6 +379,7 @@ def _build(
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
     _freeze(space.positions, space.cells, clamps.free, quadrature.lanes, quadrature.weights)
+    _freeze(quadrature.volume_weights, matrix.indices, matrix.indptr)
     _freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         scene, refine, mesh, space, quadrature, materials, clamps, loads, matrix, cell_size

@@ -188,7 +188,8 @@ class TrueHessian:
         return self.lagged and (objective.state.time != self._time or self._spent())
 
     def _renew(self, objective: StepObjective, y: Array, age: int) -> TangentSolver:
-        self._solver = self.tangents.first_hessian(objective, y)
+        at_rest = age != INSIDE and not self.lagged
+        self._solver = self.tangents.first_hessian(objective, y, at_rest)
         self._shape = self._rotations.of_cells(y)
         self._factors, self.age, self._counts = objective.factors, age, []
         return self._solver

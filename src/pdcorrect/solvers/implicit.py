@@ -165,7 +165,7 @@ class ImplicitStepper:
 
     def _factorisation(self) -> str:
         rest = self.problem.rest_state()
-        stage = self._integrator(self.problem, rest, self.time_step)
+        stage = self._integrator(self.problem, rest, self.time_step, None)
         return self._global_solver(hessian_factors(self.problem, stage)).backend
 
     # --- one attempt ----------------------------------------------------------------
@@ -189,7 +189,7 @@ class ImplicitStepper:
     def _objective(
         self, state: State, forces: Array | None, h: float, integrate: Integrator
     ) -> StepObjective:
-        stage = integrate(self.problem, state, h)
+        stage = integrate(self.problem, state, h, forces)
         loads = self.problem.external_forces(*stage.loads_over, stage.loads_at)
         if forces is not None:
             loads = loads + forces
@@ -221,7 +221,12 @@ class ImplicitStepper:
     def _substeps(
         self, state: State, forces: Array | None, h: float, effort: _Effort
     ) -> _Outcome | None:
-        """The step in 2, 4, 8, 16 parts; its residual and estimate are the worst part's."""
+        """The step in 2, 4, 8, 16 parts; its residual and estimate are the worst part's.
+
+        None without inertia: parts by backward Euler would solve another problem.
+        """
+        if self._integrator(self.problem, state, h, forces).inertia == 0.0:
+            return None
         for level in range(1, _SUBSTEP_LEVELS + 1):
             count = 2**level
             parts: list[_Outcome] = []
@@ -249,7 +254,7 @@ class ImplicitStepper:
             "smallest_volume_ratio": float(self.problem.volume_ratios(state.positions).min()),
         }
         status = minimum.status
-        if status.ok and stats["smallest_volume_ratio"] <= 0.0:
+        if status is Status.CONVERGED and stats["smallest_volume_ratio"] <= 0.0:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
         return StepResult(state, status, effort.iterations, residual, minimum.estimate, stats)
@@ -264,8 +269,8 @@ def _outcome(
     clamp_work = 0.0
     if problem.clamps.moving:
         clamp_work = float(np.vdot(objective.balance(y)[1][:nodes] * ~problem.free, moved))
-    end = y.copy()
-    end[:nodes] = after.positions
+    ends_at_y = objective.stage.gain == 1.0  # otherwise the modes at the end are other ones
+    end = y if ends_at_y else problem.relaxed(after.positions)
     return _Outcome(
         after,
         minimum,

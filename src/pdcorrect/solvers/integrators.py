@@ -16,14 +16,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+_EQUAL_STEPS = 1e-6
+"""Relative difference up to which two steps count as equal."""
+_MASS_TOLERANCE, _MASS_STEPS = 1e-15, 200
+"""Of solving with a consistent mass matrix, whose condition does not depend on the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +69,11 @@ class Stage:
     gain: float = 1.0
 
 
-Integrator = Callable[[Problem, State, float], Stage]
-"""(problem, state, h) -> the equation of the step from ``state`` to its time + h."""
+Integrator = Callable[[Problem, State, float, Array | None], Stage]
+"""(problem, state, h, forces) -> the equation of the step from ``state`` to its time + h.
+
+``forces`` (N, 3), N, act besides the scene's loads; only a first acceleration needs them.
+"""
 
 
 def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
@@ -82,7 +90,7 @@ def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
     return _INTEGRATORS[name]
 
 
-def backward_euler(problem: Problem, state: State, h: float) -> Stage:
+def backward_euler(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
     """Thesis eq. 3-1 to 3-4: v' = (p' - p)/h, M (v' - v)/h = f(p').  First order."""
     p, v, end = state.positions, state.velocities, state.time + h
     target = p + h * v
@@ -94,22 +102,28 @@ def backward_euler(problem: Problem, state: State, h: float) -> Stage:
     )  # fmt: skip
 
 
-def bdf2(problem: Problem, state: State, h: float) -> Stage:
+def bdf2(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
     """Two-step backward differences: p' = (4 p - p_)/3 + 2h/3 v', the same for v'.
 
-    Second order.  Without the previous state (in ``state.memory``) the step is one of
-    backward Euler, which does not lower the order.
+    Second order.  Without the state one step of the same length before (in
+    ``state.memory``) the step is one of backward Euler, which, at the start only, does
+    not lower the order.
     """
     p, v, end = state.positions, state.velocities, state.time + h
-    if "previous_positions" not in state.memory:
-        stage = backward_euler(problem, state, h)
+    before = state.memory.get("previous_times")
+    if before is None or abs(state.time - before[0, 0] - h) > _EQUAL_STEPS * h:
+        stage = backward_euler(problem, state, h, forces)
         origin, target, rate = stage.origin, stage.target, stage.rate
     else:
         origin = (4.0 * p - state.memory["previous_positions"]) / 3.0
         drift = (4.0 * v - state.memory["previous_velocities"]) / 3.0
         rate = 1.5 / h
         target = origin + drift / rate
-    memory = {"previous_positions": p, "previous_velocities": v}
+    memory = {
+        "previous_positions": p,
+        "previous_velocities": v,
+        "previous_times": np.full_like(p, state.time),
+    }
     return Stage(
         rate**2, target, rate, origin,
         np.where(problem.free, target, problem.clamped_positions(end)),
@@ -118,7 +132,7 @@ def bdf2(problem: Problem, state: State, h: float) -> Stage:
     )  # fmt: skip
 
 
-def midpoint(problem: Problem, state: State, h: float) -> Stage:
+def midpoint(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
     """Implicit midpoint: y = (p + p')/2, M (v' - v)/h = f(y), p' - p = h (v + v')/2.
 
     Second order, symplectic; keeps linear and angular momentum.
@@ -147,11 +161,11 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
     gamma = 0.5 - alpha_m + alpha_f
     beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2
 
-    def stage(problem: Problem, state: State, h: float) -> Stage:
+    def stage(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
         p, v, end = state.positions, state.velocities, state.time + h
         a = state.memory.get("accelerations")
         if a is None:
-            a = accelerations(problem, state)
+            a = accelerations(problem, state, forces)
         scale = 1.0 / ((1.0 - alpha_f) * beta * h**2)
         at_rest = -v / (beta * h) - (0.5 / beta - 1.0) * a  # a' for y = p
         rate = gamma / (beta * h)
@@ -173,7 +187,7 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
         clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
         clamp_velocity = _clamp_velocity(problem, end, h)
         acceleration = (clamp_velocity - v) / h  # mean over the step, moved to y's time:
-        if state.memory:
+        if "accelerations" in state.memory:
             acceleration += _clamp_acceleration(problem, time, h)
             acceleration -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
         return Stage(
@@ -189,7 +203,7 @@ def generalised_alpha(spectral_radius: float) -> Integrator:
     return stage
 
 
-def quasi_static(problem: Problem, state: State, h: float) -> Stage:
+def quasi_static(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
     """Equilibrium f(p') = 0 under the loads and clamps at the end of the step."""
     p, end = state.positions, state.time + h
     start = np.where(problem.free, p, problem.clamped_positions(end))
@@ -239,17 +253,20 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
 
 def accelerations(problem: Problem, state: State, forces: Array | None = None) -> Array:
     """M^-1 `forces_at` a state, (N, 3), m/s2; zero where clamped."""
-    force = forces_at(problem, state, forces)
-    out = np.zeros_like(force)
-    for i in range(3):
-        nodes = np.flatnonzero(problem.free[:, i])
-        if problem.mass_is_diagonal:
-            out[nodes, i] = force[nodes, i] / problem.mass[nodes]
-        elif len(nodes):
-            out[nodes, i] = spla.spsolve(
-                problem.mass_matrix[nodes][:, nodes].tocsc(), force[nodes, i]
-            )
-    return out
+    force = forces_at(problem, state, forces) * problem.free
+    if problem.mass_is_diagonal:
+        return force / problem.mass[:, None]
+    diagonal = problem.mass_matrix.diagonal()[:, None]
+    found = conjugate_gradients(
+        lambda x: problem.mass_times(x) * problem.free,
+        force,
+        lambda r: r / diagonal,
+        tolerance=_EQUAL_STEPS = 1e-6
+"""Relative difference up to which two steps count as equal."""
+_MASS_TOLERANCE,
+        max_steps=_MASS_STEPS,
+    )
+    return found.x
 
 
 _INTEGRATORS: dict[str, Integrator] = {

@@ -139,7 +139,10 @@ class _IterativeSteps:
     def _renew(self, p: Array) -> None:
         """Make the preconditioner at p."""
         self._first = self._last = 0
-        self._cycle = self._tangents.approximate(self._objective, p)
+        try:
+            self._cycle = self._tangents.approximate(self._objective, p)
+        except NotPositiveDefinite:
+            self._cycle = None  # no preconditioner
 
     def _solve(self, p: Array, b: Array, project: bool = False) -> Solution:
         objective = self._objective

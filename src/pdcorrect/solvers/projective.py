@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Literal, get_args
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.factorisation import Backend
+from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite
 from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.first_hessian import TrueHessian
@@ -138,7 +139,8 @@ class ProjectiveDynamics(ImplicitStepper):
         if self._true is None:
             super()._prepare(objective)
         else:
-            self._true.solver(objective)(objective.start)
+            with suppress(NotPositiveDefinite):
+                self._true.solver(objective)(objective.start)
             if self._true.lagged:
                 self._true.forget()
 
@@ -153,7 +155,12 @@ class ProjectiveDynamics(ImplicitStepper):
         if self._true is None:
             solver = self._global_solver(objective.factors)
             return minimise(objective, objective.start, solver, options)
-        return self._minimise_true(self._true, objective, options)
+        try:
+            return self._minimise_true(self._true, objective, options)
+        except NotPositiveDefinite:  # G always is, if the step has a minimum
+            self._true.forget()
+            solver = self._global_solver(objective.factors)
+            return minimise(objective, objective.start, solver, options)
 
     def _minimise_true(
         self, hessian: TrueHessian, objective: StepObjective, options: MinimiserOptions

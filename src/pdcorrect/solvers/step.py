@@ -116,12 +116,17 @@ class StepObjective:
             return 0.0
         return 2.0 * self.stage.rate * h * self._damping.value_and_gradient(y)[0]
 
-    def cell_hessians(self, y: Array, project: bool = False) -> Array:
+    def cell_hessians(self, y: Array, project: bool = False, at_rest: bool = False) -> Array:
         """Second derivative without inertia, by cell: (C, L, L, 3, 3), N/m.
 
         ``project`` raises negative eigenvalues to zero at each quadrature point.
+        ``at_rest``: damping in proportion to the stiffness at y itself, so that the
+        result does not depend on the state at the step's start.
         """
         out = self.problem.linearise(y, project).blocks()
+        if at_rest:
+            out *= self.factors[1]
+            return out
         if self._damping is not None and self._damping.stiffness:
             out += self._damping.stiffness * self._damping.tangent.blocks()
         return out

@@ -35,6 +35,8 @@ _CYCLE_SECONDS = 1.7e-8
 
 The cycle is cheaper on large meshes, but takes three to four times the iterations.
 """
+_LARGEST_BAND = 2e9
+"""Bytes; fixed, so that the choice rarely depends on the memory that happens to be free."""
 _SOLVES = 50
 """Solves over which a factorisation should have paid."""
 _SHIFTS = (1e-10, 1e-6, 1e-2)
@@ -96,7 +98,7 @@ class TangentFactory:
     def _band_pays(self) -> bool:
         """Whether a band factor, kept for a run, beats multigrid as a first Hessian."""
         seconds = self._solve_seconds + self._factor_seconds / _SOLVES
-        fits = self.order.factor_bytes < MEMORY_SHARE * available_memory()
+        fits = self.order.factor_bytes < min(_LARGEST_BAND, MEMORY_SHARE * available_memory())
         return fits and seconds < _CYCLE_SECONDS * self._entries
 
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
@@ -116,11 +118,22 @@ class TangentFactory:
         except (NotPositiveDefinite, np.linalg.LinAlgError):
             return self._projected(objective, y, self.backend), False
 
-    def first_hessian(self, objective: StepObjective, y: Array) -> TangentSolver:
-        """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid."""
-        if self.backend == "amg":
-            return self.approximate(objective, y)
-        return self.factorise(objective, y)[0]
+    def first_hessian(
+        self, objective: StepObjective, y: Array, at_rest: bool = False
+    ) -> TangentSolver:
+        """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid.
+
+        ``at_rest``: damping too is taken at y, not at the step's start.
+
+        Raises
+        ------
+        NotPositiveDefinite
+        """
+        approximate = self.backend == "amg"
+        if not approximate:
+            with suppress(NotPositiveDefinite, np.linalg.LinAlgError):
+                return self._solver(objective, y, self.backend, at_rest=at_rest)
+        return self._projected(objective, y, self.backend, approximate, at_rest)
 
     def approximate(self, objective: StepObjective, y: Array) -> TangentSolver:
         """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap.
@@ -133,11 +146,16 @@ class TangentFactory:
         return self._projected(objective, y, "amg", approximate=True)
 
     def _projected(
-        self, objective: StepObjective, y: Array, backend: Backend, approximate: bool = False
+        self,
+        objective: StepObjective,
+        y: Array,
+        backend: Backend,
+        approximate: bool = False,
+        at_rest: bool = False,
     ) -> TangentSolver:
         for shift in (0.0, *_SHIFTS):
             with suppress(NotPositiveDefinite, np.linalg.LinAlgError):
-                return self._solver(objective, y, backend, shift, True, approximate)
+                return self._solver(objective, y, backend, shift, True, approximate, at_rest)
         raise NotPositiveDefinite("no shift made the projected tangent positive definite")
 
     def _solver(
@@ -148,11 +166,12 @@ class TangentFactory:
         shift: float = 0.0,
         project: bool = False,
         approximate: bool = False,
+        at_rest: bool = False,
     ) -> TangentSolver:
         problem, mass_factor = self.problem, objective.factors[0]
-        blocks, modes = objective.cell_hessians(y, project), None
+        blocks, modes = objective.cell_hessians(y, project, at_rest), None
         if problem.space.internal:
-            modes = Condensed(blocks, problem.space.local, problem.cells.shape[1])
+            modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
             blocks = modes.blocks
         if backend == "band":
             band = self.order.assemble(blocks, problem.mass_matrix, mass_factor)
