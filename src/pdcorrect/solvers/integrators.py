@@ -261,9 +261,7 @@ def accelerations(problem: Problem, state: State, forces: Array | None = None) -
         lambda x: problem.mass_times(x) * problem.free,
         force,
         lambda r: r / diagonal,
-        tolerance=_EQUAL_STEPS = 1e-6
-"""Relative difference up to which two steps count as equal."""
-_MASS_TOLERANCE,
+        tolerance=_MASS_TOLERANCE,
         max_steps=_MASS_STEPS,
     )
     return found.x
