@@ -245,3 +245,10 @@ def test_best_coarse_changes_element_and_mass_only():
     assert best.with_changes(solver=scene.solver.model_dump()) == scene
     assert pc.best_coarse(best) == best
     assert (scene.solver.element, scene.solver.mass) == ("hex8", "lumped")
+
+
+@pytest.mark.parametrize(
+    ("cells", "element"), [([6, 2, 2], "hex8-bubble-mean"), ([6, 2, 1], "hex8-bubble")]
+)
+def test_best_coarse_looks_at_the_thickness(cells, element):
+    assert pc.best_coarse(beam(cells)).solver.element == element
