@@ -121,6 +121,30 @@ def finish_tangent_lanes(T, project):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
+def principal_stress_lanes(model, s, v, k, mu, omega, first, density, t):  # type: ignore[no-untyped-def]
+    """Energy density (L,) and principal stresses t (3, L) of the energy with number ``model``.
+
+    Fills v (3, L) and k (L,) by `nearest_volume_lanes` where the energy needs them.
+    """
+    if model == COROTATED:
+        nearest_volume_lanes(s, v, k, first)
+        corotated_lanes(s, v, k, mu, omega, first, density, t)
+    else:
+        hyperelastic_lanes(model, s, mu, omega, density, t)
+
+
+@njit(**OPTIONS)
+def principal_tangent_lanes(model, s, v, k, mu, omega, first, project, T):  # type: ignore[no-untyped-def]
+    """Tangent T (12, L) in the frame of the SVD, see `finish_tangent_lanes`; else as above."""
+    if model == COROTATED:
+        nearest_volume_lanes(s, v, k, first)
+        corotated_tangent_lanes(s, v, k, mu, omega, first, T)
+    else:
+        hyperelastic_tangent_lanes(model, s, mu, omega, T)
+    finish_tangent_lanes(T, project)
+
+
+@njit(**OPTIONS)
 def _volume_diagonal(s, v, l, omega, T):  # type: ignore[no-untyped-def]
     """Add omega (I - dv/ds), with d_i = 2 v_i - s_i and dv/ds free of 0/0 at d_i = 0."""
     v0, v1, v2 = v[0, l], v[1, l], v[2, l]
@@ -165,8 +189,7 @@ def _project_diagonal(T, l):  # type: ignore[no-untyped-def]
 def signed_svd(F: Array) -> tuple[Array, Array, Array]:
     """U (..., 3, 3), s (..., 3), V (..., 3, 3) with F = U diag(s) V^T, both rotations proper."""
     flat, shape = _to_lanes(F)
-    U, s, V, B, S, _, _ = scratch(flat.shape[1])
-    signed_svd_lanes(flat, U, s, V, B, S)
+    U, s, V, _, _ = _decompose(flat)
     return _from_lanes(U, shape), s.T.reshape(*shape, 3).copy(), _from_lanes(V, shape)
 
 
@@ -179,7 +202,8 @@ def nearest_rotation(F: Array) -> Array:
 def nearest_unit_determinant(F: Array) -> Array:
     """The matrix V (..., 3, 3) with det V = 1 nearest to F in the Frobenius norm."""
     flat, shape = _to_lanes(F)
-    U, _, V, _, _, v, _ = _decompose(flat)
+    U, s, V, v, k = _decompose(flat)
+    nearest_volume_lanes(s, v, k, 0)
     scaled = _from_lanes(U, shape) * v.T.reshape(*shape, 1, 3)
     return scaled @ np.swapaxes(_from_lanes(V, shape), -1, -2)
 
@@ -202,13 +226,9 @@ def elasticity(
 ) -> Array:
     """dP/dF, (..., 3, 3, 3, 3), Pa; ``project`` makes it positive semi-definite."""
     flat, shape = _to_lanes(F)
-    U, s, V, _, _, v, k = _decompose(flat)
+    U, s, V, v, k = _decompose(flat)
     T, weights = np.empty((12, flat.shape[1])), _weights(mu, omega, shape)
-    if energy_code(energy) == COROTATED:
-        corotated_tangent_lanes(s, v, k, *weights, 0, T)
-    else:
-        hyperelastic_tangent_lanes(energy_code(energy), s, *weights, T)
-    finish_tangent_lanes(T, project)
+    principal_tangent_lanes(energy_code(energy), s, v, k, *weights, 0, project, T)
     C = np.zeros((flat.shape[1], 3, 3, 3, 3))  # in the frame of the SVD
     for i in range(3):
         C[:, i, i, i, i] = T[i]
@@ -225,13 +245,10 @@ def _density_and_stress(
     F: Array, mu: ArrayLike, omega: ArrayLike, energy: str
 ) -> tuple[Array, Array]:
     flat, shape = _to_lanes(F)
-    U, s, V, _, _, v, k = _decompose(flat)
+    U, s, V, v, k = _decompose(flat)
     weights = _weights(mu, omega, shape)
     density, t, P = np.empty(flat.shape[1]), np.empty_like(s), np.empty_like(flat)
-    if energy_code(energy) == COROTATED:
-        corotated_lanes(s, v, k, *weights, 0, density, t)
-    else:
-        hyperelastic_lanes(energy_code(energy), s, *weights, density, t)
+    principal_stress_lanes(energy_code(energy), s, v, k, *weights, 0, density, t)
     stress_lanes(U, t, V, P)
     return density.reshape(shape), _from_lanes(P, shape)
 
@@ -253,11 +270,10 @@ def _spread(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _decompose(flat: Array) -> tuple[Array, ...]:
-    work = scratch(flat.shape[1])
-    U, s, V, B, S, v, k = work
+    """U (9, L), s (3, L), V (9, L) of matrices (9, L), and room for v (3, L) and k (L,)."""
+    U, s, V, B, S, v, k = scratch(flat.shape[1])
     signed_svd_lanes(flat, U, s, V, B, S)
-    nearest_volume_lanes(s, v, k, 0)
-    return work
+    return U, s, V, v, k
 
 
 def _to_lanes(F: Array) -> tuple[Array, tuple[int, ...]]:

@@ -6,23 +6,13 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdcorrect.fem.decomposition import OPTIONS, nearest_volume_lanes, signed_svd_lanes
-from pdcorrect.fem.energies import (
-    corotated_lanes,
-    corotated_tangent_lanes,
-    finish_tangent_lanes,
-    stress_lanes,
-)
-from pdcorrect.fem.hyperelasticity import (
-    COROTATED,
-    hyperelastic_lanes,
-    hyperelastic_tangent_lanes,
-)
-from pdcorrect.fem.kernels import PARALLEL, deformation, nodal_forces, stiffness, total
+from pdcorrect.fem.blocks import CHUNK, PARALLEL, deformation, nodal_forces, total
+from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
+from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
+from pdcorrect.fem.tangent_kernels import stiffness
 
 Array = NDArray[np.float64]
 
-_CHUNK = 16
 _BACKTRACKS = 30
 
 
@@ -39,14 +29,14 @@ def relax(  # type: ignore[no-untyped-def]
     """
     count, lanes = cells.shape[0], weights.shape[2]
     width = cells.shape[1] - nodes
-    for chunk in prange((count + _CHUNK - 1) // _CHUNK):
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
         F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
         U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
         s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
         k, density, T = np.empty(lanes), np.empty(lanes), np.empty((12, lanes))
         forces, old = np.empty((width, 3)), np.empty((width, 3))
         K, A = np.empty((width, 3, width, 3)), np.empty((9, lanes))
-        for c in range(chunk * _CHUNK, min(count, (chunk + 1) * _CHUNK)):
+        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
             modes, here = cells[c, nodes:], gradients[c, nodes:]
             shear, volume = weights[c, 0], weights[c, 1]
             start = first if volume[lanes - 1] > 0.0 else lanes
@@ -55,11 +45,7 @@ def relax(  # type: ignore[no-untyped-def]
             for _ in range(steps + _BACKTRACKS):
                 deformation(u, cells[c], gradients[c], 1.0, F)
                 signed_svd_lanes(F, U, s, V, B, S)
-                if model == COROTATED:
-                    nearest_volume_lanes(s, v, k, start)
-                    corotated_lanes(s, v, k, shear, volume, start, density, t)
-                else:
-                    hyperelastic_lanes(model, s, shear, volume, density, t)
+                principal_stress_lanes(model, s, v, k, shear, volume, start, density, t)
                 new = total(density)
                 if not new <= energy + 1e-13 * abs(energy):
                     scale *= 0.5
@@ -76,11 +62,7 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                if model == COROTATED:
-                    corotated_tangent_lanes(s, v, k, shear, volume, start, T)
-                else:
-                    hyperelastic_tangent_lanes(model, s, shear, volume, T)
-                finish_tangent_lanes(T, True)
+                principal_tangent_lanes(model, s, v, k, shear, volume, start, True, T)
                 stiffness(here, U, V, T, A, P, K)
                 _solve(K, forces, step)
                 for m in range(width):
