@@ -50,6 +50,8 @@ ORDER = [
     "fem.stress",
     "fem.modes",
     "solvers",
+    "solvers.linear",
+    "solvers.schemes",
     "solvers.integrators",
     "solvers.step",
     "solvers.tangent_solver",

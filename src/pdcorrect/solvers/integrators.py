@@ -1,19 +1,14 @@
-"""Implicit time integrators, each as one equation of the same form.
+"""Time integrators: what the tables of `schemes` make of a state.
 
-A step solves
-
-    c M (y - q) + d C (y - o) = f_int(y) + f_ext
-
-for one unknown configuration y, so every integrator minimises the same kind of
-function (thesis eq. 3-6) and projective dynamics needs no more than other factors in G.
-An integrator is a function from the state to that equation, a `Stage`, which also
-knows how y gives the next state.  C is Rayleigh damping, d (y - o) the velocity at y.
+An integrator is a function from the state to the equation of the step, a `Stage`, which
+also knows how its solution gives the next state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +16,9 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers import schemes
+from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.schemes import Scheme, SchemeOf
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -33,18 +31,14 @@ _MASS_TOLERANCE, _MASS_STEPS = 1e-15, 200
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The equation of one step, over nodal arrays (N, 3).
+    """The equation of one step, over nodal arrays (N, 3), and what it was made of.
 
     Attributes
     ----------
-    inertia : float
-        c, 1/s2.
-    target : (N, 3)
-        q, m: where y would be without forces.
-    rate : float
-        d, 1/s.
-    origin : (N, 3)
-        o, m.
+    inertia, rate, gain : float
+        See `Scheme`.
+    target, origin : (N, 3)
+        q and o, m.
     start : (N, 3)
         First iterate, m; prescribed values where clamped.
     loads_over : tuple of float
@@ -54,8 +48,6 @@ class Stage:
         Positions at which follower loads are sampled, m.
     finish : callable
         y -> the state after the step.
-    gain : float
-        dp'/dy, by which an error of y grows.
     """
 
     inertia: float
@@ -69,11 +61,85 @@ class Stage:
     gain: float = 1.0
 
 
-Integrator = Callable[[Problem, State, float, Array | None], Stage]
-"""(problem, state, h, forces) -> the equation of the step from ``state`` to its time + h.
+class Integrator:
+    """(problem, state, h, forces) -> the stage from ``state`` to its time + h.
 
-``forces`` (N, 3), N, act besides the scene's loads; only a first acceleration needs them.
-"""
+    ``forces`` (N, 3), N, act besides the scene's loads; only a first acceleration
+    needs them.
+    """
+
+    def __init__(self, scheme_of: SchemeOf) -> None:
+        self.scheme_of = scheme_of
+
+    def scheme(self, state: State, h: float) -> Scheme:
+        """The scheme of a step of h seconds from a state."""
+        before = state.memory.get("previous_times")
+        started = bool(state.memory)
+        if before is not None:  # it needs equal steps
+            started = abs(state.time - before[0, 0] - h) <= _EQUAL_STEPS * h
+        return self.scheme_of(h, started)
+
+    def known(
+        self, problem: Problem, state: State, h: float, forces: Array | None
+    ) -> dict[str, Any]:
+        """What the linear combinations of a scheme combine, by name."""
+        scheme, end = self.scheme(state, h), state.time + h
+        known: dict[str, Any] = {
+            "positions": state.positions,
+            "velocities": state.velocities,
+            "prescribed": problem.clamped_positions(end),
+            "time": np.full_like(state.positions, state.time),
+            **state.memory,
+            "clamp_velocity": 0.0,
+            "clamp_velocity_at_y": 0.0,
+            "clamp_jump": 0.0,
+        }
+        if "accelerations" in scheme.memory and "accelerations" not in known:
+            known["accelerations"] = accelerations(problem, state, forces)
+        if problem.clamps.moving:
+            at_y = state.time + scheme.loads_over[1] * h
+            known["clamp_velocity"] = _clamp_velocity(problem, end, h)
+            known["clamp_velocity_at_y"] = _clamp_velocity(problem, at_y, h)
+            known["clamp_jump"] = _clamp_acceleration(problem, at_y, h)
+            known["clamp_jump"] -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
+        return known
+
+    def __call__(
+        self, problem: Problem, state: State, h: float, forces: Array | None = None
+    ) -> Stage:
+        scheme, free = self.scheme(state, h), problem.free
+        known = self.known(problem, state, h, forces)
+
+        def split(on_free: Linear, on_clamped: Linear | None) -> Array:
+            if on_clamped is None:
+                return _full(on_free(known), free)
+            return np.where(free, on_free(known), on_clamped(known))
+
+        def finish(y: Array) -> State:
+            known["y"] = y
+            memory = {name: split(*rows) for name, rows in scheme.memory.items()}
+            velocities = split(scheme.velocities, scheme.clamped_velocities)
+            return State(scheme.positions(known), velocities, state.time + h, memory)
+
+        first, last = (state.time + share * h for share in scheme.loads_over)
+        return Stage(
+            scheme.inertia,
+            split(scheme.target, scheme.clamped_target),
+            scheme.rate,
+            split(scheme.origin, scheme.clamped_origin),
+            split(scheme.start, scheme.clamped),
+            (first, last),
+            scheme.loads_at(known),
+            finish,
+            scheme.gain,
+        )
+
+
+def _full(values: Any, like: NDArray[np.bool_]) -> Array:
+    return np.zeros(like.shape) if isinstance(values, float) else np.asarray(values)
+
+
+backward_euler = Integrator(schemes.backward_euler)
 
 
 def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
@@ -84,132 +150,10 @@ def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
     InputError
     """
     if name == "generalised-alpha":
-        return generalised_alpha(spectral_radius)
-    if name not in _INTEGRATORS:
+        return Integrator(schemes.generalised_alpha(spectral_radius))
+    if name not in _SCHEMES:
         raise InputError(f"integrator {name!r}: expected {', '.join(INTEGRATORS)}.")
-    return _INTEGRATORS[name]
-
-
-def backward_euler(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
-    """Thesis eq. 3-1 to 3-4: v' = (p' - p)/h, M (v' - v)/h = f(p').  First order."""
-    p, v, end = state.positions, state.velocities, state.time + h
-    target = p + h * v
-    return Stage(
-        1.0 / h**2, target, 1.0 / h, p,
-        np.where(problem.free, target, problem.clamped_positions(end)),
-        (state.time, end), p,
-        lambda y: State(y, (y - p) / h, end),
-    )  # fmt: skip
-
-
-def bdf2(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
-    """Two-step backward differences: p' = (4 p - p_)/3 + 2h/3 v', the same for v'.
-
-    Second order.  Without the state one step of the same length before (in
-    ``state.memory``) the step is one of backward Euler, which, at the start only, does
-    not lower the order.
-    """
-    p, v, end = state.positions, state.velocities, state.time + h
-    before = state.memory.get("previous_times")
-    if before is None or abs(state.time - before[0, 0] - h) > _EQUAL_STEPS * h:
-        stage = backward_euler(problem, state, h, forces)
-        origin, target, rate = stage.origin, stage.target, stage.rate
-    else:
-        origin = (4.0 * p - state.memory["previous_positions"]) / 3.0
-        drift = (4.0 * v - state.memory["previous_velocities"]) / 3.0
-        rate = 1.5 / h
-        target = origin + drift / rate
-    memory = {
-        "previous_positions": p,
-        "previous_velocities": v,
-        "previous_times": np.full_like(p, state.time),
-    }
-    return Stage(
-        rate**2, target, rate, origin,
-        np.where(problem.free, target, problem.clamped_positions(end)),
-        (end, end), p + h * v,
-        lambda y: State(y, rate * (y - origin), end, memory),
-    )  # fmt: skip
-
-
-def midpoint(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
-    """Implicit midpoint: y = (p + p')/2, M (v' - v)/h = f(y), p' - p = h (v + v')/2.
-
-    Second order, symplectic; keeps linear and angular momentum.
-    """
-    p, v, end = state.positions, state.velocities, state.time + h
-    free = problem.free
-    start = np.where(free, p + 0.5 * h * v, 0.5 * (p + problem.clamped_positions(end)))
-    clamp_velocity = _clamp_velocity(problem, end, h)
-    target = np.where(free, start, start - 0.25 * h * (clamp_velocity - v))
-
-    def finish(y: Array) -> State:
-        velocities = np.where(free, (4.0 / h) * (y - p) - v, clamp_velocity)
-        return State(2.0 * y - p, velocities, end)
-
-    return Stage(
-        4.0 / h**2, target, 2.0 / h, p, start, (state.time, end), p + 0.5 * h * v, finish, 2.0
-    )  # fmt: skip
-
-
-def generalised_alpha(spectral_radius: float) -> Integrator:
-    """Chung and Hulbert (1993): second order, with chosen damping of high frequencies."""
-    r = spectral_radius
-    if not 0.0 <= r <= 1.0:
-        raise InputError(f"spectral_radius = {r!r}: expected a number from 0 to 1.")
-    alpha_m, alpha_f = (2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0)
-    gamma = 0.5 - alpha_m + alpha_f
-    beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2
-
-    def stage(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
-        p, v, end = state.positions, state.velocities, state.time + h
-        a = state.memory.get("accelerations")
-        if a is None:
-            a = accelerations(problem, state, forces)
-        scale = 1.0 / ((1.0 - alpha_f) * beta * h**2)
-        at_rest = -v / (beta * h) - (0.5 / beta - 1.0) * a  # a' for y = p
-        rate = gamma / (beta * h)
-
-        def ahead(acceleration: Array) -> Array:
-            return v + h * ((1.0 - gamma) * a + gamma * acceleration)
-
-        def finish(y: Array) -> State:
-            new = at_rest + scale * (y - p)
-            velocity = np.where(free, ahead(new), clamp_velocity)
-            return State(
-                p + (y - p) / (1.0 - alpha_f), velocity, end, {"accelerations": new * free}
-            )
-
-        free, time = problem.free, state.time + (1.0 - alpha_f) * h
-        inertia = (1.0 - alpha_m) * scale
-        target = p - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale
-        origin = p - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * v) / rate
-        clamped = alpha_f * p + (1.0 - alpha_f) * problem.clamped_positions(end)
-        clamp_velocity = _clamp_velocity(problem, end, h)
-        acceleration = (clamp_velocity - v) / h  # mean over the step, moved to y's time:
-        if "accelerations" in state.memory:
-            acceleration += _clamp_acceleration(problem, time, h)
-            acceleration -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
-        return Stage(
-            inertia,
-            np.where(free, target, clamped - acceleration / inertia),
-            rate,
-            np.where(free, origin, clamped - _clamp_velocity(problem, time, h) / rate),
-            np.where(free, p + (1.0 - alpha_f) * h * v, clamped),
-            (time, time), p + (1.0 - alpha_f) * h * v, finish,
-            1.0 / (1.0 - alpha_f),
-        )  # fmt: skip
-
-    return stage
-
-
-def quasi_static(problem: Problem, state: State, h: float, forces: Array | None = None) -> Stage:
-    """Equilibrium f(p') = 0 under the loads and clamps at the end of the step."""
-    p, end = state.positions, state.time + h
-    start = np.where(problem.free, p, problem.clamped_positions(end))
-    return Stage(
-        0.0, p, 0.0, p, start, (end, end), p, lambda y: State(y, np.zeros_like(y), end)
-    )  # fmt: skip
+    return Integrator(_SCHEMES[name])
 
 
 def _clamp_velocity(problem: Problem, time: float, h: float) -> Array:
@@ -219,16 +163,12 @@ def _clamp_velocity(problem: Problem, time: float, h: float) -> Array:
     Velocities that only satisfy an integrator's own recursion would ring, as nothing damps
     them, and one-sided differences, put into that recursion, double the acceleration.
     """
-    if not problem.clamps.moving:
-        return np.zeros_like(problem.positions)
     ahead, behind = problem.clamped_positions(time + h), problem.clamped_positions(time - h)
     return (ahead - behind) / (2.0 * h)
 
 
 def _clamp_acceleration(problem: Problem, time: float, h: float) -> Array:
     """Acceleration of the prescribed positions by central differences, (N, 3), m/s2."""
-    if not problem.clamps.moving:
-        return np.zeros_like(problem.positions)
     places = [problem.clamped_positions(time + k * h) for k in (-1, 0, 1)]
     return (places[0] - 2.0 * places[1] + places[2]) / h**2
 
@@ -278,11 +218,11 @@ def accelerations(problem: Problem, state: State, forces: Array | None = None) -
     return found.x
 
 
-_INTEGRATORS: dict[str, Integrator] = {
-    "backward-euler": backward_euler,
-    "bdf2": bdf2,
-    "midpoint": midpoint,
-    "quasi-static": quasi_static,
+_SCHEMES: dict[str, SchemeOf] = {
+    "backward-euler": schemes.backward_euler,
+    "bdf2": schemes.bdf2,
+    "midpoint": schemes.midpoint,
+    "quasi-static": schemes.quasi_static,
 }
-INTEGRATORS = (*_INTEGRATORS, "generalised-alpha")
+INTEGRATORS = (*_SCHEMES, "generalised-alpha")
 """Names of `integrator`."""
