@@ -7,7 +7,7 @@ import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.elastic_body import ElasticBody
-from pdcorrect.fem.loads import cofactor, torsion_field
+from pdcorrect.fem.fields import cofactor, torsion_field
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import problem_from_body

@@ -31,6 +31,7 @@ _HOME = {
     "modes": "pdcorrect.fem.modes",
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
     "Newton": "pdcorrect.solvers.newton",
+    "adjoint": "pdcorrect.solvers.adjoint",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
@@ -58,6 +59,7 @@ __all__ = [  # noqa: RUF022
     "modes",
     "ProjectiveDynamics",
     "Newton",
+    "adjoint",
     "rollout",
     "march",
     "restrict",
@@ -86,6 +88,7 @@ if TYPE_CHECKING:
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
     from pdcorrect.io.vtk import write_vtu_series
     from pdcorrect.scene import Scene, best_coarse
+    from pdcorrect.solvers.adjoint import adjoint
     from pdcorrect.solvers.newton import Newton
     from pdcorrect.solvers.projective import ProjectiveDynamics
     from pdcorrect.solvers.reactions import reactions

@@ -45,6 +45,11 @@ def energy_code(name: str) -> int:
     return _CODES[name]
 
 
+def model_name(code: int) -> str:
+    """A name of the energy with a number of the kernels."""
+    return next(name for name, known in _CODES.items() if known == code)
+
+
 @njit(**OPTIONS)
 def hyperelastic_lanes(model, s, mu, omega, density, t):  # type: ignore[no-untyped-def]
     """Energy density (L,) and principal stresses t (3, L) for stretches s (3, L)."""

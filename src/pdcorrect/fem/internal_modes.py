@@ -180,6 +180,8 @@ class Condensed:
     blocks : (C, nodes, nodes, 3, 3)
         K_uu - K_ub K_bb^-1 K_bu: the second derivative of the energy with the
         modes in equilibrium.
+    size : int
+        Number of modes of all cells.
 
     Raises
     ------
@@ -198,6 +200,7 @@ class Condensed:
         if not _eliminate(blocks, nodes, shift, self.blocks, self._inverse, self._solved):
             raise np.linalg.LinAlgError("the modes of a cell have an indefinite tangent")
         self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
+        self.size = self._modes.size
 
     def reduced(self, r: Array) -> Array:
         """Right-hand side (N, 3) of the nodes for that of a configuration, (N + B, 3)."""

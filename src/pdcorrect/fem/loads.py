@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import SceneError
+from pdcorrect.fem.fields import cofactor, tensor_cross, torsion_field, torsion_pull
 from pdcorrect.fem.operators import Space, scatter
 from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import (
@@ -88,11 +89,17 @@ class NodalLoad:
         Nodal forces at amplitude 1 on the body at rest, N.
     sample : callable or None
         For follower loads: nodal forces at given positions.
+    pull : callable or None
+        For follower loads: (positions, x) -> derivatives (N, 3) of x . sample(positions).
+    acceleration : (3,) or None
+        Of loads that are nodal mass times an acceleration, m/s2.
     """
 
     amplitude: Amplitude
     pattern: Array
     sample: Callable[[Array], Array] | None = None
+    pull: Callable[[Array, Array], Array] | None = None
+    acceleration: Array | None = None
 
     def forces(self, start: float, end: float, positions: Array | None) -> Array:
         """Nodal forces (N, 3), N, for the step from ``start`` to ``end`` (s)."""
@@ -100,6 +107,13 @@ class NodalLoad:
         if self.sample is None or positions is None or factor == 0.0:
             return factor * self.pattern
         return factor * self.sample(positions)
+
+    def pulled(self, start: float, end: float, positions: Array, x: Array) -> Array:
+        """Derivatives (N, 3) of x . `forces` by the positions, N/m, for x (N, 3)."""
+        factor = self.amplitude.mean(start, end)
+        if self.pull is None or factor == 0.0:
+            return np.zeros_like(x)
+        return factor * self.pull(positions, x)
 
 
 def assemble_loads(
@@ -115,7 +129,7 @@ def assemble_loads(
     loads = []
     for i, load in enumerate(scene.loads):
         key = f"loads[{i}]"
-        sample = _SAMPLERS[type(load)](load, space, selector, nodal_mass, f"{key}.region")
+        sample, pull = _SAMPLERS[type(load)](load, space, selector, nodal_mass, f"{key}.region")
         pattern = sample(space.positions)
         if pattern.any() and not pattern[free].any():
             raise SceneError(
@@ -123,26 +137,34 @@ def assemble_loads(
                 "expected at least one free component. Change its region, its direction or the "
                 "clamps."
             )
-        follower = getattr(load, "follower", False)
-        loads.append(NodalLoad(Amplitude(load), pattern, sample if follower else None))
+        amplitude = Amplitude(load)
+        if getattr(load, "follower", False):
+            loads.append(NodalLoad(amplitude, pattern, sample, pull))
+        else:
+            acceleration = np.array(load.acceleration) if isinstance(load, Gravity) else None
+            loads.append(NodalLoad(amplitude, pattern, acceleration=acceleration))
     return tuple(loads)
 
 
-Sampler = Callable[[Array], Array]
+Sampler = tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]
+"""Positions -> nodal forces, and (positions, x) -> derivatives of x . forces."""
+
+
+def _fixed(pattern: Array) -> Sampler:
+    """Forces that do not depend on the positions."""
+    return lambda positions: pattern, lambda positions, x: np.zeros_like(x)
 
 
 def _gravity(
     load: Gravity, space: Space, selector: Selector, nodal_mass: Array, key: str
 ) -> Sampler:
-    pattern = nodal_mass[:, None] * np.array(load.acceleration)
-    return lambda positions: pattern
+    return _fixed(nodal_mass[:, None] * np.array(load.acceleration))
 
 
 def _body_force(
     load: BodyForce, space: Space, selector: Selector, mass: Array, key: str
 ) -> Sampler:
-    pattern = _in_cells(space, selector.cells(load.region, key), np.array(load.density))
-    return lambda positions: pattern
+    return _fixed(_in_cells(space, selector.cells(load.region, key), np.array(load.density)))
 
 
 def _force(load: Force, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
@@ -165,14 +187,13 @@ def _force(load: Force, space: Space, selector: Selector, mass: Array, key: str)
     else:
         cells = selector.cells(load.region, key)
         pattern = _in_cells(space, cells, total / space.volumes()[cells].sum())
-    return lambda positions: pattern
+    return _fixed(pattern)
 
 
 def _traction(load: Traction, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
     face = space.face_quadrature(selector.faces(load.region, key))
     values = np.einsum("nq,nqk,i->nki", face.weights, face.values, np.array(load.traction))
-    pattern = scatter(space.cells[face.cells], values, len(space.positions))
-    return lambda positions: pattern
+    return _fixed(scatter(space.cells[face.cells], values, len(space.positions)))
 
 
 def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
@@ -186,7 +207,16 @@ def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key
         values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -load.pressure * area)
         return scatter(nodes, values, len(positions))
 
-    return sample
+    def pull(positions: Array, x: Array) -> Array:
+        F = np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
+        at_points = -load.pressure * np.einsum(
+            "nq,nqk,nki->nqi", face.weights, face.values, x[nodes]
+        )
+        slope = tensor_cross(F, at_points[..., :, None] * face.normals[..., None, :])
+        values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
+        return scatter(nodes, values, len(positions))
+
+    return sample, pull
 
 
 def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
@@ -197,6 +227,10 @@ def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: 
     def field(points: Array) -> Array:
         return load.strength * torsion_field(points - centre, load.attraction, load.stretch)
 
+    def slope(points: Array, x: Array) -> Array:
+        about = points - centre
+        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
+
     if load.distribution == "nodal":
         nodes = selector.coarse_nodes(load.region, key)
 
@@ -205,13 +239,24 @@ def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: 
             out[nodes] = field(positions[nodes])
             return out
 
-        return sample
+        def pull(positions: Array, x: Array) -> Array:
+            out = np.zeros_like(positions)
+            out[nodes] = slope(positions[nodes], x[nodes])
+            return out
 
-    inside = np.zeros(len(space.cells))
+        return sample, pull
+
+    inside = np.zeros((len(space.cells), 1, 1))
     inside[selector.cells(load.region, key)] = 1.0
-    return lambda positions: space.body_load(
-        field(space.interpolate(positions)) * inside[:, None, None]
-    )
+
+    def sample_cells(positions: Array) -> Array:
+        return space.body_load(field(space.interpolate(positions)) * inside)
+
+    def pull_cells(positions: Array, x: Array) -> Array:
+        forces = space.body_load_transposed(x) * inside
+        return space.interpolate_transposed(slope(space.interpolate(positions), forces))
+
+    return sample_cells, pull_cells
 
 
 _SAMPLERS: dict[type, Callable[..., Sampler]] = {
@@ -222,30 +267,6 @@ _SAMPLERS: dict[type, Callable[..., Sampler]] = {
     Pressure: _pressure,
     Torsion: _torsion,
 }
-
-
-_ON_AXIS = 1e-9
-"""Distance from the axis, of the body's extent, that is taken as zero."""
-
-
-def torsion_field(points: Array, attraction: float, stretch: float) -> Array:
-    """Unit rotational field of the thesis, eq. 6-1 to 6-3, at ``points`` (..., 3).
-
-    f = (stretch, -z - attraction y, y - attraction z) / |...|, and 0 where the
-    numerator vanishes (on the axis with no stretch) or is only a rounding error
-    of the coordinates.
-    """
-    y, z = points[..., 1], points[..., 2]
-    f = np.stack([np.full_like(y, stretch), -z - attraction * y, y - attraction * z], axis=-1)
-    length = np.linalg.norm(f, axis=-1, keepdims=True)
-    rounding = _ON_AXIS * np.abs(points).max(initial=0.0)
-    return np.divide(f, length, out=np.zeros_like(f), where=length > rounding)
-
-
-def cofactor(F: Array) -> Array:
-    """Cofactor matrix det(F) F^-T of (..., 3, 3), also for singular F."""
-    rows = [np.cross(F[..., (i + 1) % 3, :], F[..., (i + 2) % 3, :]) for i in range(3)]
-    return np.stack(rows, axis=-2)
 
 
 def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:

@@ -24,6 +24,8 @@ class Materials:
 
     Attributes
     ----------
+    young, poisson : (C,)
+        Pa; dimensionless.
     mu, volume_weight : (C,)
         Weights of the two energy terms, Pa; zero where a term is left out.
     density : (C,)
@@ -32,6 +34,8 @@ class Materials:
         The energy, see `energy_code`.
     """
 
+    young: Array
+    poisson: Array
     mu: Array
     volume_weight: Array
     density: Array
@@ -46,6 +50,8 @@ class Materials:
         mu, lam = lame(young, poisson)
         omega = lam if rule.volume_weight == "published" else 3 * lam
         return cls(
+            young=young,
+            poisson=poisson,
             mu=np.zeros_like(mu) if rule.energy == "volume-only" else mu,
             volume_weight=np.zeros_like(lam) if rule.energy in _NO_VOLUME else omega,
             density=density,

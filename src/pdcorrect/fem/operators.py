@@ -120,6 +120,24 @@ class Space:
         per_point = np.broadcast_to(density[:, None], basis.dx.shape)
         return sp.csr_matrix(_density_product.assemble(basis, density=per_point))
 
+    def cell_products(self, a: Array, b: Array, rule: str) -> Array:
+        """Derivatives of a . M b by the cells' densities, (C,), for nodal fields (N, 3).
+
+        M by the rule of `mass_matrix`.
+        """
+        if rule == "per-node":
+            share = self.volumes()[:, None] / np.bincount(self.cells.ravel())[self.cells]
+            return np.einsum("ck,cki,cki->c", share, a[self.cells], b[self.cells])
+        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
+        values = np.stack([np.asarray(basis.basis[k][0])[0] for k in self._to_vtk])
+        x, y = (np.einsum("cki,kq->cqi", z[self.cells], values) for z in (a, b))
+        consistent = np.einsum("cq,cqi,cqi->c", basis.dx, x, y)
+        if rule == "consistent":
+            return consistent
+        nodal = np.einsum("cki,cki->ck", a[self.cells], b[self.cells])
+        diagonal = np.einsum("cq,kq,ck->c", basis.dx, values, nodal)
+        return diagonal if rule == "lumped" else 0.5 * (consistent + diagonal)
+
     def volumes(self) -> Array:
         """Rest volume of each cell, (C,), m3."""
         return np.asarray(self._basis.dx.sum(axis=1))
@@ -131,6 +149,16 @@ class Space:
             for i in range(3)
         ]
         return np.stack(columns, axis=1)
+
+    def body_load_transposed(self, nodal: Array) -> Array:
+        """Derivatives of nodal . `body_load` by the force density, (C, Q, 3)."""
+        return self.interpolate(nodal) * self._basis.dx[..., None]
+
+    def interpolate_transposed(self, values: Array) -> Array:
+        """Derivatives (N, 3) of values . `interpolate` by the nodal field, for (C, Q, 3)."""
+        shapes = np.stack([np.asarray(self._basis.basis[k][0])[0] for k in self._to_vtk])
+        cells = np.einsum("cqi,kq->cki", values, shapes, optimize=True)
+        return scatter(self.cells, cells, len(self.positions))
 
     def interpolate(self, nodal: Array) -> Array:
         """Values (C, Q, 3) at the quadrature points of a nodal field (N, 3)."""

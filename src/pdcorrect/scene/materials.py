@@ -20,6 +20,16 @@ def lame(young: Moduli, poisson: Moduli) -> tuple[Moduli, Moduli]:
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
+def lame_slopes(young: Moduli, poisson: Moduli) -> tuple[tuple[Moduli, Moduli], ...]:
+    """Derivatives of (mu, lambda) by Young's modulus, then by Poisson's ratio (Pa)."""
+    mu, lam = lame(young, poisson)
+    by_poisson = (
+        -mu / (1 + poisson),
+        young * (1 + 2 * poisson**2) / ((1 + poisson) * (1 - 2 * poisson)) ** 2,
+    )
+    return (mu / young, lam / young), by_poisson
+
+
 class EffectiveModuli(Strict):
     """What the energy amounts to at small strain: E in Pa, Poisson's ratio."""
 

@@ -153,6 +153,13 @@ class TrueHessian:
         self.age += 1
         return self._turned(self._solver, objective.start)
 
+    def at(self, objective: StepObjective, y: Array) -> TurnedSolver:
+        """H^-1 for the same step at a configuration y, by the factor in use if it fits."""
+        if self._solver is None or objective.factors != self._factors:
+            self._renew(objective, self._at_rest(), INSIDE if self.lagged else 0)
+        assert self._solver is not None
+        return self._turned(self._solver, y)
+
     def renew(self, objective: StepObjective, y: Array) -> TurnedSolver:
         """H^-1 at a configuration within the step, which the next step will not keep."""
         return self._turned(self._renew(objective, y, INSIDE), y)

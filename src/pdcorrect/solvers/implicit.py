@@ -16,7 +16,7 @@ from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import Integrator, backward_euler
 from pdcorrect.solvers.integrators import integrator as make_integrator
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve
 from pdcorrect.solvers.newton_loop import newton_cg
 from pdcorrect.solvers.step import GlobalSolver, StepObjective, check_input, hessian_factors
 from pdcorrect.state import State, Status, StepResult
@@ -94,11 +94,11 @@ class ImplicitStepper:
         self.tolerance = float(tolerance)
         time = problem.scene.time
         self.integrator = time.integrator if integrator is None else integrator
-        self._integrator = make_integrator(self.integrator, time.spectral_radius)
+        self.integrate = make_integrator(self.integrator, time.spectral_radius)
         self._options = MinimiserOptions(self.tolerance * problem.cell_size)
         self._backend = backend
         self._recover = recover
-        self._solvers: dict[tuple[float, float], GlobalSolver] = {}
+        self._solvers: dict[tuple[float, ...], GlobalSolver] = {}
         self._adrift = bool(problem.free.all(axis=0).any())
 
     def __call__(
@@ -129,7 +129,7 @@ class ImplicitStepper:
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         effort = _Effort()
-        outcome = self._attempt(state, forces, h, effort, self._integrator)
+        outcome = self._attempt(state, forces, h, effort, self.integrate)
         if not outcome.minimum.status.ok and self._recover:
             outcome = self._substeps(state, forces, h, effort) or outcome
         if h != self.time_step:
@@ -140,7 +140,7 @@ class ImplicitStepper:
         """Factorise and load the kernels now, so that the first step is like the others."""
         with _quiet_blas():
             rest = self.problem.rest_state()
-            objective = self._objective(rest, None, self.time_step, self._integrator)
+            objective = self.objective(rest, None, self.time_step)
             objective.value_and_gradient(objective.start)
             objective.hessian_operator(objective.start)(objective.start)
             self._prepare(objective)
@@ -148,7 +148,7 @@ class ImplicitStepper:
 
     def _prepare(self, objective: StepObjective) -> None:
         """Factorise what the first step will use."""
-        self._global_solver(objective.factors)
+        self.global_solver(objective.factors)
 
     def __repr__(self) -> str:
         return f"{self.name} of {self.problem!r}, tolerance {self.tolerance:g}"
@@ -165,8 +165,8 @@ class ImplicitStepper:
 
     def _factorisation(self) -> str:
         rest = self.problem.rest_state()
-        stage = self._integrator(self.problem, rest, self.time_step, None)
-        return self._global_solver(hessian_factors(self.problem, stage)).backend
+        stage = self.integrate(self.problem, rest, self.time_step, None)
+        return self.global_solver(hessian_factors(self.problem, stage)).backend
 
     # --- one attempt ----------------------------------------------------------------
 
@@ -175,21 +175,39 @@ class ImplicitStepper:
         raise TypeError(f"{type(self).__name__} does not say how to minimise a step")
 
     def _volume_scale(self) -> float:
-        """Factor on the volume weight in G, as used by `_global_solver`."""
+        """Factor on the volume weight in G, as used by `global_solver`."""
         return 1.0
 
-    def _global_solver(self, factors: tuple[float, float]) -> GlobalSolver:
-        """G's factor; the first one made and the last other one are kept."""
-        if factors not in self._solvers:
-            kept = dict(list(self._solvers.items())[:1])
-            kept[factors] = GlobalSolver(self.problem, factors, self._backend, self._volume_scale())
-            self._solvers = kept
-        return self._solvers[factors]
+    def preconditioner(self, objective: StepObjective, y: Array) -> Solve:
+        """A symmetric positive definite approximation of a step's H^-1 at y, for its adjoint."""
+        return self.global_solver(objective.factors)
 
-    def _objective(
-        self, state: State, forces: Array | None, h: float, integrate: Integrator
+    def global_solver(
+        self, factors: tuple[float, float], volume_scale: float | None = None
+    ) -> GlobalSolver:
+        """G's factor; the first one made and the last other one are kept.
+
+        ``volume_scale`` multiplies the volume weight in G, by default as in this stepper's
+        first Hessian.
+        """
+        scale = self._volume_scale() if volume_scale is None else volume_scale
+        key = (*factors, scale)
+        if key not in self._solvers:
+            kept = dict(list(self._solvers.items())[:1])
+            kept[key] = GlobalSolver(self.problem, factors, self._backend, scale)
+            self._solvers = kept
+        return self._solvers[key]
+
+    def objective(
+        self,
+        state: State,
+        forces: Array | None,
+        time_step: float,
+        integrate: Integrator | None = None,
     ) -> StepObjective:
-        stage = integrate(self.problem, state, h, forces)
+        """What a step minimises; ``integrate`` is the stepper's own integrator by default."""
+        integrate = self.integrate if integrate is None else integrate
+        stage = integrate(self.problem, state, time_step, forces)
         loads = self.problem.external_forces(*stage.loads_over, stage.loads_at)
         if forces is not None:
             loads = loads + forces
@@ -199,7 +217,7 @@ class ImplicitStepper:
         self, state: State, forces: Array | None, h: float, effort: _Effort, integrate: Integrator
     ) -> _Outcome:
         """The method itself, then Newton-CG from where it stopped."""
-        objective = self._objective(state, forces, h, integrate)
+        objective = self.objective(state, forces, h, integrate)
         stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
         minimum = self._minimise(objective, options)
@@ -207,7 +225,7 @@ class ImplicitStepper:
         failed = not minimum.status.ok and minimum.status is not Status.NOT_FINITE
         if failed and self._recover:
             options = replace(options, max_iterations=_FALLBACK_ITERATIONS)
-            solver = self._global_solver(objective.factors)
+            solver = self.global_solver(objective.factors)
             minimum = newton_cg(objective, minimum.positions, solver, options)
             effort.add(minimum)
             if minimum.status is Status.CONVERGED:
@@ -225,7 +243,7 @@ class ImplicitStepper:
 
         None without inertia: parts by backward Euler would solve another problem.
         """
-        if self._integrator(self.problem, state, h, forces).inertia == 0.0:
+        if self.integrate(self.problem, state, h, forces).inertia == 0.0:
             return None
         for level in range(1, _SUBSTEP_LEVELS + 1):
             count = 2**level

@@ -199,7 +199,11 @@ def accelerations(problem: Problem, state: State, forces: Array | None = None) -
     ConvergenceError
         If the mass matrix could not be solved with.
     """
-    force = forces_at(problem, state, forces) * problem.free
+    return solve_mass(problem, forces_at(problem, state, forces) * problem.free)
+
+
+def solve_mass(problem: Problem, force: Array) -> Array:
+    """M^-1 force on the free components, for (N, 3) that is zero where clamped."""
     if problem.mass_is_diagonal:
         return force / problem.mass[:, None]
     diagonal = problem.mass_matrix.diagonal()[:, None]

@@ -13,7 +13,7 @@ from pdcorrect.fem.conjugate_gradients import Solution, conjugate_gradients
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, largest_displacement
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve, largest_displacement
 from pdcorrect.solvers.newton_loop import Direction, newton_loop
 from pdcorrect.solvers.step import HessianOperator, StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory, TangentSolver
@@ -84,6 +84,12 @@ class Newton(ImplicitStepper):
     def _prepare(self, objective: StepObjective) -> None:
         _, gradient = objective.value_and_gradient(objective.start)
         self._solver(objective, self._options)(objective.start, gradient)
+
+    def preconditioner(self, objective: StepObjective, y: Array) -> Solve:
+        """A factor of the Hessian at y, or a multigrid cycle where steps go without one."""
+        if self.linear_solver == "cg":
+            return self._tangents.approximate(objective, y)
+        return self._tangents.factorise(objective, y)[0]
 
     def _factorisation(self) -> str:
         return "amg" if self.linear_solver == "cg" else self._tangents.backend

@@ -15,7 +15,7 @@ from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.first_hessian import TrueHessian
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, minimise
+from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve, minimise
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory
 from pdcorrect.state import State, Status, StepResult, Trajectory
@@ -112,7 +112,7 @@ class ProjectiveDynamics(ImplicitStepper):
         age = int(run.stats["hessian_age"][-1])
         made = len(run) - 1 - max(age, 0)
         state = run.state(made)
-        objective = self._objective(state, None, self.time_step, self._integrator)
+        objective = self.objective(state, None, self.time_step)
         counts = [int(n) for n in run.stats["iterations"][made:]]
         self._true.restore(age, counts, objective, run.state(-1).time)
 
@@ -120,6 +120,12 @@ class ProjectiveDynamics(ImplicitStepper):
         if self._true is not None:
             return self._true.tangents.backend
         return super()._factorisation()
+
+    def preconditioner(self, objective: StepObjective, y: Array) -> Solve:
+        """The first Hessian's solver, turned to y; G's where there is no true one."""
+        if self._true is None:
+            return super().preconditioner(objective, y)
+        return self._true.at(objective, y)
 
     def _volume_scale(self) -> float:
         return 1.0 if self.first_hessian == "G" else VOLUME_SCALE
@@ -142,13 +148,13 @@ class ProjectiveDynamics(ImplicitStepper):
 
     def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
         if self._true is None:
-            solver = self._global_solver(objective.factors)
+            solver = self.global_solver(objective.factors)
             return minimise(objective, objective.start, solver, options)
         try:
             return self._minimise_true(self._true, objective, options)
         except NotPositiveDefinite:  # G always is, if the step has a minimum
             self._true.forget()
-            solver = self._global_solver(objective.factors)
+            solver = self.global_solver(objective.factors)
             return minimise(objective, objective.start, solver, options)
 
     def _minimise_true(

@@ -50,6 +50,7 @@ class StepObjective:
         gamma is relative to this.
     factors : tuple of float
         On mass and on stiffness in the Hessian: 1/s2 and 1.
+    damping : StepDamping or None
     """
 
     def __init__(self, problem: Problem, state: State, stage: Stage, forces: Array) -> None:
@@ -63,10 +64,10 @@ class StepObjective:
         self.factors = hessian_factors(problem, stage)
         self._rest = problem.extended(problem.positions)
         self._target = problem.extended(stage.target)
-        self._damping: _Damping | None = None
+        self.damping: StepDamping | None = None
         damping = problem.scene.damping
         if stage.rate and (damping.mass or damping.stiffness):
-            self._damping = _Damping(problem, state, stage)
+            self.damping = StepDamping(problem, state, stage)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """Gamma (J) and its gradient (N + B, 3), N, zero where clamped."""
@@ -86,8 +87,8 @@ class StepObjective:
         value = energy + kinetic - work
         gradient -= elastic
         gradient -= self.forces
-        if self._damping is not None:
-            loss, force = self._damping.value_and_gradient(y)
+        if self.damping is not None:
+            loss, force = self.damping.value_and_gradient(y)
             value, self.scale = value + loss, self.scale + loss
             gradient += force
         return float(value), gradient
@@ -112,9 +113,9 @@ class StepObjective:
 
     def damping_loss(self, y: Array, h: float) -> float:
         """Energy that the damping takes out in a step of h seconds, J."""
-        if self._damping is None:
+        if self.damping is None:
             return 0.0
-        return 2.0 * self.stage.rate * h * self._damping.value_and_gradient(y)[0]
+        return 2.0 * self.stage.rate * h * self.damping.value_and_gradient(y)[0]
 
     def cell_hessians(self, y: Array, project: bool = False, at_rest: bool = False) -> Array:
         """Second derivative without inertia, by cell: (C, L, L, 3, 3), N/m.
@@ -127,8 +128,8 @@ class StepObjective:
         if at_rest:
             out *= self.factors[1]
             return out
-        if self._damping is not None and self._damping.stiffness:
-            out += self._damping.stiffness * self._damping.tangent.blocks()
+        if self.damping is not None and self.damping.stiffness:
+            out += self.damping.stiffness * self.damping.tangent.blocks()
         return out
 
     def hessian_operator(self, y: Array) -> HessianOperator:
@@ -137,25 +138,37 @@ class StepObjective:
 
     def add_damping(self, x: Array, out: Array) -> None:
         """Add the stiffness-proportional damping's second derivative times x to ``out``."""
-        if self._damping is not None and self._damping.stiffness:
-            out += self._damping.stiffness * self._damping.tangent.apply(x)
+        if self.damping is not None and self.damping.stiffness:
+            out += self.damping.stiffness * self.damping.tangent.apply(x)
 
 
-class _Damping:
-    """d/2 (y - o)^T C (y - o) with C = alpha M + beta K(start of the step)."""
+class StepDamping:
+    """d/2 (y - o)^T C (y - o) with C = alpha M + beta K(start of the step).
+
+    Attributes
+    ----------
+    mass, stiffness : float
+        d alpha and d beta.
+    before : (N + B, 3)
+        The configuration at the start of the step.
+    origin : (N + B, 3)
+        o, with the internal modes' amplitudes there.
+    tangent : Linearisation
+        K, projected.
+    """
 
     def __init__(self, problem: Problem, state: State, stage: Stage) -> None:
         damping = problem.scene.damping
         self._problem = problem
-        self._mass = stage.rate * damping.mass
+        self.mass = stage.rate * damping.mass
         self.stiffness = stage.rate * damping.stiffness
-        before = problem.relaxed(state.positions)
-        self._origin = np.concatenate([stage.origin, before[len(stage.origin) :]])
-        self.tangent = problem.linearise(before, project=True)
+        self.before = problem.relaxed(state.positions)
+        self.origin = np.concatenate([stage.origin, self.before[len(stage.origin) :]])
+        self.tangent = problem.linearise(self.before, project=True)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
-        offset = y - self._origin
-        force = self._mass * self._problem.mass_times(offset)
+        offset = y - self.origin
+        force = self.mass * self._problem.mass_times(offset)
         if self.stiffness:
             force = force + self.stiffness * self.tangent.apply(offset)
         return 0.5 * float(np.vdot(offset, force)), force
@@ -169,17 +182,22 @@ def hessian_factors(problem: Problem, stage: Stage) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class HessianOperator:
-    """x -> (d2 gamma/dy2) x on the free components."""
+    """x -> (d2 gamma/dy2) x, with x and the result on the free components."""
 
     objective: StepObjective
     tangent: Linearisation
 
     def __call__(self, x: Array) -> Array:
+        out = self.product(x)
+        out *= self.objective.free
+        return out
+
+    def product(self, x: Array) -> Array:
+        """The same on all components."""
         out = self.tangent.apply(x)
         if self.objective.factors[0]:
             out += self.objective.factors[0] * self.objective.problem.mass_times(x)
         self.objective.add_damping(x, out)
-        out *= self.objective.free
         return out
 
 

@@ -1,0 +1,137 @@
+"""Derivatives of elastic forces by material weights, and of tangents by the shape.
+
+Every energy here is linear in its two weights mu and omega, so forces and exact
+tangents of a cell are too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import ConvergenceError
+from pdcorrect.fem import kernels
+from pdcorrect.fem.elastic_body import ElasticBody
+from pdcorrect.fem.energies import elasticity
+from pdcorrect.fem.hyperelasticity import model_name
+from pdcorrect.fem.internal_modes import Condensed
+
+Array = NDArray[np.float64]
+
+_STEP = 1e-4
+"""Of a deformation gradient's entry, for differences of fourth order of tangents."""
+
+
+def weight_slopes(body: ElasticBody, configuration: Array, x: Array) -> tuple[Array, Array]:
+    """Derivatives of x . dW/dy by each cell's mu and omega, two (C,), N m/Pa.
+
+    ``configuration`` y and x are (N + B, 3).
+    """
+    quadrature, assembly = body.quadrature, body.assembly
+    u = configuration - body.extended(body.positions)
+    out = []
+    for term, volumes in enumerate((quadrature.weights, quadrature.volume_weights)):
+        weights = np.zeros((len(volumes), 2, volumes.shape[1]))
+        weights[:, term] = volumes
+        energy, by_cell = np.empty(len(volumes)), np.empty((*assembly.cells.shape, 3))
+        kernels.energy_and_forces(
+            body.materials.model, u, assembly.cells, quadrature.lanes, weights,
+            quadrature.first_volume, energy, by_cell, assembly.start, assembly.slots,
+            np.empty_like(u),
+        )  # fmt: skip
+        out.append(-np.einsum("cki,cki->c", by_cell, x[assembly.cells]))
+    return out[0], out[1]
+
+
+def tangent_slopes(
+    body: ElasticBody, configuration: Array, x: Array, z: Array
+) -> tuple[Array, Array, Array]:
+    """Derivatives of x . K z, K the projected tangent at y: by y, mu and omega.
+
+    (N + B, 3), N; and two (C,), N m/Pa, for x and z (N + B, 3).  By differences at each
+    quadrature point, since projecting is not linear.
+    """
+    cells, gradients = body.space.local, body.quadrature.gradients
+    u = configuration - body.extended(body.positions)
+    F, along, across = (
+        np.einsum("cki,cqkj->cqij", field[cells], gradients, optimize=True) for field in (u, x, z)
+    )
+    F = F + np.eye(3)
+    energy = model_name(body.materials.model)
+    shear = body.materials.mu[:, None] * body.quadrature.weights
+    volume = body.materials.volume_weight[:, None] * body.quadrature.volume_weights
+
+    def contracted(F: Array, scales: tuple[float, float] = (1.0, 1.0)) -> Array:
+        C = elasticity(F, scales[0] * shear, scales[1] * volume, project=True, energy=energy)
+        return np.einsum("cqij,cqijkl,cqkl->cq", along, C, across, optimize=True)
+
+    slope = np.empty_like(F)
+    for i in range(3):
+        for j in range(3):
+            step = np.zeros((3, 3))
+            step[i, j] = _STEP
+            slope[..., i, j] = _difference(lambda t, e=step: contracted(F + t * e)) / _STEP
+    by_mu = _difference(lambda t: contracted(F, (1.0 + _STEP * t, 1.0))).sum(axis=1)
+    by_omega = _difference(lambda t: contracted(F, (1.0, 1.0 + _STEP * t))).sum(axis=1)
+    by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
+    flat = cells.ravel()
+    by_shape = [np.bincount(flat, by_cell[..., i].ravel(), minlength=len(x)) for i in range(3)]
+    materials = body.materials
+    return (
+        np.stack(by_shape, axis=1),
+        _quotient(by_mu, _STEP * materials.mu),
+        _quotient(by_omega, _STEP * materials.volume_weight),
+    )
+
+
+def _difference(function) -> Array:  # type: ignore[no-untyped-def]
+    """Derivative at 0 of a function of t by central differences of fourth order, t = 1, 2."""
+    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
+
+
+def _quotient(a: Array, b: Array) -> Array:
+    return np.divide(a, b, out=np.zeros_like(a), where=b > 0.0)
+
+
+class Following:
+    """Internal modes that follow the nodes, in equilibrium, at a configuration y.
+
+    Parameters
+    ----------
+    body : ElasticBody
+    configuration : (N + B, 3)
+    project : bool
+        Whether their tangent is the projected one.
+    """
+
+    def __init__(self, body: ElasticBody, configuration: Array, project: bool = False) -> None:
+        self._count = len(body.positions)
+        self._condensed: Condensed | None = None
+        if body.space.internal:
+            blocks = body.linearise(configuration, project).blocks()
+            try:
+                self._condensed = Condensed(blocks, body.space.local, body.cells.shape[1])
+            except np.linalg.LinAlgError:
+                raise ConvergenceError(
+                    "the internal modes of a cell are not in stable equilibrium: expected a "
+                    "state that a step converged to."
+                ) from None
+
+    def lifted(self, nodal: Array) -> Array:
+        """The configuration's change (N + B, 3) for a change of the nodes (N, 3)."""
+        if self._condensed is None:
+            return nodal
+        nothing = np.zeros((len(nodal) + self._condensed.size, 3))
+        return self._condensed.recovered(nodal, nothing)
+
+    def response(self, slopes: Array) -> Array:
+        """The modes' change (N + B, 3) with nodes held, for such derivatives as forces."""
+        if self._condensed is None:
+            return np.zeros_like(slopes)
+        return self._condensed.recovered(np.zeros((self._count, 3)), slopes)
+
+    def reduced(self, slopes: Array) -> Array:
+        """Derivatives by the nodes (N, 3) of a function of the configuration."""
+        if self._condensed is None:
+            return slopes
+        return self._condensed.reduced(slopes)

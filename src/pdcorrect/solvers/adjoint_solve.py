@@ -1,0 +1,182 @@
+"""Linear systems of the adjoint: H x = g with the second derivative H of a step's gamma.
+
+Thesis eq. 3-30 iterates x <- G^-1 (g + (G - H) x), which needs nothing but G's factor
+and converges where the spectral radius of G^-1 (G - H) is below 1 (eq. 3-38, the
+quasi-Newton form of the same, has the same iterates).  Conjugate gradients with the
+same preconditioner take the square root of its iterations, and converge wherever H is
+positive definite; a factor of H itself needs not even that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.assembly import Assembly
+from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
+
+Array = NDArray[np.float64]
+Solve = Callable[[Array], Array]
+AdjointSolver = Literal["auto", "cg", "direct", "fixed-point"]
+
+_CG_STEPS = 300
+_FIXED_POINT_STEPS = 20000
+_HOPELESS = 1e3
+"""Growth of the fixed point's change at which it is given up."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjointSolution:
+    """X (N + B, 3) with H x = g on the free components, zero where clamped.
+
+    Attributes
+    ----------
+    solver : str
+        What found it.
+    iterations : int
+    residual : float
+        |g - H x| / |g|.
+    """
+
+    x: Array
+    solver: str
+    iterations: int
+    residual: float
+
+
+def check_solver(name: str) -> None:
+    """Refuse a name that is no `AdjointSolver`."""
+    if name not in get_args(AdjointSolver):
+        raise InputError(f"solver = {name!r}: expected {', '.join(get_args(AdjointSolver))}.")
+
+
+def solve_adjoint(
+    H: HessianOperator,
+    g: Array,
+    solver: AdjointSolver,
+    precondition: Callable[[], Solve],
+    global_solver: Callable[[], Solve],
+    tolerance: float,
+) -> AdjointSolution:
+    """Solve H x = g.
+
+    Parameters
+    ----------
+    H : HessianOperator
+    g : (N + B, 3)
+        Zero where clamped.
+    solver : str
+        "auto" is conjugate gradients, and a direct solution where they fail.
+    precondition, global_solver : callable
+        Make the preconditioner of conjugate gradients, and G^-1.
+    tolerance : float
+        Of the residual, relative.
+
+    Raises
+    ------
+    ConvergenceError
+        If the method asked for does not converge, or H is singular.
+    """
+    if not g.any():
+        return AdjointSolution(np.zeros_like(g), "none needed", 0, 0.0)
+    if solver == "fixed-point":
+        return _checked(H, g, *_fixed_point(H, g, global_solver(), tolerance), solver)
+    if solver != "direct":
+        found = conjugate_gradients(
+            H, g, precondition(), tolerance=0.1, max_steps=_CG_STEPS, residual_share=tolerance
+        )
+        if found.converged:
+            return _checked(H, g, found.x, found.steps, "cg")
+        if solver == "cg":
+            why = "did not converge" if found.convex else "met negative curvature"
+            raise ConvergenceError(
+                f"adjoint by conjugate gradients: {why} in {found.steps} steps, expected a state "
+                "that a step converged to. Use solver='direct'."
+            )
+    return _checked(H, g, _direct(H, g), 1, "direct")
+
+
+def _checked(H: HessianOperator, g: Array, x: Array, steps: int, solver: str) -> AdjointSolution:
+    residual = float(np.linalg.norm(g - H(x)) / np.linalg.norm(g))
+    return AdjointSolution(x, solver, steps, residual)
+
+
+def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -> tuple[Array, int]:
+    x = np.zeros_like(g)
+    r, size = g, float(np.linalg.norm(g))
+    for step in range(1, _FIXED_POINT_STEPS + 1):
+        x = x + solve(r)
+        r = g - H(x)
+        left = float(np.linalg.norm(r)) / size
+        if left <= tolerance:
+            return x, step
+        if not left < _HOPELESS:
+            break
+    raise ConvergenceError(
+        f"adjoint by the fixed point: relative residual {left:.1e} after {step} steps, expected "
+        "a spectral radius of G^-1 (G - H) well below 1. Use solver='auto'."
+    )
+
+
+def _direct(H: HessianOperator, g: Array) -> Array:
+    """By a sparse LU factorisation of H, which may be indefinite."""
+    matrix, free = assembled(H.objective, H)
+    try:
+        factor = spla.splu(matrix.tocsc())
+    except RuntimeError as error:
+        raise ConvergenceError(
+            f"adjoint: the Hessian at this state is singular ({error}); the step has no "
+            "derivative there."
+        ) from None
+    out = np.zeros(g.size)
+    out[free] = factor.solve(g.ravel()[free])
+    r = (g - H(out.reshape(g.shape))).ravel()[free]  # one refinement: LU pivots little
+    out[free] += factor.solve(r)
+    return out.reshape(g.shape)
+
+
+def assembled(
+    objective: StepObjective, H: HessianOperator
+) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
+    """H as a sparse matrix on the free components of configurations, and their numbers."""
+    problem = objective.problem
+    blocks = H.tangent.blocks()
+    damping = objective.damping
+    if damping is not None and damping.stiffness:
+        blocks = blocks + damping.stiffness * damping.tangent.blocks()
+    matrix = Assembly(problem.space.local, problem.unknowns).matrix(blocks)
+    mass = problem.mass_matrix.copy()
+    mass.resize((problem.unknowns, problem.unknowns))
+    matrix = matrix + objective.factors[0] * sp.kron(mass, sp.eye_array(3))
+    free = np.flatnonzero(objective.free.ravel())
+    return sp.csr_matrix(matrix)[free][:, free], free
+
+
+def spectral_radius(H: HessianOperator, solve: GlobalSolver) -> float:
+    """Of G^-1 (G - H): the factor by which the fixed point's error falls in a step."""
+    objective = H.objective
+    shape, free = objective.free.shape, np.flatnonzero(objective.free.ravel())
+    G = sp.kron(objective.problem.scalar_matrix(*objective.factors), sp.eye_array(3))
+    G = sp.csr_matrix(G)[free][:, free]
+
+    def on_free(function: Solve) -> spla.LinearOperator:
+        def product(x: Array) -> Array:
+            full = np.zeros(objective.free.size)
+            full[free] = x.ravel()
+            return function(full.reshape(shape)).ravel()[free]
+
+        return spla.LinearOperator(G.shape, matvec=product, dtype=np.float64)
+
+    start = np.random.default_rng(0).normal(size=len(free))
+    ratios = spla.eigsh(
+        on_free(H), 2, G, which="BE", Minv=on_free(solve), v0=start, return_eigenvectors=False
+    )
+    return float(np.abs(1.0 - ratios).max())
