@@ -1,6 +1,7 @@
 """The program: what it writes, what it says, and how it ends."""
 
 import csv
+import dataclasses
 import json
 import os
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam, cross
-from pdcorrect import cli
+from pdcorrect import cli, report
 
 PROGRAM = Path(sys.executable).parent / "pdcorrect"
 
@@ -133,9 +134,7 @@ def test_a_run_that_fails_keeps_its_frames_and_ends_with_status_1(
     def fails_third(self, state, *rest, **named):
         result = real(self, state, *rest, **named)
         if state.time > 0.015:
-            from dataclasses import replace
-
-            return replace(result, status=pc.Status.ITERATION_LIMIT)
+            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
         return result
 
     monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_third)
@@ -235,8 +234,6 @@ def test_an_output_that_cannot_be_written_is_found_before_the_work(run, scene_fi
 
 
 def test_a_name_that_reads_nan_survives_the_report(tmp_path):
-    from pdcorrect import report
-
     scene = beam((2, 1, 1), name="NaN study", time={"frames": 1})
     comparison = pc.compare(scene, cases=pc.evaluate.CASES[2:3])
     record = json.loads(report.to_json(comparison))
@@ -247,19 +244,55 @@ def test_a_name_that_reads_nan_survives_the_report(tmp_path):
 
 
 def test_frames_that_needed_a_fallback_are_reported(monkeypatch):
-    from dataclasses import replace
-
-    from pdcorrect import report
-
     real = pc.Newton.__call__
     monkeypatch.setattr(
         pc.Newton,
         "__call__",
-        lambda self, *args: replace(real(self, *args), status=pc.Status.SUBSTEPPED),
+        lambda self, *args: dataclasses.replace(real(self, *args), status=pc.Status.SUBSTEPPED),
     )
     comparison = pc.compare(beam((3, 1, 1), time={"frames": 2}))
     assert comparison.solver_error is None
     assert any("coarse Newton: 2 of 2 frames" in note for note in report.notes(comparison))
+
+
+def fold(patch, solver, since, status=pc.Status.INVERTED):
+    """Let steps that end after ``since`` (s) end with an inverted cell."""
+    real = solver.__call__
+
+    def folded(self, state, *rest):
+        result = real(self, state, *rest)
+        if result.state.time < since:
+            return result
+        stats = {**result.stats, "smallest_volume_ratio": -0.5}
+        return dataclasses.replace(result, status=status, stats=stats)
+
+    patch.setattr(solver, "__call__", folded)
+
+
+@pytest.mark.parametrize("status", [pc.Status.INVERTED, pc.Status.RECOVERED])
+def test_the_summary_counts_frames_with_inverted_cells(
+    run, scene_file, tmp_path, monkeypatch, status
+):
+    _, out, _ = run("simulate", scene_file, "-o", tmp_path / "upright.h5")
+    assert "folded" not in out
+    fold(monkeypatch, pc.ProjectiveDynamics, 0.025, status)
+    _, out, _ = run("simulate", scene_file, "-o", tmp_path / "run.h5", "--frames", 3)
+    expected = " frames ended with inverted or folded cells, the first of them frame 3 (t = 0.03 s)"
+    assert "1 of 3" + expected in out
+    _, out, _ = run("simulate", scene_file, "-o", tmp_path / "run.h5", "--resume")
+    assert "2 of 4" + expected in out
+
+
+def test_the_report_counts_frames_with_inverted_cells(monkeypatch):
+    scene = beam((3, 1, 1), time={"frames": 3})
+    assert not any("folded" in note for note in report.notes(pc.compare(scene)))
+    fold(monkeypatch, pc.Newton, 0.015)
+    notes = report.notes(pc.compare(scene))
+    expected = (
+        "coarse Newton: 2 of 3 frames ended with inverted or folded cells, the first of them "
+        "frame 2 (t = 0.02 s)."
+    )
+    assert [note for note in notes if "folded" in note] == [expected]
 
 
 def test_an_interrupted_run_says_what_it_kept(run, scene_file, tmp_path, monkeypatch):

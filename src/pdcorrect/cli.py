@@ -249,7 +249,9 @@ def _run(
 
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
-    """Frames, time, iterations, residual, energy, and what solved them."""
+    """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
+    from pdcorrect.report import inverted_frames
+
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
@@ -273,6 +275,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
         f"over the run {stats['external_work'].sum():.4g} J"
     )
+    _say(inverted_frames(stats, problem.time_step) or "")
 
 
 def _progress(hidden: bool = False) -> Any:
