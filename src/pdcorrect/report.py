@@ -17,6 +17,7 @@ from pdcorrect.environment import environment
 from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
+from pdcorrect.replacement import replacing
 from pdcorrect.state import Status, Trajectory
 
 HEADINGS = (
@@ -192,13 +193,8 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file that appears under its name only when it is complete."""
-    part = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def make_folder(folder: str | Path) -> Path:
