@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
@@ -51,6 +52,28 @@ def test_simulate_refines_and_takes_either_solver(program, scene_file, tmp_path,
     assert loaded.attributes["solver"] == method
     assert method in out
     assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_vtu_files_hold_the_stress_at_the_nodes(program, tmp_path, element):
+    scene = beam((4, 2, 1), time={"frames": 2}, solver={"element": element})
+    (tmp_path / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+    arguments = ("-o", tmp_path / "run.h5", "--refine", 2, "--vtu", tmp_path / "vtu")
+    assert program("simulate", tmp_path / "scene.toml", *arguments)[0] == 0
+    problem = pc.discretise(scene, refine=2)
+    for frame, positions in enumerate(pc.load_trajectory(tmp_path / "run.h5").positions):
+        data = meshio.read(tmp_path / "vtu" / f"run_{frame:04d}.vtu").point_data
+        expected = pc.stress(problem, positions).nodal_cauchy
+        for column, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)]):
+            np.testing.assert_array_equal(data["stress"][:, column], expected[:, i, j])
+        s = expected
+        twice_squared = (s[:, 0, 0] - s[:, 1, 1]) ** 2 + (s[:, 1, 1] - s[:, 2, 2]) ** 2
+        twice_squared += (s[:, 2, 2] - s[:, 0, 0]) ** 2
+        twice_squared += 6 * (s[:, 0, 1] ** 2 + s[:, 1, 2] ** 2 + s[:, 0, 2] ** 2)
+        np.testing.assert_allclose(
+            data["von_mises"], np.sqrt(twice_squared / 2), rtol=1e-9, atol=1e-9
+        )
+    assert 100 < data["von_mises"].max() < 1e5
 
 
 def test_an_existing_file_is_kept_unless_told(program, scene_file, tmp_path):

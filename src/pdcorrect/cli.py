@@ -56,7 +56,8 @@ def simulate(
     solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
     frames: Frames = None,
     vtu: Annotated[
-        Optional[Path], typer.Option(help="Also write VTU files and a PVD into this folder.")
+        Optional[Path],
+        typer.Option(help="Also write VTU files, with stress, and a PVD into this folder."),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
     resume: Annotated[
@@ -84,7 +85,8 @@ def simulate(
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
-        _say(f"wrote {write_vtu_series(load_trajectory(output), vtu)}")
+        series = write_vtu_series(load_trajectory(output), vtu, stress_of=stepper.problem)
+        _say(f"wrote {series}")
 
 
 @app.command()
