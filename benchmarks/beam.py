@@ -177,10 +177,15 @@ def memory(length: str, refine: str, first_hessian: str) -> dict[str, Any]:
     }
 
 
-def growth(refine: str, method: str, poisson: str = "0.45") -> dict[str, Any]:
-    """Times and memory of one mesh with one solver of the linear systems."""
+def growth(refine: str, method: str, body: str = "beam") -> dict[str, Any]:
+    """Times and memory of one mesh with one solver of the linear systems.
+
+    The body is the beam of 24 x 2 x 2 coarse cells or a compact block of 6 x 6 x 6.
+    """
     started = time.perf_counter()
-    scene = beam(24, "ours").with_changes(material={"poisson": float(poisson)})
+    scene = beam(24, "ours")
+    if body == "block":
+        scene = scene.with_changes(body={"cells": [6, 6, 6]})
     problem = pc.discretise(scene, refine=int(refine))
     discretised = time.perf_counter() - started
     options: dict[str, Any] = {
@@ -195,6 +200,7 @@ def growth(refine: str, method: str, poisson: str = "0.45") -> dict[str, Any]:
     prepared = time.perf_counter() - started
     run = pc.rollout(stepper, 3)
     return {
+        "body": body,
         "nodes": len(problem.positions),
         "method": method,
         "discretise_s": discretised,

@@ -8,10 +8,11 @@ import pytest
 
 import pdcorrect as pc
 from pdcorrect import cli
+from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
 from pdcorrect.fem.operators import Space
-from pdcorrect.fem.problem import _build
+from pdcorrect.fem.problem import problem_from_body
 from pdcorrect.fem.selection import Selector
 
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
@@ -68,7 +69,8 @@ def problem_on(mesh, element="hex8", **changes):
     cell_size = float(np.cbrt(space.volumes().mean()))
     selector = Selector(mesh, space.positions, cell_size)
     materials = Materials.from_scene(scene, selector, len(mesh.cells))
-    return _build(scene, 1, mesh, space, space.quadrature(), materials, cell_size)
+    body = ElasticBody(mesh, space, space.quadrature(), materials, cell_size)
+    return problem_from_body(scene, 1, body)
 
 
 def boundary_nodes(problem):

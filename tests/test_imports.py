@@ -46,6 +46,7 @@ ORDER = [
     "fem.clamps",
     "fem.materials",
     "fem.assembly",
+    "fem.elastic_body",
     "fem.problem",
     "fem.stress",
     "fem.modes",

@@ -6,10 +6,11 @@ import pytest
 import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
+from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import cofactor, torsion_field
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.operators import Space, lumped
-from pdcorrect.fem.problem import _build
+from pdcorrect.fem.problem import problem_from_body
 from test_mesh import distorted_mesh
 
 
@@ -22,7 +23,8 @@ def distorted_problem(poisson=0.4):
     materials = Materials.from_moduli(
         scene.material, np.linspace(2e5, 4e5, count), np.full(count, poisson), np.full(count, 1e3)
     )
-    return _build(scene, 1, mesh, space, space.quadrature(), materials, 0.05)
+    body = ElasticBody(mesh, space, space.quadrature(), materials, 0.05)
+    return problem_from_body(scene, 1, body)
 
 
 @pytest.mark.parametrize("make", [lambda: pc.discretise(cross()), distorted_problem])

@@ -8,9 +8,10 @@ from block_meshes import spokes, warped
 from conftest import beam, disturbed, rotation
 from pdcorrect.errors import InputError
 from pdcorrect.fem import energies
+from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.operators import Space
-from pdcorrect.fem.problem import _build
+from pdcorrect.fem.problem import problem_from_body
 from pdcorrect.fem.stress import stress, von_mises
 from test_mesh import distorted_mesh
 
@@ -41,7 +42,8 @@ def body(element, energy="corotated", mesh=None, young=None, poisson=0.4, mass="
     materials = Materials.from_moduli(
         scene.material, modulus, np.full(count, poisson), np.full(count, 1e3)
     )
-    return _build(scene, 1, mesh, space, space.quadrature(), materials, 0.05)
+    body = ElasticBody(mesh, space, space.quadrature(), materials, 0.05)
+    return problem_from_body(scene, 1, body)
 
 
 @every_pair

@@ -37,7 +37,7 @@ At 180 000 nodes a step takes less time with it, and the preparation 2 s instead
 56 000 nodes a step takes more (``benchmarks``, case growth).
 """
 MEMORY_SHARE = 0.5
-"""Share of the free memory that a factor may be expected to take."""
+"""Share of the machine's memory that a factor may be expected to take."""
 
 
 class Factor(Protocol):
@@ -217,9 +217,9 @@ def check_backend(backend: str) -> None:
 def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) -> Backend:
     """The back end for a matrix of ``size`` rows.
 
-    ``memory`` (bytes) defaults to what is available.
+    ``memory`` (bytes) defaults to the machine's.
     """
-    memory = available_memory() if memory is None else memory
+    memory = total_memory() if memory is None else memory
     if factor_bytes(size, unknowns) > MEMORY_SHARE * memory or size > unknowns * LARGEST_DIRECT:
         return "amg"
     return "cholespy" if importlib.util.find_spec("cholespy") else "splu"
@@ -236,24 +236,17 @@ def factor_bytes(size: int, unknowns: int = 1) -> float:
     return 12.0 * 12.0 * (size / unknowns) ** (4 / 3) * unknowns**2
 
 
-def available_memory() -> float:
-    """Bytes that a process may still take: the system's word, or the control group's if less."""
-    limits = [_available_memory_of_system()]
-    group = Path("/sys/fs/cgroup")
-    with suppress(OSError, ValueError):
-        limit = int((group / "memory.max").read_text())
-        limits.append(limit - int((group / "memory.current").read_text()))
-    return float(min(limits))
+def total_memory() -> float:
+    """Bytes of the machine, or of the control group if less.
 
-
-def _available_memory_of_system() -> float:
-    with suppress(OSError, ValueError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024.0 * float(line.split()[1])
+    Not what happens to be free: a run that is resumed has to make the same choices.
+    """
+    limits = [float("inf")]
     with suppress(OSError, ValueError, AttributeError):
-        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    return float("inf")
+        limits.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
+    with suppress(OSError, ValueError):
+        limits.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(limits)
 
 
 _REDIRECTION = threading.Lock()

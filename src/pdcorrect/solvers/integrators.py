@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
@@ -252,7 +252,13 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
 
 
 def accelerations(problem: Problem, state: State, forces: Array | None = None) -> Array:
-    """M^-1 `forces_at` a state, (N, 3), m/s2; zero where clamped."""
+    """M^-1 `forces_at` a state, (N, 3), m/s2; zero where clamped.
+
+    Raises
+    ------
+    ConvergenceError
+        If the mass matrix could not be solved with.
+    """
     force = forces_at(problem, state, forces) * problem.free
     if problem.mass_is_diagonal:
         return force / problem.mass[:, None]
@@ -264,6 +270,11 @@ def accelerations(problem: Problem, state: State, forces: Array | None = None) -
         tolerance=_MASS_TOLERANCE,
         max_steps=_MASS_STEPS,
     )
+    if not found.converged:
+        raise ConvergenceError(
+            f"M a = f was not solved in {found.steps} steps of conjugate gradients: expected "
+            "finite forces and densities within a factor of 1e6 of each other."
+        )
     return found.x
 
 

@@ -47,8 +47,8 @@ class Newton(ImplicitStepper):
     linear_solver : {"auto", "direct", "cg"}
         "auto" factorises where a band factor is expected to be quicker
         (`TangentFactory.direct_pays`) and where a direct ``backend`` is asked for by
-        name.  Conjugate gradients may miss a direction
-        of negative curvature that neither the force nor a fixed random vector excites.
+        name.  Conjugate gradients may miss a direction of negative curvature that
+        neither the force nor a fixed random vector excites.
     time_step, integrator, backend, recover
         See `ImplicitStepper`.
     """

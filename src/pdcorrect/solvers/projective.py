@@ -80,31 +80,20 @@ class ProjectiveDynamics(ImplicitStepper):
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
-        if method not in ("lbfgs", "local-global"):
-            raise InputError(f"method = {method!r}: expected 'lbfgs' or 'local-global'.")
-        names = get_args(FirstHessian)
-        if first_hessian not in names:
-            raise InputError(f"first_hessian = {first_hessian!r}: expected {', '.join(names)}.")
-        if method == "local-global" and first_hessian not in ("auto", "G"):
-            raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
-        if method == "local-global" and problem.materials.model != COROTATED:
-            raise InputError(
-                f"method = 'local-global' with energy = {problem.scene.material.energy!r}: "
-                "expected the corotated energy, whose terms are projections, or method = 'lbfgs'."
-            )
+        _check_method(problem, method, first_hessian)
         tolerance = problem.scene.solver.tolerance if tolerance is None else tolerance
         super().__init__(problem, tolerance, time_step, integrator, backend, recover)
         self.method = method
         self.name = f"projective dynamics ({method})"
-        self.first_hessian = "G" if method == "local-global" else first_hessian
-        self._true: TrueHessian | None = None
-        if self.first_hessian in ("auto", "rest", "lagged"):
-            if self.first_hessian == "auto":
-                self.first_hessian = "G-scaled" if backend in ("cholespy", "splu") else "rest"
-            if self.first_hessian != "G-scaled":
-                tangents = TangentFactory(problem, backend)
-                self._true = TrueHessian(tangents, lagged=self.first_hessian == "lagged")
         plain = method == "local-global"
+        self.first_hessian = first_hessian
+        if first_hessian == "auto":
+            general = backend in ("cholespy", "splu")
+            self.first_hessian = "G" if plain else "G-scaled" if general else "rest"
+        self._true: TrueHessian | None = None
+        if self.first_hessian in ("rest", "lagged"):
+            tangents = TangentFactory(problem, backend)
+            self._true = TrueHessian(tangents, lagged=self.first_hessian == "lagged")
         limit = (20000 if plain else 1000) if max_iterations is None else max_iterations
         self._options = replace(
             self._options,
@@ -175,6 +164,21 @@ class ProjectiveDynamics(ImplicitStepper):
             again = replace(options, max_iterations=limit)
             found = _after(found, minimise(objective, found.positions, solver, again))
         return found
+
+
+def _check_method(problem: Problem, method: str, first_hessian: str) -> None:
+    if method not in get_args(Method):
+        raise InputError(f"method = {method!r}: expected 'lbfgs' or 'local-global'.")
+    names = get_args(FirstHessian)
+    if first_hessian not in names:
+        raise InputError(f"first_hessian = {first_hessian!r}: expected {', '.join(names)}.")
+    if method == "local-global" and first_hessian not in ("auto", "G"):
+        raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
+    if method == "local-global" and problem.materials.model != COROTATED:
+        raise InputError(
+            f"method = 'local-global' with energy = {problem.scene.material.energy!r}: "
+            "expected the corotated energy, whose terms are projections, or method = 'lbfgs'."
+        )
 
 
 _NAMES = {

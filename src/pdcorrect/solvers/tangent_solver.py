@@ -18,8 +18,8 @@ from pdcorrect.fem.factorisation import (
     Backend,
     Factor,
     NotPositiveDefinite,
-    available_memory,
     factorise,
+    total_memory,
 )
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.multigrid import rigid_motions
@@ -36,7 +36,7 @@ _CYCLE_SECONDS = 1.7e-8
 The cycle is cheaper on large meshes, but takes three to four times the iterations.
 """
 _LARGEST_BAND = 2e9
-"""Bytes; fixed, so that the choice rarely depends on the memory that happens to be free."""
+"""Bytes; fixed, so that machines of usual size make the same choice."""
 _SOLVES = 50
 """Solves over which a factorisation should have paid."""
 _SHIFTS = (1e-10, 1e-6, 1e-2)
@@ -98,7 +98,7 @@ class TangentFactory:
     def _band_pays(self) -> bool:
         """Whether a band factor, kept for a run, beats multigrid as a first Hessian."""
         seconds = self._solve_seconds + self._factor_seconds / _SOLVES
-        fits = self.order.factor_bytes < min(_LARGEST_BAND, MEMORY_SHARE * available_memory())
+        fits = self.order.factor_bytes < min(_LARGEST_BAND, MEMORY_SHARE * total_memory())
         return fits and seconds < _CYCLE_SECONDS * self._entries
 
     def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:

@@ -1,0 +1,197 @@
+"""`ElasticBody`: a mesh, an element and materials, and the elastic energy's derivatives.
+
+Elements with internal modes (hex8-bubble) have more unknowns than nodes.  A
+*configuration* is an array (N + B, 3) of the nodes' positions followed by the
+amplitudes of the B modes, m; for other elements B is 0 and it is just the positions.
+Solvers work on configurations; users see positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem import internal_modes, kernels
+from pdcorrect.fem.assembly import Assembly, Linearisation
+from pdcorrect.fem.materials import Materials
+from pdcorrect.fem.mesh import HexMesh
+from pdcorrect.fem.operators import Space
+from pdcorrect.fem.quadrature import Quadrature
+
+Array = NDArray[np.float64]
+
+_RELAXED = 1e-13
+"""Of the cell size: change of an internal mode at which its equilibrium is found."""
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticBody:
+    """A body that stores elastic energy; it knows neither mass nor time.
+
+    Attributes
+    ----------
+    mesh : HexMesh
+        Corners, for pictures and refinement.
+    space : Space
+        The scalar finite element space.
+    quadrature : Quadrature
+        Gradients (C, Q, L, 3), 1/m, and weights (C, Q), m3.
+    materials : Materials
+    cell_size : float
+        Coarse cell size (cube root of the mean cell volume), m: the unit of
+        tolerances at every refinement.
+    """
+
+    mesh: HexMesh
+    space: Space
+    quadrature: Quadrature
+    materials: Materials
+    cell_size: float
+
+    @property
+    def positions(self) -> Array:
+        """Rest positions (N, 3), m."""
+        return self.space.positions
+
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """Node numbers (C, K), VTK order."""
+        return self.space.cells
+
+    @property
+    def unknowns(self) -> int:
+        """Nodes and internal modes, N + B."""
+        return len(self.positions) + self.space.internal
+
+    def extended(self, nodal: Array) -> Array:
+        """A nodal vector (N, 3) followed by zeros for the internal modes, (N + B, 3)."""
+        if not self.space.internal:
+            return nodal
+        return np.concatenate([nodal, np.zeros((self.space.internal, 3))])
+
+    def relaxed(self, positions: Array, steps: int = 50) -> Array:
+        """The configuration (N + B, 3) in which the internal modes are in equilibrium.
+
+        ``steps`` Newton steps in each cell at most.
+        """
+        self._check(positions, len(self.positions))
+        if not self.space.internal:
+            return positions
+        x = self.extended(positions - self.positions)
+        internal_modes.relax(
+            self.materials.model, x, self.space.local, self.cells.shape[1],
+            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
+            steps, _RELAXED * self.cell_size,
+        )  # fmt: skip
+        x[: len(positions)] = positions
+        return x
+
+    def energy(self, positions: Array) -> float:
+        """Elastic energy, J, with internal modes in equilibrium."""
+        return self.energy_and_forces(self.relaxed(positions))[0]
+
+    def forces(self, positions: Array) -> Array:
+        """Elastic nodal forces -dW/dp, (N, 3), N."""
+        return self.energy_and_forces(self.relaxed(positions))[1][: len(self.positions)]
+
+    def stiffness(self, positions: Array, project: bool = False) -> sp.csr_matrix:
+        """Tangent stiffness d2W/dp2, (3N, 3N), N/m; component i of node n is row 3 n + i.
+
+        ``project`` raises negative eigenvalues to zero at each quadrature point.
+        """
+        tangent = self.linearise(self.relaxed(positions), project)
+        if not self.space.internal:
+            return tangent.assemble()
+        try:
+            modes = internal_modes.Condensed(
+                tangent.blocks(), self.space.local, self.cells.shape[1]
+            )
+        except np.linalg.LinAlgError:
+            raise ConvergenceError(
+                "the internal modes of a cell are not in stable equilibrium at these positions: "
+                "expected a shape that is strained less. Use project=True."
+            ) from None
+        return Assembly(self.cells, len(self.positions)).matrix(modes.blocks)
+
+    def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
+        """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
+        assembly, u = self.assembly, self._displacement(configuration)
+        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
+        forces = np.empty_like(u)
+        kernels.energy_and_forces(
+            self.materials.model, u, assembly.cells, self.quadrature.lanes,
+            self._point_weights, self.quadrature.first_volume, energy, by_cell,
+            assembly.start, assembly.slots, forces,
+        )  # fmt: skip
+        return float(energy.sum()), forces
+
+    def volume_ratios(self, positions: Array) -> Array:
+        """Smallest det F over the quadrature points of each cell, (C,).
+
+        Of the nodes' displacements alone: a cell that is turned inside out or folded
+        has a value below zero, whatever its internal modes do.
+        """
+        self._check(positions, len(self.positions))
+        out = np.empty(len(self.cells))
+        kernels.smallest_determinants(
+            positions - self.positions, self.cells, self.quadrature.lanes, out
+        )
+        return out
+
+    def linearise(self, configuration: Array, project: bool = False) -> Linearisation:
+        """The tangent at a configuration, ready to be applied or assembled.
+
+        ``project`` raises negative eigenvalues at each quadrature point to zero.
+        """
+        count, lanes = self.quadrature.weights.shape
+        left, right = np.empty((count, 9, lanes)), np.empty((count, 9, lanes))
+        tangent = np.empty((count, 12, lanes))
+        kernels.linearise_cells(
+            self.materials.model, self._displacement(configuration), self.space.local,
+            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
+            project, left, right, tangent,
+        )  # fmt: skip
+        return Linearisation(self.assembly, self.quadrature, left, right, tangent)
+
+    def laplacian(self, volume_scale: float = 1.0) -> sp.csr_matrix:
+        """Sum (2 mu + s omega) w D^T D, (N + B, N + B), N/m: the stiffness in G (eq. 3-14).
+
+        ``volume_scale`` is s.
+        """
+        shear, volume = self._point_weights[:, 0], self._point_weights[:, 1]
+        coefficient = 2 * shear + volume_scale * volume
+        return self.quadrature.laplacian(coefficient, self.space.local, self.unknowns)
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """Sums cell-wise results into configurations."""
+        return Assembly(self.space.local, self.unknowns)
+
+    @cached_property
+    def _point_weights(self) -> Array:
+        """Mu w and omega w at the quadrature points, (C, 2, Q), J."""
+        return np.stack(
+            [
+                self.materials.mu[:, None] * self.quadrature.weights,
+                self.materials.volume_weight[:, None] * self.quadrature.volume_weights,
+            ],
+            axis=1,
+        )
+
+    def _displacement(self, configuration: Array) -> Array:
+        """The nodes' positions less those at rest: gradients of it do not depend on the origin."""
+        self._check(configuration, self.unknowns)
+        if not self.space.internal:
+            return np.subtract(configuration, self.positions)
+        out = np.array(configuration)
+        out[: len(self.positions)] -= self.positions
+        return out
+
+    def _check(self, x: Array, count: int) -> None:
+        if np.shape(x) != (count, 3):
+            raise InputError(f"positions {np.shape(x)}: expected ({count}, 3), one row a node.")
