@@ -6,17 +6,15 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cases
 import numpy as np
 
 import pdcorrect as pc
 from pdcorrect.solvers.first_hessian import TrueHessian
-from pdcorrect.solvers.integrators import backward_euler
-from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
-from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.lbfgs import MinimiserOptions
 from pdcorrect.solvers.tangent_solver import TangentFactory
 
 SIZES = ((24, 1), (24, 2), (24, 4), (56, 4))
@@ -148,11 +146,9 @@ def first_guesses() -> list[dict[str, Any]]:
     "position" p, "inertial" p + h v (for backward Euler the previous increment repeated),
     "extrapolated" p + h v + h (v - v_).
     """
-    from cases import example_beam
-
     rows = []
     for motion in ("twist", "bending", "flight"):
-        problem = pc.discretise(example_beam(motion, 0.45), refine=2)
+        problem = pc.discretise(cases.example_beam(motion, 0.45), refine=2)
         row: dict[str, Any] = {"motion": motion, "poisson": 0.45}
         for name in ("position", "inertial", "extrapolated"):
             row[name] = _iterations(problem, motion, name)
@@ -161,23 +157,15 @@ def first_guesses() -> list[dict[str, Any]]:
 
 
 def _iterations(problem: pc.Problem, motion: str, start: str) -> float:
-    from cases import initial_state
+    h, hessian = problem.time_step, TrueHessian(TangentFactory(problem), lagged=False)
 
-    state = initial_state(problem, motion)
-    hessian = TrueHessian(TangentFactory(problem), lagged=False)
-    before, counts = state.velocities, []
+    def guess(state: pc.State, before: cases.Array) -> cases.Array:
+        p, v = state.positions, state.velocities
+        ahead = {"position": 0.0 * v, "inertial": h * v, "extrapolated": h * (2 * v - before)}
+        return p + ahead[start]
+
     options = MinimiserOptions(1e-5 * problem.cell_size)
-    for _ in range(8):
-        h, p, v = problem.time_step, state.positions, state.velocities
-        stage = backward_euler(problem, state, h)
-        guess = {"position": p, "inertial": p + h * v, "extrapolated": p + h * (2 * v - before)}
-        stage = replace(stage, start=np.where(problem.free, guess[start], stage.start))
-        loads = problem.external_forces(state.time, state.time + h)
-        objective = StepObjective(problem, state, stage, loads)
-        found = minimise(objective, objective.start, hessian.solver(objective), options)
-        counts.append(found.iterations)
-        before, state = v, stage.finish(found.positions)
-    return float(np.mean(counts))
+    return cases.mean_iterations(problem, motion, hessian.solver, options, guess)
 
 
 CASES: dict[str, Callable[[], Any]] = {

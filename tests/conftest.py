@@ -1,11 +1,13 @@
 """Scenes and meshes that several tests share; all asymmetric on purpose."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import pdcorrect as pc
+from pdcorrect import cli
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
@@ -100,3 +102,20 @@ def rotation(seed=3):
 @pytest.fixture
 def rng():
     return np.random.default_rng(12345)
+
+
+@pytest.fixture
+def program(capsys, monkeypatch):
+    """Call the program in this process; returns (status, standard output, standard error)."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["pdcorrect", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            status = end.code or 0
+        out, err = capsys.readouterr()
+        return status, out, err
+
+    return call

@@ -1,18 +1,20 @@
 """The program: what it writes, what it says, and how it ends."""
 
 import csv
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 
 import pdcorrect as pc
 from conftest import beam, cross
-from pdcorrect import cli
+from pdcorrect import cli, report
 
 PROGRAM = Path(sys.executable).parent / "pdcorrect"
 
@@ -24,26 +26,9 @@ def scene_file(tmp_path):
     return path
 
 
-@pytest.fixture
-def run(capsys, monkeypatch):
-    """Call the program in this process; returns (status, standard output, standard error)."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["pdcorrect", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            status = end.code or 0
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return call
-
-
-def test_simulate_writes_the_rollout(run, scene_file, tmp_path):
+def test_simulate_writes_the_rollout(program, scene_file, tmp_path):
     output = tmp_path / "run.h5"
-    status, out, err = run("simulate", scene_file, "-o", output)
+    status, out, err = program("simulate", scene_file, "-o", output)
     assert (status, err) == (0, "")
     problem = pc.discretise(pc.Scene.load(scene_file))
     expected = pc.rollout(pc.ProjectiveDynamics(problem))
@@ -56,10 +41,10 @@ def test_simulate_writes_the_rollout(run, scene_file, tmp_path):
 
 
 @pytest.mark.parametrize("solver", ["pd", "newton"])
-def test_simulate_refines_and_takes_either_solver(run, scene_file, tmp_path, solver):
+def test_simulate_refines_and_takes_either_solver(program, scene_file, tmp_path, solver):
     output = tmp_path / "run.h5"
     arguments = ("--refine", 2, "--solver", solver, "--frames", 2, "--vtu", tmp_path / "vtu")
-    status, out, _ = run("simulate", scene_file, "-o", output, *arguments)
+    status, out, _ = program("simulate", scene_file, "-o", output, *arguments)
     assert status == 0
     loaded = pc.load_trajectory(output)
     assert loaded.positions.shape == (3, 9 * 5 * 3, 3)
@@ -69,14 +54,36 @@ def test_simulate_refines_and_takes_either_solver(run, scene_file, tmp_path, sol
     assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3
 
 
-def test_an_existing_file_is_kept_unless_told(run, scene_file, tmp_path):
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_vtu_files_hold_the_stress_at_the_nodes(program, tmp_path, element):
+    scene = beam((4, 2, 1), time={"frames": 2}, solver={"element": element})
+    (tmp_path / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+    arguments = ("-o", tmp_path / "run.h5", "--refine", 2, "--vtu", tmp_path / "vtu")
+    assert program("simulate", tmp_path / "scene.toml", *arguments)[0] == 0
+    problem = pc.discretise(scene, refine=2)
+    for frame, positions in enumerate(pc.load_trajectory(tmp_path / "run.h5").positions):
+        data = meshio.read(tmp_path / "vtu" / f"run_{frame:04d}.vtu").point_data
+        expected = pc.stress(problem, positions).nodal_cauchy
+        for column, (i, j) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)]):
+            np.testing.assert_array_equal(data["stress"][:, column], expected[:, i, j])
+        s = expected
+        twice_squared = (s[:, 0, 0] - s[:, 1, 1]) ** 2 + (s[:, 1, 1] - s[:, 2, 2]) ** 2
+        twice_squared += (s[:, 2, 2] - s[:, 0, 0]) ** 2
+        twice_squared += 6 * (s[:, 0, 1] ** 2 + s[:, 1, 2] ** 2 + s[:, 0, 2] ** 2)
+        np.testing.assert_allclose(
+            data["von_mises"], np.sqrt(twice_squared / 2), rtol=1e-9, atol=1e-9
+        )
+    assert 100 < data["von_mises"].max() < 1e5
+
+
+def test_an_existing_file_is_kept_unless_told(program, scene_file, tmp_path):
     output = tmp_path / "run.h5"
     output.write_text("precious")
-    status, _, err = run("simulate", scene_file, "-o", output)
+    status, _, err = program("simulate", scene_file, "-o", output)
     assert status != 0
     assert "run.h5" in err
     assert output.read_text() == "precious"
-    assert run("simulate", scene_file, "-o", output, "--overwrite", "--frames", 1)[0] == 0
+    assert program("simulate", scene_file, "-o", output, "--overwrite", "--frames", 1)[0] == 0
     assert len(pc.load_trajectory(output)) == 1
 
 
@@ -88,12 +95,14 @@ def test_an_existing_file_is_kept_unless_told(run, scene_file, tmp_path):
         ("at = 0.0|at = 7.0", "contains no node"),
     ],
 )
-def test_bad_scenes_end_with_status_2_and_one_paragraph(run, scene_file, tmp_path, change, words):
+def test_bad_scenes_end_with_status_2_and_one_paragraph(
+    program, scene_file, tmp_path, change, words
+):
     old, new = change.split("|")
     text = scene_file.read_text()
     assert old in text
     scene_file.write_text(text.replace(old, new))
-    status, out, err = run("simulate", scene_file, "-o", tmp_path / "run.h5")
+    status, out, err = program("simulate", scene_file, "-o", tmp_path / "run.h5")
     assert status == cli.BAD_INPUT
     assert words in err
     assert err.startswith("error: ")
@@ -101,7 +110,7 @@ def test_bad_scenes_end_with_status_2_and_one_paragraph(run, scene_file, tmp_pat
     assert not (tmp_path / "run.h5").exists()
 
 
-def test_other_bad_input_ends_with_status_2(run, scene_file, tmp_path):
+def test_other_bad_input_ends_with_status_2(program, scene_file, tmp_path):
     out = tmp_path / "x.h5"
     for arguments in (
         ("simulate", tmp_path / "none.toml", "-o", out),
@@ -112,45 +121,43 @@ def test_other_bad_input_ends_with_status_2(run, scene_file, tmp_path):
         ("render", scene_file, "-o", tmp_path / "x.png"),
         ("frobnicate",),
     ):
-        status, _, err = run(*arguments)
+        status, _, err = program(*arguments)
         assert status == cli.BAD_INPUT, arguments
         assert "Traceback" not in err
 
 
-def test_an_unwritable_output_is_named(run, scene_file):
+def test_an_unwritable_output_is_named(program, scene_file):
     for target in (scene_file / "run.h5", "/proc/nowhere/run.h5"):
-        status, _, err = run("simulate", scene_file, "-o", target)
+        status, _, err = program("simulate", scene_file, "-o", target)
         assert status != 0
         assert "run.h5" in err
         assert "Traceback" not in err
 
 
 def test_a_run_that_fails_keeps_its_frames_and_ends_with_status_1(
-    run, scene_file, tmp_path, monkeypatch
+    program, scene_file, tmp_path, monkeypatch
 ):
     real = pc.ProjectiveDynamics.__call__
 
     def fails_third(self, state, *rest, **named):
         result = real(self, state, *rest, **named)
         if state.time > 0.015:
-            from dataclasses import replace
-
-            return replace(result, status=pc.Status.ITERATION_LIMIT)
+            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
         return result
 
     monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_third)
     output = tmp_path / "run.h5"
-    status, _, err = run("simulate", scene_file, "-o", output)
+    status, _, err = program("simulate", scene_file, "-o", output)
     assert status == cli.FAILED
     assert "frame 3" in err
     assert len(pc.load_trajectory(output)) == 2
 
 
-def test_compare_writes_its_report(run, tmp_path):
+def test_compare_writes_its_report(program, tmp_path):
     scene = tmp_path / "cross.toml"
     scene.write_text(cross(0.4, name="small cross", solver={"tolerance": 1e-4}).to_toml())
     folder = tmp_path / "report"
-    status, out, _ = run("compare", scene, "-o", folder, "--frames", 3)
+    status, out, _ = program("compare", scene, "-o", folder, "--frames", 3)
     assert status == 0
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     assert list(rows) == ["coarse PD", "coarse Newton", "intermediate PD", "fine PD"]
@@ -175,33 +182,35 @@ def test_compare_writes_its_report(run, tmp_path):
         assert f"| {label} |" in text
 
 
-def test_compare_without_figures_needs_no_view_extra(run, scene_file, tmp_path, monkeypatch):
+def test_compare_without_figures_needs_no_view_extra(program, scene_file, tmp_path, monkeypatch):
     for module in ("pyvista", "matplotlib"):
         monkeypatch.setitem(sys.modules, module, None)
-    status, _, _ = run("compare", scene_file, "-o", tmp_path / "r", "--frames", 2, "--no-figures")
+    status, _, _ = program(
+        "compare", scene_file, "-o", tmp_path / "r", "--frames", 2, "--no-figures"
+    )
     assert status == 0
     assert not list((tmp_path / "r").glob("*.png"))
-    status, _, err = run("compare", scene_file, "-o", tmp_path / "r2", "--frames", 2)
+    status, _, err = program("compare", scene_file, "-o", tmp_path / "r2", "--frames", 2)
     assert status == cli.BAD_INPUT
     assert "pip install 'pdcorrect[view]'" in err
 
 
-def test_render_draws_runs_side_by_side(run, scene_file, tmp_path):
+def test_render_draws_runs_side_by_side(program, scene_file, tmp_path):
     for name, solver in (("a", "pd"), ("b", "newton")):
-        run("simulate", scene_file, "-o", tmp_path / f"{name}.h5", "--solver", solver)
+        program("simulate", scene_file, "-o", tmp_path / f"{name}.h5", "--solver", solver)
     files = (tmp_path / "a.h5", tmp_path / "b.h5")
     for name in ("still.png", "moving.gif"):
-        status, _, err = run("render", *files, "-o", tmp_path / name)
+        status, _, err = program("render", *files, "-o", tmp_path / name)
         assert (status, err) == (0, "")
         assert (tmp_path / name).stat().st_size > 5000
-    status, _, err = run("render", *files, "-o", tmp_path / "x.png", "--frame", 99)
+    status, _, err = program("render", *files, "-o", tmp_path / "x.png", "--frame", 99)
     assert status == cli.BAD_INPUT
-    status, _, err = run("render", *files, "-o", tmp_path / "x.bmp2")
+    status, _, err = program("render", *files, "-o", tmp_path / "x.bmp2")
     assert status == cli.BAD_INPUT
 
 
-def test_doctor_looks_at_everything(run):
-    status, out, _ = run("doctor")
+def test_doctor_looks_at_everything(program):
+    status, out, _ = program("doctor")
     for word in ("numpy", "scikit-fem", "BLAS", "kernel threads", "factorisation cholespy", "GPU",
                  "off-screen rendering"):  # fmt: skip
         assert word in out
@@ -220,14 +229,14 @@ def test_help_names_every_command():
         assert "Usage" in help_text
 
 
-def test_an_output_that_cannot_be_written_is_found_before_the_work(run, scene_file, tmp_path):
+def test_an_output_that_cannot_be_written_is_found_before_the_work(program, scene_file, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
     for arguments in (
         ("compare", scene_file, "-o", blocked),
         ("simulate", scene_file, "-o", tmp_path / "a.h5", "--vtu", blocked / "vtu"),
     ):
-        status, out, err = run(*arguments)
+        status, out, err = program(*arguments)
         assert status == cli.FAILED
         assert "file" in err
         assert "frames of" not in out
@@ -235,8 +244,6 @@ def test_an_output_that_cannot_be_written_is_found_before_the_work(run, scene_fi
 
 
 def test_a_name_that_reads_nan_survives_the_report(tmp_path):
-    from pdcorrect import report
-
     scene = beam((2, 1, 1), name="NaN study", time={"frames": 1})
     comparison = pc.compare(scene, cases=pc.evaluate.CASES[2:3])
     record = json.loads(report.to_json(comparison))
@@ -247,22 +254,58 @@ def test_a_name_that_reads_nan_survives_the_report(tmp_path):
 
 
 def test_frames_that_needed_a_fallback_are_reported(monkeypatch):
-    from dataclasses import replace
-
-    from pdcorrect import report
-
     real = pc.Newton.__call__
     monkeypatch.setattr(
         pc.Newton,
         "__call__",
-        lambda self, *args: replace(real(self, *args), status=pc.Status.SUBSTEPPED),
+        lambda self, *args: dataclasses.replace(real(self, *args), status=pc.Status.SUBSTEPPED),
     )
     comparison = pc.compare(beam((3, 1, 1), time={"frames": 2}))
     assert comparison.solver_error is None
     assert any("coarse Newton: 2 of 2 frames" in note for note in report.notes(comparison))
 
 
-def test_an_interrupted_run_says_what_it_kept(run, scene_file, tmp_path, monkeypatch):
+def fold(patch, solver, since, status=pc.Status.INVERTED):
+    """Let steps that end after ``since`` (s) end with an inverted cell."""
+    real = solver.__call__
+
+    def folded(self, state, *rest):
+        result = real(self, state, *rest)
+        if result.state.time < since:
+            return result
+        stats = {**result.stats, "smallest_volume_ratio": -0.5}
+        return dataclasses.replace(result, status=status, stats=stats)
+
+    patch.setattr(solver, "__call__", folded)
+
+
+@pytest.mark.parametrize("status", [pc.Status.INVERTED, pc.Status.RECOVERED])
+def test_the_summary_counts_frames_with_inverted_cells(
+    program, scene_file, tmp_path, monkeypatch, status
+):
+    _, out, _ = program("simulate", scene_file, "-o", tmp_path / "upright.h5")
+    assert "folded" not in out
+    fold(monkeypatch, pc.ProjectiveDynamics, 0.025, status)
+    _, out, _ = program("simulate", scene_file, "-o", tmp_path / "run.h5", "--frames", 3)
+    expected = " frames ended with inverted or folded cells, the first of them frame 3 (t = 0.03 s)"
+    assert "1 of 3" + expected in out
+    _, out, _ = program("simulate", scene_file, "-o", tmp_path / "run.h5", "--resume")
+    assert "2 of 4" + expected in out
+
+
+def test_the_report_counts_frames_with_inverted_cells(monkeypatch):
+    scene = beam((3, 1, 1), time={"frames": 3})
+    assert not any("folded" in note for note in report.notes(pc.compare(scene)))
+    fold(monkeypatch, pc.Newton, 0.015)
+    notes = report.notes(pc.compare(scene))
+    expected = (
+        "coarse Newton: 2 of 3 frames ended with inverted or folded cells, the first of them "
+        "frame 2 (t = 0.02 s)."
+    )
+    assert [note for note in notes if "folded" in note] == [expected]
+
+
+def test_an_interrupted_run_says_what_it_kept(program, scene_file, tmp_path, monkeypatch):
     real = pc.ProjectiveDynamics.__call__
 
     def interrupted(self, state, *rest):
@@ -271,18 +314,18 @@ def test_an_interrupted_run_says_what_it_kept(run, scene_file, tmp_path, monkeyp
         return real(self, state, *rest)
 
     monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", interrupted)
-    status, _, err = run("simulate", scene_file, "-o", tmp_path / "run.h5")
+    status, _, err = program("simulate", scene_file, "-o", tmp_path / "run.h5")
     assert status == cli.INTERRUPTED
     assert "2 of 4 frames are in" in err
     assert len(pc.load_trajectory(tmp_path / "run.h5")) == 2
 
 
-def test_render_refuses_what_would_mislead(run, scene_file, tmp_path):
-    run("simulate", scene_file, "-o", tmp_path / "a.h5")
+def test_render_refuses_what_would_mislead(program, scene_file, tmp_path):
+    program("simulate", scene_file, "-o", tmp_path / "a.h5")
     for more, words in (
         (("--colour", "error", "-o", tmp_path / "x.png"), "two runs"),
         (("--frame", "1", "-o", tmp_path / "x.gif"), "all frames"),
     ):
-        status, _, err = run("render", tmp_path / "a.h5", *more)
+        status, _, err = program("render", tmp_path / "a.h5", *more)
         assert status == cli.BAD_INPUT
         assert words in err

@@ -178,6 +178,18 @@ def test_other_energies_are_their_formulas(energy, rng):
 
 
 @pytest.mark.parametrize("energy", OTHERS)
+def test_other_energies_keep_their_digits_near_rest(energy, rng):
+    """Where the sums in the formulas cancel, down to strains of 1e-7."""
+    mu, lam = 3.0, 5.0
+    strain = rng.normal(size=(10, 3, 3))
+    strain = 1e-7 * (strain + np.swapaxes(strain, 1, 2))
+    trace = np.trace(strain, axis1=1, axis2=2)
+    linear = mu * (strain**2).sum((1, 2)) + 0.5 * lam * trace**2
+    found = energies.energy_density(np.eye(3) + strain, mu, 3 * lam, energy)
+    np.testing.assert_allclose(found, linear, rtol=1e-5)
+
+
+@pytest.mark.parametrize("energy", OTHERS)
 def test_stress_of_other_energies_is_the_derivative_of_the_formula(energy, rng):
     """Central differences of two sizes, extrapolated: nothing is left but round-off."""
     F = np.concatenate([rng.normal(size=(50, 3, 3)), list(CASES.values())])

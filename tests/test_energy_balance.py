@@ -13,18 +13,18 @@ SPAN = 0.08
 """Seconds; the beam's first period is 0.047 s."""
 
 
-def bent(problem):
-    """At rest in a gently bent shape: almost only the first mode."""
+def bent(problem, by=0.002):
+    """At rest in a gently bent shape, ``by`` m: almost only the first mode."""
     mode = pc.modes(problem, 1).shapes[0]
-    start = problem.positions + 0.002 * mode / np.abs(mode).max()
+    start = problem.positions + by * mode / np.abs(mode).max()
     return pc.State(start, np.zeros_like(start))
 
 
-def vibration(integrator, step, **changes):
+def vibration(integrator, step, by=0.002, **changes):
     scene = beam((4, 1, 1), loads=[], time={"step": step, "integrator": integrator}, **changes)
     problem = pc.discretise(scene)
     frames = round(SPAN / step)
-    return pc.rollout(pc.Newton(problem, tolerance=1e-9), frames=frames, state=bent(problem))
+    return pc.rollout(pc.Newton(problem, tolerance=1e-9), frames=frames, state=bent(problem, by))
 
 
 def lost_share(integrator, step, **changes):
@@ -55,6 +55,18 @@ def test_the_damping_accounts_for_the_loss_of_a_damped_vibration(damping):
     assert lost > 0.3 * balance.total[0]
     assert balance.damping_loss[-1] == pytest.approx(lost, rel=0.03)
     assert (np.diff(balance.damping_loss) >= 0).all()
+
+
+@pytest.mark.parametrize(("integrator", "most"), [("bdf2", 1.1), ("generalised-alpha", 1.02)])
+def test_damped_internal_modes_move_rightly_but_their_loss_is_recorded_too_large(integrator, most):
+    """In motion so small that the shape holds one mode only."""
+    changes = {"damping": {"stiffness": 0.0005}, "solver": {"element": "hex8-bubble"}, "by": 2e-6}
+    exact = pc.metrics.energy_balance(vibration("midpoint", 0.0005, **changes))
+    assert exact.damping_loss[-1] == pytest.approx(exact.total[0] - exact.total[-1], rel=1e-3)
+    found = pc.metrics.energy_balance(vibration(integrator, 0.0005, **changes))
+    lost = found.total[0] - found.total[-1]
+    assert lost == pytest.approx(exact.damping_loss[-1], rel=0.03)
+    assert 1.001 < found.damping_loss[-1] / exact.damping_loss[-1] < most
 
 
 def test_the_terms_add_up_to_the_work_of_the_loads():

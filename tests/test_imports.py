@@ -13,6 +13,7 @@ ORDER = [
     "pdcorrect",
     "errors",
     "interruption",
+    "replacement",
     "shapes",
     "scene.regions",
     "scene.bodies",

@@ -337,30 +337,29 @@ def test_the_log_of_a_continued_run_holds_all_its_steps():
 # --- the program -----------------------------------------------------------------------
 
 
+REMEMBERING = {
+    "time": {"step": 0.01, "frames": 12, "integrator": "bdf2"},
+    "damping": {"mass": 2.0, "stiffness": 2e-3},
+    "solver": {"element": "hex8-bubble"},
+}
+"""A step needs the state before the last as well, and damps internal modes."""
+
+
 @pytest.fixture
-def scene_file(tmp_path):
+def scene_file(tmp_path, request):
+    """Of the small beam, with the changes that a test asks for."""
     path = tmp_path / "scene.toml"
-    path.write_text(small().to_toml(), encoding="utf-8")
+    changes = getattr(request, "param", {})
+    path.write_text(small(**changes).to_toml(), encoding="utf-8")
     return path
 
 
-@pytest.fixture
-def program(capsys, monkeypatch):
-    """Call the program in this process; returns (status, standard output, standard error)."""
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["pdcorrect", *map(str, arguments)])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            status = end.code or 0
-        out, err = capsys.readouterr()
-        return status, out, err
-
-    return call
+of_both_kinds = pytest.mark.parametrize(
+    "scene_file", [{}, REMEMBERING], ids=["plain", "damped bdf2"], indirect=True
+)
 
 
+@of_both_kinds
 @pytest.mark.parametrize("solver", ["pd", "newton"])
 def test_a_run_in_three_parts_equals_one_at_once(program, scene_file, tmp_path, solver):
     path, expected = tmp_path / "run.h5", tmp_path / "expected.h5"
@@ -616,8 +615,14 @@ def test_a_run_on_a_full_disk_goes_on_when_there_is_room(program, scene_file, tm
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
 @pytest.mark.parametrize(
-    ("kills", "frames"),
-    [(3, 400), pytest.param(20, 6000, marks=pytest.mark.slow)],
+    ("kills", "frames", "scene_file"),
+    [
+        (3, 400, {}),
+        pytest.param(20, 6000, {}, marks=pytest.mark.slow),
+        pytest.param(10, 3000, REMEMBERING, marks=pytest.mark.slow),
+    ],
+    indirect=["scene_file"],
+    ids=["plain", "plain, often", "damped bdf2"],
 )
 def test_a_run_killed_again_and_again_equals_one_that_was_not(
     program, scene_file, tmp_path, kills, frames

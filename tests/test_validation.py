@@ -10,7 +10,7 @@ import pytest
 import pdcorrect as pc
 
 FOLDER = Path(__file__).parent.parent / "validation"
-CASES = ("best_coarse", "cantilever", "cook", "locking")
+CASES = ("best_coarse", "cantilever", "cook", "four_errors", "locking")
 
 
 def case(name):
@@ -65,6 +65,13 @@ def test_best_coarse_model_of_a_short_beam():
     check("best_coarse", run.shares("short beam, bend", (run.BEST,)))
     for modes, count in (("3 warping", 6), ("6 products", 9)):
         assert run.zero_modes(modes) == count
+
+
+def test_four_errors_of_a_beam_on_its_coarse_mesh():
+    run = case("four_errors")
+    check("four_errors", run.solver_error())
+    check("four_errors", run.model_error())
+    check("four_errors", run.time_error(("backward-euler", "midpoint"), (1, 2, 4), finest=64))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -56,7 +56,8 @@ def simulate(
     solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
     frames: Frames = None,
     vtu: Annotated[
-        Optional[Path], typer.Option(help="Also write VTU files and a PVD into this folder.")
+        Optional[Path],
+        typer.Option(help="Also write VTU files, with stress, and a PVD into this folder."),
     ] = None,
     overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
     resume: Annotated[
@@ -84,7 +85,8 @@ def simulate(
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
-        _say(f"wrote {write_vtu_series(load_trajectory(output), vtu)}")
+        series = write_vtu_series(load_trajectory(output), vtu, stress_of=stepper.problem)
+        _say(f"wrote {series}")
 
 
 @app.command()
@@ -249,7 +251,9 @@ def _run(
 
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
-    """Frames, time, iterations, residual, energy, and what solved them."""
+    """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
+    from pdcorrect.report import inverted_frames
+
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
@@ -273,6 +277,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
         f"over the run {stats['external_work'].sum():.4g} J"
     )
+    _say(inverted_frames(stats, problem.time_step) or "")
 
 
 def _progress(hidden: bool = False) -> Any:

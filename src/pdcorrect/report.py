@@ -6,7 +6,9 @@ import csv
 import dataclasses
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +17,8 @@ from pdcorrect.environment import environment
 from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
-from pdcorrect.state import Trajectory
+from pdcorrect.replacement import replacing
+from pdcorrect.state import Status, Trajectory
 
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
@@ -87,7 +90,33 @@ def notes(comparison: Comparison) -> list[str]:
         for row in comparison.rows
         if row.unusual_frames
     ]
+    for row in comparison.rows:
+        inverted = inverted_frames(comparison.runs[row.label].stats, scene.time.step)
+        if inverted:
+            out.append(f"{row.label}: {inverted}.")
     return out
+
+
+def inverted_frames(stats: Mapping[str, Any], step: float) -> str | None:
+    """How many frames of a run ended with inverted cells, and which was the first; None if none.
+
+    Parameters
+    ----------
+    stats : mapping of str to (T,) arrays
+        Those of a run from its first step on.
+    step : float
+        s.
+    """
+    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
+    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
+        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
+    if not inverted.any():
+        return None
+    first = 1 + int(inverted.argmax())
+    return (
+        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
+        f"first of them frame {first} (t = {first * step:g} s)"
+    )
 
 
 def _lost_share(run: Trajectory) -> float | None:
@@ -164,13 +193,8 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 
 
 def _put(path: Path, text: str) -> None:
-    """Write a file that appears under its name only when it is complete."""
-    part = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def make_folder(folder: str | Path) -> Path:

@@ -96,7 +96,14 @@ THIN: dict[str, Loads] = {
     "thin beam, twist unit": twist(6e4),
 }
 """One cell through the thickness."""
-ALL = MOTIONS | CHECKS | THIN
+VARIED: dict[str, Loads] = {
+    "beam, twist unit, half": twist(2e4),
+    "beam, twist linear, half": twist(2e4, True),
+    "beam, stretch, published": force(RIGHT["region"], 400, 0, 0),
+}
+"""The same with half the load, or another volume weight."""
+MATERIALS = {"beam, stretch, published": {"volume_weight": "published"}}
+ALL = MOTIONS | CHECKS | THIN | VARIED
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,10 @@ MODELS = (
 THIN_MODELS = (
     Model("hex8", 0.5, True), Model("hex8-mean", 0.5, True), Model("hex8-bubble", 0.5, True),
     BEST, Model("hex27", 0.5, True),
+)  # fmt: skip
+VARIED_MODELS = (
+    Model("hex8", refine=2), Model("hex8", 0.5, True), Model("hex8-bubble", 1.0, False),
+    *(Model("hex8-bubble", a, True) for a in (0.5, 0.0)), Model("hex8-bubble", 0.5, False), BEST,
 )  # fmt: skip
 THESIS = ("beam, twist unit", "cross, twist unit", "weight, impulse")
 THESIS_MODELS = (
@@ -232,7 +243,8 @@ def scene(motion: str, frames: int = FRAMES, **load: Any) -> pc.Scene:
     keys = {**ALL[motion], **load}
     keys.pop("linear", None)
     return pc.Scene(
-        name=motion, body=BODIES[body], material=MATERIAL, loads=[keys],
+        name=motion, body=BODIES[body], loads=[keys],
+        material={**MATERIAL, **MATERIALS.get(motion, {})},
         clamps=CLAMPS.get(body, [LEFT]), time={"step": 0.01, "frames": frames},
         solver={"tolerance": TOLERANCE},
     )  # fmt: skip
@@ -377,6 +389,8 @@ def compute() -> common.Figures:
         figures |= shares(motion, THESIS_MODELS, thesis_problem, "nodal forces, ")
     for motion in THIN:
         figures |= shares(motion, THIN_MODELS)
+    for motion in VARIED:
+        figures |= shares(motion, VARIED_MODELS)
     for motion in CHECKS:
         figures |= shares(motion, (BEST,))
         figures |= reference_error(motion)

@@ -2,7 +2,9 @@
 
 Threads share the cells in fixed contiguous chunks and every result is stored by
 cell, then summed node by node in a fixed order; so results do not depend on the
-number of threads.  Work arrays are made once a chunk.
+number of threads.  Work arrays are made once a chunk, by the thread that takes it, and
+none for a block, a cell or a quadrature point; only the eigenvalues of a point's 3x3 block,
+where negative ones are raised to zero, come from LAPACK with arrays of their own.
 """
 
 from __future__ import annotations

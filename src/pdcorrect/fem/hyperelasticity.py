@@ -57,15 +57,18 @@ def hyperelastic_lanes(model, s, mu, omega, density, t):  # type: ignore[no-unty
         a, b, c = s[0, l], s[1, l], s[2, l]
         lam = omega[l] / 3.0
         if model == NEO_HOOKEAN:
-            change = a * b * c - 1.0
-            squares = a * a + b * b + c * c - 3.0
-            density[l] = mu[l] * (0.5 * squares - change) + 0.5 * (mu[l] + lam) * change * change
+            x, y, z = a - 1.0, b - 1.0, c - 1.0  # near rest sums of a, b, c would cancel
+            pairs, triple = x * y + y * z + z * x, x * y * z
+            change = x + y + z + pairs + triple
+            rest = 0.5 * (x * x + y * y + z * z) - pairs - triple
+            density[l] = mu[l] * rest + 0.5 * (mu[l] + lam) * change * change
             q = (mu[l] + lam) * change - mu[l]
             t[0, l] = mu[l] * a + q * b * c
             t[1, l] = mu[l] * b + q * a * c
             t[2, l] = mu[l] * c + q * a * b
         else:
-            x, y, z = 0.5 * (a * a - 1.0), 0.5 * (b * b - 1.0), 0.5 * (c * c - 1.0)
+            x, y, z = a - 1.0, b - 1.0, c - 1.0
+            x, y, z = x + 0.5 * x * x, y + 0.5 * y * y, z + 0.5 * z * z
             trace = x + y + z
             density[l] = mu[l] * (x * x + y * y + z * z) + 0.5 * lam * trace * trace
             t[0, l] = a * (2.0 * mu[l] * x + lam * trace)

@@ -34,14 +34,13 @@ def relax(  # type: ignore[no-untyped-def]
         U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
         s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
         k, density, T = np.empty(lanes), np.empty(lanes), np.empty((12, lanes))
-        forces, old = np.empty((width, 3)), np.empty((width, 3))
+        forces, old, step = np.empty((width, 3)), np.empty((width, 3)), np.empty((width, 3))
         K, A = np.empty((width, 3, width, 3)), np.empty((9, lanes))
         for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
             modes, here = cells[c, nodes:], gradients[c, nodes:]
             shear, volume = weights[c, 0], weights[c, 1]
             start = first if volume[lanes - 1] > 0.0 else lanes
-            energy, scale = np.inf, 1.0
-            step, tried = np.zeros((width, 3)), 0
+            energy, scale, tried = np.inf, 1.0, 0
             for _ in range(steps + _BACKTRACKS):
                 deformation(u, cells[c], gradients[c], 1.0, F)
                 signed_svd_lanes(F, U, s, V, B, S)
@@ -56,7 +55,7 @@ def relax(  # type: ignore[no-untyped-def]
                     for m in range(width):
                         u[modes[m]] = old[m] + scale * step[m]
                     continue
-                if tried == steps or (tried > 0 and np.abs(step).max() <= tolerance):
+                if tried == steps or (tried > 0 and _largest(step) <= tolerance):
                     break
                 tried += 1
                 energy, scale = new, 1.0
@@ -68,6 +67,16 @@ def relax(  # type: ignore[no-untyped-def]
                 for m in range(width):
                     old[m] = u[modes[m]]
                     u[modes[m]] = old[m] + step[m]
+
+
+@njit(**OPTIONS)
+def _largest(step):  # type: ignore[no-untyped-def]
+    """Largest size of an entry of ``step`` (L, 3)."""
+    out = 0.0
+    for m in range(step.shape[0]):
+        for i in range(3):
+            out = max(out, abs(step[m, i]))
+    return out
 
 
 @njit(**OPTIONS)
@@ -107,30 +116,31 @@ def _eliminate(blocks, nodes, shift, condensed, inverse, solved):  # type: ignor
     count, width = blocks.shape[:2]
     m, n = 3 * (width - nodes), 3 * nodes
     failed = np.zeros(count, dtype=np.int64)
-    for c in prange(count):
-        K, right = np.empty((m, m)), np.zeros((m, m + n))
-        for i in range(m):
-            k, a = nodes + i // 3, i % 3
-            right[i, i] = 1.0
-            for j in range(m):
-                K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
-            for j in range(n):
-                right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
-        largest = 0.0
-        for i in range(m):
-            largest = max(largest, K[i, i])
-        for i in range(m):
-            K[i, i] += shift * largest
-        if not _cholesky_solve(K, right):
-            failed[c] = 1
-        inverse[c] = right[:, :m]
-        solved[c] = right[:, m:]
-        for i in range(n):
-            for j in range(n):
-                value = blocks[c, i // 3, j // 3, i % 3, j % 3]
-                for b in range(m):
-                    value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
-                condensed[c, i // 3, j // 3, i % 3, j % 3] = value
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        K, right = np.empty((m, m)), np.empty((m, m + n))
+        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+            for i in range(m):
+                k, a = nodes + i // 3, i % 3
+                for j in range(m):
+                    K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
+                    right[i, j] = 1.0 if i == j else 0.0
+                for j in range(n):
+                    right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
+            largest = 0.0
+            for i in range(m):
+                largest = max(largest, K[i, i])
+            for i in range(m):
+                K[i, i] += shift * largest
+            if not _cholesky_solve(K, right):
+                failed[c] = 1
+            inverse[c] = right[:, :m]
+            solved[c] = right[:, m:]
+            for i in range(n):
+                for j in range(n):
+                    value = blocks[c, i // 3, j // 3, i % 3, j % 3]
+                    for b in range(m):
+                        value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
+                    condensed[c, i // 3, j // 3, i % 3, j % 3] = value
     return failed.sum() == 0
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import MeshError, OutputError
 from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, HexMesh
 from pdcorrect.fem.mesh_checks import TOLERANCE
+from pdcorrect.replacement import replacing
 
 _HEXAHEDRA = ("hexahedron", "hexahedron20", "hexahedron27")
 """Cells that are read; of the second-order ones, the corners."""
@@ -207,10 +208,8 @@ def write_vtu(
         point_data=dict(point_data or {}),
         cell_data={name: [values] for name, values in (cell_data or {}).items()},
     )
-    part = path.with_name(path.name + ".part")
     try:
-        meshio.write(part, mesh, file_format="vtu")
-        part.replace(path)
+        with replacing(path) as part:
+            meshio.write(part, mesh, file_format="vtu")
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error

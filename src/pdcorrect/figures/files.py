@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pdcorrect import replacement
 from pdcorrect.errors import InputError, OutputError, require_extra
 
 Image = NDArray[np.uint8]
@@ -25,13 +26,10 @@ def replacing(output: Path) -> Iterator[Path]:
         raise OutputError(f"{output}: there is no folder {output.parent}; create it first.")
     part = output.with_name(f"{output.stem}.part{output.suffix}")
     try:
-        yield part
-        part.replace(output)
+        with replacement.replacing(output, part):
+            yield part
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def write_png(path: Path, page: Image) -> None:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import OutputError
 from pdcorrect.io.disk_space import Reserve, abandon
 from pdcorrect.io.superblock import read_superblock
+from pdcorrect.replacement import part_of, replacing
 
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
 _FILL: dict[str, Any] = {"f": np.nan, "i": -1, "S": b""}
@@ -277,22 +278,13 @@ def _check_target(path: Path, overwrite: bool) -> None:
 
 def _save(data: bytes, path: Path) -> None:
     """Write all or nothing: a killed process leaves no file without its beginning."""
-    part = part_of(path)
     try:
-        part.write_bytes(data)
-        part.replace(path)
+        with replacing(path) as part:
+            part.write_bytes(data)
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({_reason(error)}); choose another place."
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-
-
-def part_of(path: Path) -> Path:
-    """Where what is to replace a file is written."""
-    return path.with_name(path.name + ".part")
 
 
 def _filters(compress: bool) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pdcorrect import __version__
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.io.growing_file import Column, Content, GrowingFile, part_of
+from pdcorrect.io.growing_file import Column, Content, GrowingFile
 from pdcorrect.io.trajectory_reader import (
     FORMAT,
     RESERVED,
@@ -29,6 +29,7 @@ from pdcorrect.io.trajectory_reader import (
     read_storage,
     trajectory_fault,
 )
+from pdcorrect.replacement import part_of, replacing
 from pdcorrect.state import State, StepResult, Trajectory
 
 __all__ = ["TrajectoryWriter", "load_trajectory", "save_trajectory"]
@@ -267,17 +268,13 @@ def _reopened(path: Path, run: Trajectory) -> GrowingFile | None:
 
 
 def _rewrite(path: Path, run: Trajectory, compress: bool) -> None:
-    part = part_of(path)
     try:
-        save_trajectory(part, run, overwrite=True, compress=compress)
-        part.replace(path)
+        with replacing(path) as part:
+            save_trajectory(part, run, overwrite=True, compress=compress)
     except OSError as error:
         raise OutputError(
             f"{path}: is unchanged, but the copy to continue with failed: {error}"
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def _entries(state: State) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.stress import stress, von_mises
+from pdcorrect.replacement import replacing
 from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
@@ -88,10 +89,9 @@ def write_vtu_series(
         ET.SubElement(collection, "DataSet", timestep=time, part="0", file=file)
     ET.indent(root)
     path = folder / f"{name}.pvd"
-    part = path.with_name(path.name + ".part")
     try:
-        ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
-        part.replace(path)
+        with replacing(path) as part:
+            ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
     return path
