@@ -1,10 +1,13 @@
 """Gradients of a step: against differences, between solvers, and of chains of steps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import pdcorrect as pc
 from conftest import ELEMENTS, beam
+from pdcorrect.errors import ConvergenceError, InputError
 
 INTEGRATORS = ["backward-euler", "bdf2", "midpoint", "generalised-alpha"]
 TORSION = {"kind": "torsion", "strength": 2e3, "stretch": 0.3, "follower": True}
@@ -150,13 +153,262 @@ def check_material_gradients(case):
 
 def check_time_step(case):
     h = case.stepper.time_step
-    agrees(case.found.time_step * h, difference(lambda t: case.loss(time_step=h * (1 + t)), 1e-4))
+
+    def stretched(t):
+        stepper = pc.Newton(case.problem, 1e-13, time_step=h * (1 + t), recover=False)
+        return case.loss(stepper=stepper)
+
+    agrees(case.found.time_step * h, difference(stretched, 1e-3))
+
+
+def check_clamped_positions(case):
+    problem = case.problem
+    direction = np.random.default_rng(5).normal(size=problem.free.shape) * ~problem.free
+
+    def shifted(t):
+        clamps = replace(problem.clamps, rest=problem.clamps.rest + t * direction)
+        stepper = pc.Newton(replace(problem, clamps=clamps), 1e-13, recover=False)
+        return case.loss(stepper=stepper)
+
+    found = case.found.clamped_positions
+    assert (found[problem.free] == 0).all()
+    agrees(np.vdot(found, direction), difference(shifted, 1e-4 * problem.cell_size))
+
+
+def timed(integrator, radius=0.8):
+    return {"step": 0.01, "frames": 3, "integrator": integrator, "spectral_radius": radius}
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_gradients_are_those_of_central_differences(element, integrator):
-    time = {"step": 0.01, "frames": 3, "integrator": integrator}
-    case = Case(pc.discretise(scene(element, time=time)), steps_before=1)
-    check_state_gradients(case, ("positions", "velocities", "forces"))
+    """In a state that is compressed, twisted and random, under follower loads, on the second step.
+
+    So that the memory of integrators with several steps takes part.
+    """
+    case = Case(pc.discretise(scene(element, time=timed(integrator))), steps_before=1)
+    names = ("positions", "velocities", "forces", *case.memory)
+    check_state_gradients(case, [n for n in names if n != "previous_times"])
     check_material_gradients(case)
+    check_clamped_positions(case)
+    if integrator != "bdf2":  # which needs equal steps
+        check_time_step(case)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_so_they_are_on_the_first_step_of_a_damped_body(element, integrator):
+    damping = {"mass": 2.0, "stiffness": 0.003}
+    changes = {"time": timed(integrator), "damping": damping}
+    case = Case(pc.discretise(scene(element, **changes)))
+    check_state_gradients(case)
+    check_material_gradients(case)
+    check_clamped_positions(case)
+    check_time_step(case)
+
+
+def test_so_they_are_of_an_equilibrium():
+    time = {"step": 0.01, "frames": 3, "integrator": "quasi-static"}
+    loads = [{"kind": "gravity", "acceleration": [1.0, -3.0, -9.81]}]
+    problem = pc.discretise(scene("hex8-bubble", time=time, loads=loads))
+    case = Case(problem, state=problem.rest_state())
+    check_state_gradients(case, ["forces"])
+    check_material_gradients(case)
+    check_clamped_positions(case)
+    assert not case.found.positions.any()
+    assert not case.found.velocities.any()
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-mean", "hex27"])
+def test_so_they_are_with_an_inverted_cell(element):
+    problem = pc.discretise(scene(element, time={"step": 2e-4, "frames": 3}))
+    state = asymmetric_state(problem, invert=True)
+    assert problem.volume_ratios(state.positions).min() < 0
+    case = Case(problem, state=state)
+    assert case.result.stats["smallest_volume_ratio"] < 0
+    check_state_gradients(case)
+    check_material_gradients(case)
+
+
+@pytest.mark.parametrize("energy", ["corotated-only", "neo-hookean", "st-venant-kirchhoff"])
+def test_so_they_are_for_other_energies(energy):
+    material = {"young": 2e5, "poisson": 0.3, "energy": energy}
+    case = Case(pc.discretise(scene("hex8-bubble", material=material)))
+    check_state_gradients(case)
+    check_material_gradients(case)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent", "averaged", "per-node"])
+def test_so_they_are_for_every_mass_and_volume_weight(mass):
+    material = {"young": 2e5, "poisson": 0.4, "volume_weight": "published"}
+    solver = {"element": "hex8", "mass": mass}
+    case = Case(pc.discretise(scene(material=material, solver=solver)))
+    check_state_gradients(case, ["positions", "velocities"])
+    check_material_gradients(case)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_the_time_step_counts_for_moving_clamps_and_ramps(integrator):
+    turn = {"times": [0.0, 1.0], "rotation": [0.0, 300.0], "centre": [0, 0.02, 0.02], "axis": "x"}
+    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": turn}]
+    ramp = {**GRAVITY, "ramp": 0.5}
+    problem = pc.discretise(scene(clamps=clamps, loads=[ramp], time=timed(integrator)))
+    case = Case(problem)
+    check_time_step(case)
+
+
+def test_gradients_by_lame_parameters_are_those_by_moduli():
+    case = Case(pc.discretise(scene()))
+    materials = case.problem.materials
+    e = 1e-6
+    for name, value in (("young", materials.young), ("poisson", materials.poisson)):
+        full = {"young": materials.young, "poisson": materials.poisson}
+        plus = case.problem.with_material(**{**full, name: value * (1 + e)}).materials
+        minus = case.problem.with_material(**{**full, name: value * (1 - e)}).materials
+        mu = (plus.mu - minus.mu) / (2 * e * value)
+        lam = (plus.volume_weight - minus.volume_weight) / (6 * e * value)
+        expected = case.found.mu * mu + case.found.lam * lam
+        np.testing.assert_allclose(getattr(case.found, name), expected, rtol=1e-7)
+
+
+# --- solvers of the linear system --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_projective_dynamics_and_newton_have_the_same_gradients(element):
+    problem = pc.discretise(scene(element))
+    newton = Case(problem)
+    for options in ({}, {"first_hessian": "G"}, {"method": "local-global"}):
+        pd = pc.ProjectiveDynamics(problem, 1e-11, **options)
+        found = Case(problem, pd).found
+        for name in ("positions", "velocities", "forces", "young", "poisson", "density"):
+            exact = getattr(newton.found, name)
+            error = np.abs(getattr(found, name) - exact).max()
+            assert error < 1e-8 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+def test_all_solvers_agree_and_the_fixed_point_falls_by_its_spectral_radius(element):
+    problem = pc.discretise(scene(element, time={"step": 0.003, "frames": 2}))
+    cases = {name: Case(problem, solver=name) for name in ("cg", "direct", "fixed-point", "auto")}
+    exact = cases["direct"].found.x
+    for name, case in cases.items():
+        assert case.found.solver == ("cg" if name == "auto" else name)
+        assert case.found.residual <= 1e-10
+        np.testing.assert_allclose(case.found.x, exact, atol=1e-9 * np.abs(exact).max())
+    fixed = cases["fixed-point"].found
+    radius = fixed.spectral_radius
+    assert 0 < radius < 1
+    assert fixed.iterations == pytest.approx(np.log(1e-10) / np.log(radius), rel=0.35)
+    assert cases["cg"].found.iterations < fixed.iterations
+
+
+def test_where_the_hessian_is_indefinite_a_direct_solution_takes_over():
+    """A state that is no minimum: conjugate gradients say so, auto falls back."""
+    problem = pc.discretise(scene(loads=[], time={"step": 10.0, "frames": 2}))
+    squeezed = problem.positions * [0.45, 1.0, 1.0]
+    state = pc.State(squeezed, np.zeros_like(squeezed))
+    result = pc.StepResult(state, pc.Status.CONVERGED, 0, 0.0, 0.0)
+    stepper, g = pc.Newton(problem), np.random.default_rng(0).normal(size=squeezed.shape)
+    with pytest.raises(ConvergenceError, match="negative curvature"):
+        pc.adjoint(stepper, state, result, g, solver="cg")
+    found = pc.adjoint(stepper, state, result, g)
+    assert found.solver == "direct"
+    assert found.residual < 1e-10
+
+
+def test_the_adjoint_is_the_transpose_of_the_linearised_step():
+    """U . (dS/dp) w from differences of S is w . (dS/dp)^T u to their accuracy, and exactly so
+    between two adjoints: H is symmetric.
+    """
+    problem = pc.discretise(scene("hex8-bubble"))
+    stepper, state = pc.Newton(problem, 1e-13), asymmetric_state(problem)
+    result = stepper(state)
+    rng = np.random.default_rng(1)
+    u, w = rng.normal(size=(2, *problem.positions.shape)) * problem.free
+    a, b = (pc.adjoint(stepper, state, result, g, tolerance=1e-13).forces for g in (u, w))
+    assert np.vdot(a, w) == pytest.approx(np.vdot(b, u), rel=1e-10)
+
+
+def test_a_loose_step_says_how_far_its_gradients_are_off():
+    """To first order: its estimate is the difference from those of the exact step."""
+    problem = pc.discretise(scene())
+    exact = Case(problem)
+    for tolerance in (1e-2, 1e-3, 1e-4):
+        pd = pc.ProjectiveDynamics(problem, tolerance, first_hessian="G", recover=False)
+        loose = Case(problem, pd)
+        for name, estimate in loose.found.estimated_errors().items():
+            right = getattr(exact.found, name)
+            off = np.linalg.norm(getattr(loose.found, name) - right) / np.linalg.norm(right)
+            assert off == pytest.approx(estimate, rel=0.2), (name, tolerance)
+
+
+# --- chains of steps -----------------------------------------------------------------------------
+
+
+def chained(stepper, state, steps, loss_weights):
+    """Loss of the last state, and its gradients by the first."""
+    states, results = [state], []
+    for _ in range(steps):
+        results.append(stepper(states[-1]))
+        states.append(results[-1].state)
+    value = np.vdot(loss_weights[0], states[-1].positions)
+    value += np.vdot(loss_weights[1], states[-1].velocities)
+    g, gv, memory = loss_weights[0], loss_weights[1], {}
+    for before, result in zip(states[-2::-1], results[::-1], strict=True):
+        found = pc.adjoint(stepper, before, result, g, gv, grad_memory=memory)
+        g, gv, memory = found.positions, found.velocities, found.memory
+        memory.pop("previous_times", None)
+    return value, g, gv
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_through_twenty_steps_the_remainder_is_of_second_order(integrator):
+    problem = pc.discretise(scene(time=timed(integrator), loads=[TORSION]))
+    stepper = pc.Newton(problem, 1e-12)
+    state = asymmetric_state(problem)
+    rng = np.random.default_rng(2)
+    weights = rng.normal(size=(2, *problem.positions.shape)) * [[[100.0]], [[1.0]]]
+    value, g, gv = chained(stepper, state, 20, weights)
+    d = rng.normal(size=problem.positions.shape) * problem.free
+    dp, dv = 0.02 * problem.cell_size * d, 0.3 * d
+    slope = np.vdot(g, dp) + np.vdot(gv, dv)
+    remainders = []
+    for t in (1e-2, 5e-3, 2.5e-3, 1.25e-3):
+        moved = pc.State(state.positions + t * dp, state.velocities + t * dv)
+        remainders.append(abs(chained(stepper, moved, 20, weights)[0] - value - t * slope))
+    orders = np.log2(np.divide(remainders[:-1], remainders[1:]))
+    assert orders[-1] == pytest.approx(2.0, abs=0.15)
+    assert remainders[-1] < 1e-2 * abs(1.25e-3 * slope)
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+def test_wrong_input_is_refused_by_name():
+    problem = pc.discretise(scene())
+    stepper, state = pc.Newton(problem), problem.rest_state()
+    result = stepper(state)
+    g = np.ones_like(state.positions)
+    with pytest.raises(InputError, match="grad_positions has shape"):
+        pc.adjoint(stepper, state, result, g[1:])
+    with pytest.raises(InputError, match="grad_velocities contains NaN"):
+        pc.adjoint(stepper, state, result, g, g * np.nan)
+    with pytest.raises(InputError, match="solver = 'magic'"):
+        pc.adjoint(stepper, state, result, g, solver="magic")
+    for status, words in (
+        (pc.Status.LINE_SEARCH, "no decrease"),
+        (pc.Status.SUBSTEPPED, "smaller parts"),
+    ):
+        with pytest.raises(InputError, match=words):
+            pc.adjoint(stepper, state, replace(result, status=status), g)
+
+
+def test_without_a_loss_there_is_nothing_to_solve():
+    problem = pc.discretise(scene())
+    stepper, state = pc.Newton(problem), problem.rest_state()
+    found = pc.adjoint(stepper, state, stepper(state))
+    assert found.solver == "none needed"
+    assert not found.positions.any()
+    assert not found.young.any()
+    assert found.time_step == 0.0

@@ -85,7 +85,7 @@ class ElasticBody:
         x = self.extended(positions - self.positions)
         internal_modes.relax(
             self.materials.model, x, self.space.local, self.cells.shape[1],
-            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
+            self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
             steps, _RELAXED * self.cell_size,
         )  # fmt: skip
         x[: len(positions)] = positions
@@ -125,7 +125,7 @@ class ElasticBody:
         forces = np.empty_like(u)
         kernels.energy_and_forces(
             self.materials.model, u, assembly.cells, self.quadrature.lanes,
-            self._point_weights, self.quadrature.first_volume, energy, by_cell,
+            self.point_weights, self.quadrature.first_volume, energy, by_cell,
             assembly.start, assembly.slots, forces,
         )  # fmt: skip
         return float(energy.sum()), forces
@@ -153,7 +153,7 @@ class ElasticBody:
         tangent = np.empty((count, 12, lanes))
         kernels.linearise_cells(
             self.materials.model, self._displacement(configuration), self.space.local,
-            self.quadrature.lanes, self._point_weights, self.quadrature.first_volume,
+            self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
             project, left, right, tangent,
         )  # fmt: skip
         return Linearisation(self.assembly, self.quadrature, left, right, tangent)
@@ -163,7 +163,7 @@ class ElasticBody:
 
         ``volume_scale`` is s.
         """
-        shear, volume = self._point_weights[:, 0], self._point_weights[:, 1]
+        shear, volume = self.point_weights[:, 0], self.point_weights[:, 1]
         coefficient = 2 * shear + volume_scale * volume
         return self.quadrature.laplacian(coefficient, self.space.local, self.unknowns)
 
@@ -173,7 +173,7 @@ class ElasticBody:
         return Assembly(self.space.local, self.unknowns)
 
     @cached_property
-    def _point_weights(self) -> Array:
+    def point_weights(self) -> Array:
         """Mu w and omega w at the quadrature points, (C, 2, Q), J."""
         return np.stack(
             [

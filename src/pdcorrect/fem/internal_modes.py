@@ -22,7 +22,8 @@ def relax(  # type: ignore[no-untyped-def]
 ):
     """Bring the internal modes in u (N + B, 3) to equilibrium with the nodes, in place.
 
-    Newton's method with the projected tangent in each cell, at most ``steps``
+    Newton's method in each cell, with the projected tangent where the exact one is not
+    positive definite, at most ``steps``
     times or until no mode changes by more than ``tolerance`` (m).  ``nodes`` is
     the number of nodes a cell; its other local shape functions are modes.
     Other arguments as `kernels.energy_and_forces`.
@@ -61,9 +62,11 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                principal_tangent_lanes(model, s, v, k, shear, volume, start, True, T)
-                stiffness(here, U, V, T, A, P, K)
-                _solve(K, forces, step)
+                for project in (False, True):
+                    principal_tangent_lanes(model, s, v, k, shear, volume, start, project, T)
+                    stiffness(here, U, V, T, A, P, K)
+                    if _solve(K, forces, step):
+                        break
                 for m in range(width):
                     old[m] = u[modes[m]]
                     u[modes[m]] = old[m] + step[m]
@@ -81,9 +84,10 @@ def _largest(step):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _solve(K, forces, step):  # type: ignore[no-untyped-def]
-    """Step = K^-1 forces for the lower triangle (L, 3, L, 3) of a positive semi-definite K.
+    """Step = K^-1 forces for the lower triangle (L, 3, L, 3) of K, by Cholesky's method.
 
-    By Cholesky's method, in place; a pivot that is zero to working precision is raised.
+    Whether K, which is overwritten, is positive definite; if not, pivots that are zero to
+    working precision or negative are raised.
     """
     size = 3 * len(forces)
     M, x = K.reshape(size, size), step.reshape(size)
@@ -92,6 +96,7 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
     for i in range(size):
         least = max(least, 1e-12 * M[i, i])
     least += 1e-300
+    positive = True
     for i in range(size):
         for j in range(i):
             for n in range(j):
@@ -99,6 +104,7 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
             M[i, j] /= M[j, j]
         for n in range(i):
             M[i, i] -= M[i, n] * M[i, n]
+        positive &= M[i, i] > least
         M[i, i] = np.sqrt(max(M[i, i], least))
         x[i] = f[i]
         for n in range(i):
@@ -108,6 +114,7 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
         for n in range(i + 1, size):
             x[i] -= M[n, i] * x[n]
         x[i] /= M[i, i]
+    return positive
 
 
 @njit(**PARALLEL)

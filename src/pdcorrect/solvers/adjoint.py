@@ -23,7 +23,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
@@ -46,6 +47,8 @@ from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
 
+_MODE_STEPS, _SETTLED = 100, 1e-13
+"""Newton steps to find internal modes, and the last one's length, of the cell size."""
 _STEP = 1e-3
 """Of the time step, for differences of fourth order at fixed y."""
 
@@ -378,5 +381,26 @@ def _solution(step: _Step, result: StepResult) -> Array:
     row = scheme.positions.coefficients
     rest = Linear(**{name: c for name, c in row.items() if name != "y"})
     known = {"positions": step.state.positions}
-    y = (result.state.positions - rest(known)) / row["y"]
-    return step.stepper.problem.relaxed(y)
+    problem = step.stepper.problem
+    y = problem.relaxed((result.state.positions - rest(known)) / row["y"])
+    if problem.scene.damping.stiffness and problem.space.internal:
+        y = _damped_modes(step.objective(), y)
+    return y
+
+
+def _damped_modes(objective: StepObjective, y: Array) -> Array:
+    """Y with internal modes in equilibrium with their damping too, by Newton's method."""
+    problem, nodes = objective.problem, len(objective.problem.positions)
+    for _ in range(_MODE_STEPS):
+        _, gradient = objective.value_and_gradient(y)
+        gradient[:nodes] = 0.0
+        blocks = objective.cell_hessians(y, project=True)
+        following = Condensed(blocks, problem.space.local, problem.cells.shape[1])
+        change = following.recovered(np.zeros((nodes, 3)), gradient)
+        y = y - change
+        if np.abs(change).max() <= _SETTLED * problem.cell_size:
+            return y
+    raise ConvergenceError(
+        f"internal modes of the step are not in equilibrium after {_MODE_STEPS} Newton steps: "
+        "expected a state that a step converged to."
+    )

@@ -46,13 +46,7 @@ def follower_slope(problem: Problem, x: Array, positions: Array, start: float, e
 
 
 class DampingTerm:
-    """- x . d C (y - o), by what the step starts from.
-
-    Attributes
-    ----------
-    origin : (N, 3)
-        By o's nodes.
-    """
+    """- x . d C (y - o), by what the step starts from."""
 
     def __init__(self, problem: Problem, damping: StepDamping, y: Array, x: Array) -> None:
         self._problem, self._damping, self._x = problem, damping, x
@@ -60,15 +54,21 @@ class DampingTerm:
         by_origin = damping.mass * problem.mass_times(x)
         if damping.stiffness:
             by_origin = by_origin + damping.stiffness * damping.tangent.apply(x)
-        count = len(problem.positions)
-        self.origin = by_origin[:count]
-        self._modes = by_origin.copy()
-        self._modes[:count] = 0.0
+        self._by_origin = by_origin
+
+    @cached_property
+    def origin(self) -> Array:
+        """By o, with its modes in equilibrium, (N, 3)."""
+        if not self._damping.stiffness:
+            return self._by_origin[: len(self._problem.positions)]
+        return self._at_origin.reduced(self._by_origin)
 
     @cached_property
     def positions(self) -> Array:
-        """By the positions at the start, through C and the modes in o, (N, 3)."""
-        return self._following.reduced(self._by_shape)
+        """By the positions at the start, through C, (N, 3)."""
+        if not self._damping.stiffness:
+            return np.zeros_like(self._problem.positions)
+        return self._before.reduced(self._by_shape)
 
     @cached_property
     def weights(self) -> Weights:
@@ -78,9 +78,14 @@ class DampingTerm:
             nothing = np.zeros(len(self._problem.cells))
             return nothing, nothing
         _, by_mu, by_omega = self._slopes
-        modes = -self._following.response(self._by_shape)
+        modes = -self._before.response(self._by_shape)
         more = weight_slopes(self._problem, self._damping.before, modes)
-        return more[0] - stiffness * by_mu, more[1] - stiffness * by_omega
+        modes = -self._at_origin.response(self._by_origin)
+        last = weight_slopes(self._problem, self._damping.origin, modes)
+        return (
+            more[0] + last[0] - stiffness * by_mu,
+            more[1] + last[1] - stiffness * by_omega,
+        )
 
     @property
     def density(self) -> Array:
@@ -90,7 +95,11 @@ class DampingTerm:
         return -self._damping.mass * slope
 
     @cached_property
-    def _following(self) -> Following:
+    def _at_origin(self) -> Following:
+        return Following(self._problem, self._damping.origin)
+
+    @cached_property
+    def _before(self) -> Following:
         return Following(self._problem, self._damping.before)
 
     @cached_property
@@ -100,9 +109,7 @@ class DampingTerm:
     @cached_property
     def _by_shape(self) -> Array:
         """By the configuration at the start."""
-        if not self._damping.stiffness:
-            return self._modes
-        return self._modes - self._damping.stiffness * self._slopes[0]
+        return -self._damping.stiffness * self._slopes[0]
 
 
 class FirstAccelerationTerm:

@@ -28,17 +28,17 @@ from pdcorrect.state import Status
 Array = NDArray[np.float64]
 Solve = Callable[[Array], Array]
 
-_ARMIJO = 1e-4
+ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
-_BACKTRACKS = 30
+BACKTRACKS = 30
 _ESTIMATE_STEPS = 1000
-_NO_MOTION = 1e-6
+NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 
 Otherwise stiff bodies would not move at all where the motion is below the tolerance.
 """
-_FIRST_CHECK = 0.15
+FIRST_CHECK = 0.15
 """Length of the loop's own step, of the tolerance, at which the estimate is first made.
 
 The estimate is usually 3 to 10 times that length.
@@ -194,7 +194,7 @@ def minimise(
     value, gradient = objective.value_and_gradient(p)
     x = solve(gradient)
     history = History(options.history, p.size)
-    threshold = _FIRST_CHECK * options.tolerance
+    threshold = FIRST_CHECK * options.tolerance
     evaluations, estimate = 1, math.inf
     status = Status.ITERATION_LIMIT
     for iteration in range(options.max_iterations + 1):
@@ -205,7 +205,7 @@ def minimise(
         length = largest_displacement(direction)
         if length <= threshold:
             exact, estimate = newton_step(objective, p, gradient, solve, direction)
-            if estimate <= (options.tolerance if iteration else _NO_MOTION * options.tolerance):
+            if estimate <= (options.tolerance if iteration else NO_MOTION * options.tolerance):
                 status = Status.CONVERGED
                 break
             if estimate > options.tolerance:
@@ -261,12 +261,12 @@ def line_search(
     step, tried = 1.0, 0
     if slope < 0.0:
         noise = _ROUND_OFF * objective.scale
-        while tried < _BACKTRACKS:
+        while tried < BACKTRACKS:
             tried += 1
             trial = p + step * direction
             new_value, new_gradient = objective.value_and_gradient(trial)
             fall = new_value - value
-            if fall <= _ARMIJO * step * slope or not search:
+            if fall <= ARMIJO * step * slope or not search:
                 return Found(step, trial, new_value, new_gradient, tried)
             if abs(fall) <= noise and float(np.vdot(new_gradient, direction)) <= -0.8 * slope:
                 return Found(step, trial, new_value, new_gradient, tried)

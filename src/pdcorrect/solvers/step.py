@@ -149,12 +149,12 @@ class StepDamping:
     ----------
     mass, stiffness : float
         d alpha and d beta.
-    before : (N + B, 3)
-        The configuration at the start of the step.
     origin : (N + B, 3)
-        o, with the internal modes' amplitudes there.
-    tangent : Linearisation
-        K, projected.
+        o, with the internal modes in equilibrium there: their velocity at y, like the
+        nodes', is d times the change since.
+    before : (N + B, 3), tangent : Linearisation
+        The configuration at the start of the step and K there, projected; only if
+        ``stiffness`` is not zero.
     """
 
     def __init__(self, problem: Problem, state: State, stage: Stage) -> None:
@@ -162,9 +162,14 @@ class StepDamping:
         self._problem = problem
         self.mass = stage.rate * damping.mass
         self.stiffness = stage.rate * damping.stiffness
+        if not self.stiffness:
+            self.origin = problem.extended(stage.origin)
+            return
         self.before = problem.relaxed(state.positions)
-        self.origin = np.concatenate([stage.origin, self.before[len(stage.origin) :]])
         self.tangent = problem.linearise(self.before, project=True)
+        self.origin = self.before
+        if not np.array_equal(stage.origin, state.positions):
+            self.origin = problem.relaxed(stage.origin)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         offset = y - self.origin

@@ -1,0 +1,1 @@
+"""Many scenes at once, in torch, on the CPU or a GPU."""

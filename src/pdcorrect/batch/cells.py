@@ -1,0 +1,227 @@
+"""Elastic energy, forces and tangents of many bodies at once.
+
+Bodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
+first, then, from a common place on, its internal modes.  Cells and nodes that a body does
+not have carry no weight and stay at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.points import Points, Tangent
+from pdcorrect.fem.problem import Problem
+
+_DIGITS = 11
+"""To which gradients of different cells count as equal."""
+
+
+class Sizes(NamedTuple):
+    """Of a padded batch: scenes, nodes, modes, cells, shape functions and points a cell."""
+
+    scenes: int
+    nodes: int
+    modes: int
+    cells: int
+    width: int
+    points: int
+
+    @property
+    def unknowns(self) -> int:
+        """Nodes and modes."""
+        return self.nodes + self.modes
+
+
+def padded(arrays: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float = 0) -> NDArray[Any]:
+    """Arrays stacked into (B, *shape), each in the low corner."""
+    out = np.full((len(arrays), *shape), fill, dtype=arrays[0].dtype)
+    for i, array in enumerate(arrays):
+        out[(i, *(slice(n) for n in array.shape))] = array
+    return out
+
+
+class CellBatch:
+    """The cells of B problems with the same element and energy.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+    device, dtype
+        Of everything that is computed.
+
+    Attributes
+    ----------
+    sizes : Sizes
+    node_counts : list of int
+    """
+
+    def __init__(
+        self, problems: Sequence[Problem], device: torch.device, dtype: torch.dtype
+    ) -> None:
+        first = problems[0]
+        width, points = first.space.local.shape[1], first.quadrature.weights.shape[1]
+        self.sizes = Sizes(
+            len(problems),
+            max(len(p.positions) for p in problems),
+            max(p.space.internal for p in problems),
+            max(len(p.cells) for p in problems),
+            width,
+            points,
+        )
+        self.node_counts = [len(p.positions) for p in problems]
+        self.mode_counts = [p.space.internal for p in problems]
+        self.device, self.dtype = device, dtype
+        n = self.sizes
+        self.rest = self.nodal([p.positions for p in problems])
+        local = [self._renumbered(p) for p in problems]
+        cells = padded(local, (n.cells, width))
+        offsets = np.arange(n.scenes)[:, None, None] * n.unknowns
+        self._cells = torch.as_tensor((cells + offsets).reshape(-1), device=device)
+        self._slots = torch.as_tensor(_slots(local, n), device=device)
+        shape = (n.cells, points)
+        terms = [padded([p.point_weights[:, k] for p in problems], shape) for k in (0, 1)]
+        self._weights = self.tensor(np.stack(terms)).reshape(2, -1)
+        volumes = [
+            padded([p.quadrature.weights for p in problems], shape),
+            padded([p.quadrature.volume_weights for p in problems], shape),
+        ]
+        self._volumes = self.tensor(np.stack(volumes)).reshape(2, -1)
+        self._points = Points(
+            first.materials.model,
+            first.quadrature.first_volume if terms[1].any() else points,
+            points,
+            compiled=device.type == "cuda",
+        )
+        self._identity = torch.eye(3, dtype=dtype, device=device).reshape(9, 1)
+        self._gradients = self.tensor(_gradient_sets(problems, n))
+
+    # --- arrays to and from tensors -----------------------------------------------------
+
+    def tensor(self, array: NDArray[Any]) -> Tensor:
+        """On the device, in the batch's type."""
+        return torch.as_tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
+
+    def nodal(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
+        """Nodal arrays (N, ...) of the bodies, padded to (B, U, ...)."""
+        return self.tensor(padded(arrays, (self.sizes.unknowns, *arrays[0].shape[1:])))
+
+    def configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
+        """Configurations (N + B, 3) of the bodies, padded to (B, U, 3)."""
+        out = np.zeros((self.sizes.scenes, self.sizes.unknowns, 3))
+        for i, (array, nodes) in enumerate(zip(arrays, self.node_counts, strict=True)):
+            out[i, :nodes] = array[:nodes]
+            out[i, self.sizes.nodes : self.sizes.nodes + len(array) - nodes] = array[nodes:]
+        return self.tensor(out)
+
+    def unpadded(self, x: Tensor) -> list[NDArray[Any]]:
+        """The bodies' nodal parts of (B, U, ...) as arrays."""
+        host = x.detach().cpu().numpy()
+        return [host[i, :count] for i, count in enumerate(self.node_counts)]
+
+    def _renumbered(self, problem: Problem) -> NDArray[np.int64]:
+        nodes = len(problem.positions)
+        local = problem.space.local
+        return np.where(local < nodes, local, local + self.sizes.nodes - nodes)
+
+    # --- energy ---------------------------------------------------------------------------
+
+    def energy_and_forces(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Elastic energies (B,), J, and forces (B, U, 3), N, of configurations (B, U, 3)."""
+        density, P = self._points.stress(self.gradients(y - self.rest, 1.0), self._weights)
+        return density.reshape(self.sizes.scenes, -1).sum(dim=1), -self.gathered(P)
+
+    def linearise(self, y: Tensor) -> Tangent:
+        """The tangent at configurations, for `apply`."""
+        return self._points.tangent(self.gradients(y - self.rest, 1.0), self._weights)
+
+    def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
+        """Tangent times x, both (B, U, 3)."""
+        return self.gathered(self._points.product(tangent, self.gradients(x, 0.0)))
+
+    def rotations(self, F: Tensor) -> Tensor:
+        """Nearest rotations (9, M) of matrices (9, M)."""
+        return self._points.rotations(F)
+
+    def weight_slopes(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Derivatives of x . dW/dy by each cell's mu and omega, two (B, C)."""
+        n = self.sizes
+        F, D = self.gradients(y - self.rest, 1.0), self.gradients(x, 0.0)
+        out = []
+        for term in (0, 1):
+            weights = torch.zeros_like(self._weights)
+            weights[term] = self._volumes[term]
+            _, P = self._points.stress(F, weights)
+            out.append((P * D).sum(dim=0).reshape(n.scenes, n.cells, n.points).sum(dim=2))
+        return out[0], out[1]
+
+    def gradients(self, u: Tensor, diagonal: float) -> Tensor:
+        """Diagonal I + sum_k u_k grad N_k, (9, B C Q), for (B, U, 3)."""
+        n = self.sizes
+        local = self.local(u).transpose(2, 3)
+        out = local.reshape(*self._rows, n.width) @ self._gradients
+        out = out.reshape(n.scenes, n.cells, 9, n.points).permute(2, 0, 1, 3).reshape(9, -1)
+        if diagonal:
+            out = out + diagonal * self._identity
+        return out
+
+    def gathered(self, P: Tensor) -> Tensor:
+        """sum_q P_ij dN_k/dx_j summed over the cells, (B, U, 3), for P (9, B C Q)."""
+        n = self.sizes
+        P = P.reshape(9, n.scenes, n.cells, n.points).permute(1, 2, 0, 3)
+        local = P.reshape(*self._rows, 3 * n.points) @ self._gradients.transpose(-1, -2)
+        return self.summed(local.reshape(n.scenes, n.cells, 3, n.width).transpose(2, 3))
+
+    def local(self, u: Tensor) -> Tensor:
+        """A configuration's values in each cell, (B, C, L, 3)."""
+        n = self.sizes
+        return u.reshape(-1, 3)[self._cells].reshape(n.scenes, n.cells, n.width, 3)
+
+    def summed(self, local: Tensor) -> Tensor:
+        """Values (B, C, L, 3) of cells summed into configurations (B, U, 3), in a fixed order."""
+        n = self.sizes
+        flat = local.reshape(n.scenes * n.cells * n.width, 3)
+        flat = torch.cat([flat, flat.new_zeros(1, 3)])
+        return flat[self._slots].sum(dim=1).reshape(n.scenes, n.unknowns, 3)
+
+    @property
+    def _rows(self) -> tuple[int, ...]:
+        """Leading shape of the products with gradients: by scene where its cells are alike."""
+        n = self.sizes
+        return (n.scenes, 3 * n.cells) if self._gradients.ndim == 3 else (n.scenes, n.cells, 3)
+
+
+def _slots(local: Sequence[NDArray[np.int64]], n: Sizes) -> NDArray[np.int64]:
+    """For each padded unknown the places (B U, most) in the raveled cells where it occurs."""
+    last = n.scenes * n.cells * n.width
+    rows, places = [], []
+    for i, cells in enumerate(local):
+        flat = cells.ravel()
+        order = np.argsort(flat, kind="stable")
+        rows.append(i * n.unknowns + flat[order])
+        places.append(i * n.cells * n.width + order)
+    row, place = np.concatenate(rows), np.concatenate(places)
+    counts = np.bincount(row, minlength=n.scenes * n.unknowns)
+    starts = np.cumsum(counts) - counts
+    out = np.full((n.scenes * n.unknowns, counts.max()), last)
+    out[row, np.arange(len(row)) - starts[row]] = place
+    return out
+
+
+def _gradient_sets(problems: Sequence[Problem], n: Sizes) -> NDArray[np.float64]:
+    """Gradients (B, L, 3 Q) where a scene's cells are all alike, else (B, C, L, 3 Q)."""
+    lanes = [p.quadrature.lanes for p in problems]
+    scale = [np.abs(a[0]).max() for a in lanes]
+    alike = all(
+        np.allclose(a, a[:1], rtol=0.0, atol=10.0**-_DIGITS * s)
+        for a, s in zip(lanes, scale, strict=True)
+    )
+    if alike:
+        return np.stack([a[0].reshape(n.width, 3 * n.points) for a in lanes])
+    return padded([a.reshape(len(a), n.width, 3 * n.points) for a in lanes],
+                  (n.cells, n.width, 3 * n.points))  # fmt: skip

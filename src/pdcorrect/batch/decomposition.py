@@ -1,0 +1,185 @@
+"""Signed SVD and nearest volume-preserving stretch of many matrices, in torch.
+
+The algorithms of `pdcorrect.fem.decomposition` with a fixed number of steps, so that a
+compiler can make one kernel of them.  A matrix is a list of nine tensors of one shape,
+row-major.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_SWEEPS = {torch.float64: 5, torch.float32: 3}
+_VOLUME_STEPS = 8
+LARGE_VOLUME = 4.0
+"""Above this det F the nearest unit-determinant matrix may not be unique (see `extreme`)."""
+_TINY = {torch.float64: 1e-300, torch.float32: 1e-37}
+_RANK = {torch.float64: 1e-14, torch.float32: 1e-6}
+
+
+def tiny(a: Tensor) -> float:
+    """A number that changes nothing but keeps a division finite."""
+    return _TINY[a.dtype]
+
+
+def _rotate(S: list[Tensor], V: list[Tensor], p: int, q: int, pq: int, pr: int, qr: int) -> None:
+    """Jacobi rotation that zeroes entry (p, q) of S = [00 11 22 01 02 12]."""
+    gap, d = S[q] - S[p], S[pq]
+    tangent = torch.where(gap < 0, -2.0, 2.0) * d
+    tangent = tangent / (gap.abs() + torch.sqrt(gap * gap + 4.0 * d * d) + tiny(d))
+    cosine = torch.rsqrt(1.0 + tangent * tangent)
+    sine = tangent * cosine
+    S[p], S[q], S[pq] = S[p] - tangent * d, S[q] + tangent * d, torch.zeros_like(d)
+    S[pr], S[qr] = cosine * S[pr] - sine * S[qr], sine * S[pr] + cosine * S[qr]
+    _turn(V, p, q, cosine, sine)
+
+
+def _turn(A: list[Tensor], p: int, q: int, cosine: Tensor, sine: Tensor) -> None:
+    for i in (0, 3, 6):
+        x, y = A[i + p], A[i + q]
+        A[i + p], A[i + q] = cosine * x - sine * y, sine * x + cosine * y
+
+
+def _order(B: list[Tensor], V: list[Tensor], i: int, j: int) -> None:
+    """Exchange columns i < j (one negated, so det V stays +1) where column j is longer."""
+    swap = _squares(B, j) > _squares(B, i)
+    for A in (B, V):
+        for row in (0, 3, 6):
+            x, y = A[row + i], A[row + j]
+            A[row + i], A[row + j] = torch.where(swap, y, x), torch.where(swap, -x, y)
+
+
+def _squares(B: list[Tensor], j: int) -> Tensor:
+    return B[j] * B[j] + B[3 + j] * B[3 + j] + B[6 + j] * B[6 + j]
+
+
+def signed_svd(F: list[Tensor]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """U (9), s (3), V (9) with F = U diag(s) V^T, both rotations proper, s1 >= s2 >= |s3|."""
+    one, zero = torch.ones_like(F[0]), torch.zeros_like(F[0])
+    V = [one, zero, zero, zero, one, zero, zero, zero, one]
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    S = [F[a] * F[b] + F[3 + a] * F[3 + b] + F[6 + a] * F[6 + b] for a, b in pairs]
+    for _ in range(_SWEEPS[F[0].dtype]):
+        _rotate(S, V, 0, 1, 3, 4, 5)
+        _rotate(S, V, 0, 2, 4, 3, 5)
+        _rotate(S, V, 1, 2, 5, 3, 4)
+    B = product(F, V)
+    _order(B, V, 0, 1)
+    _order(B, V, 0, 2)
+    _order(B, V, 1, 2)
+    _polish(B, V)
+    _order(B, V, 1, 2)
+    return _orthonormalise(B, V)
+
+
+def _polish(B: list[Tensor], V: list[Tensor]) -> None:
+    """Make columns 1 and 2 of B orthogonal to their own size, which F^T F cannot resolve."""
+    gap = _squares(B, 2) - _squares(B, 1)
+    d = B[1] * B[2] + B[4] * B[5] + B[7] * B[8]
+    tangent = torch.where(gap < 0, -2.0, 2.0) * d
+    tangent = tangent / (gap.abs() + torch.sqrt(gap * gap + 4.0 * d * d) + tiny(d))
+    cosine = torch.rsqrt(1.0 + tangent * tangent)
+    for A in (B, V):
+        _turn(A, 1, 2, cosine, tangent * cosine)
+
+
+def _orthonormalise(
+    B: list[Tensor], V: list[Tensor]
+) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    """U and s from the (nearly orthogonal, sorted) columns of B = F V."""
+    small = tiny(B[0])
+    first = torch.sqrt(_squares(B, 0))
+    x = [B[i] / (first + small) for i in (0, 3, 6)]
+    for k in range(3):  # no matrix at all: U = V
+        x[k] = torch.where(first > 0, x[k], V[3 * k])
+    y = [B[i] for i in (1, 4, 7)]
+    y = _less(y, x)
+    second = torch.sqrt(_dot(y, y))
+    flat = second <= _RANK[B[0].dtype] * first
+    y = [a / (second + small) for a in y]
+    # rank 0 or 1: the missing left vectors are the right ones, turned as little as needed
+    near = _less([V[i] for i in (1, 4, 7)], x)
+    far = _less([V[i] for i in (2, 5, 8)], x)
+    use_far = _dot(near, near) < 1e-6
+    spare = [torch.where(use_far, b, a) for a, b in zip(near, far, strict=True)]
+    scale = torch.rsqrt(_dot(spare, spare) + small)
+    y = [torch.where(flat, scale * b, a) for a, b in zip(y, spare, strict=True)]
+    z = [
+        x[1] * y[2] - x[2] * y[1],
+        x[2] * y[0] - x[0] * y[2],
+        x[0] * y[1] - x[1] * y[0],
+    ]
+    third = z[0] * B[2] + z[1] * B[5] + z[2] * B[8]
+    zero = torch.zeros_like(first)
+    s = [first, torch.where(flat, zero, second), torch.where(flat, zero, third)]
+    U = [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]]
+    return U, s, V
+
+
+def _dot(x: list[Tensor], y: list[Tensor]) -> Tensor:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+def _less(y: list[Tensor], x: list[Tensor]) -> list[Tensor]:
+    """Y without its part along the unit vector x."""
+    along = _dot(x, y)
+    return [b - along * a for a, b in zip(x, y, strict=True)]
+
+
+def product(A: list[Tensor], B: list[Tensor]) -> list[Tensor]:
+    """A B."""
+    return [
+        A[3 * i] * B[j] + A[3 * i + 1] * B[3 + j] + A[3 * i + 2] * B[6 + j]
+        for i in range(3)
+        for j in range(3)
+    ]
+
+
+def transposed(A: list[Tensor]) -> list[Tensor]:
+    """A^T."""
+    return [A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]]
+
+
+def nearest_volume(s: list[Tensor]) -> tuple[list[Tensor], Tensor]:
+    """Nearest stretch of unit volume v (3) and multiplier k for s (3).
+
+    Where det F exceeds `LARGE_VOLUME` there may be two candidates, which both are
+    looked for.
+    """
+    a, b, c = s
+    volume = a * b * c
+    squares = a * a * b * b + (a * a + b * b) * c * c
+    guess = c + (1.0 - volume) * a * b / (squares + tiny(c))
+    near = (c > 0.5) & (volume > 0.5) & (volume < 2.0) & (guess > 0.2)
+    start = torch.where(near, guess, torch.ones_like(c))
+    large = volume > LARGE_VOLUME
+    start = torch.where(large, c, start)  # the root next to s
+    last = _volume_root(s, start)
+    flattened = _volume_root(s, 1.0 / (a * b + tiny(c)))
+    cost = [_stretches(s, root)[2] for root in (last, flattened)]
+    root = torch.where(large & (cost[1] < cost[0]), flattened, last)
+    v, k, _ = _stretches(s, root)
+    return v, k
+
+
+def _volume_root(s: list[Tensor], c: Tensor) -> Tensor:
+    """Newton's method for v3 of v1 v2 v3 = 1."""
+    small = tiny(c)
+    for _ in range(_VOLUME_STEPS):
+        kappa = c * (c - s[2])
+        root_a = torch.sqrt((s[0] * s[0] + 4.0 * kappa).abs())
+        root_b = torch.sqrt((s[1] * s[1] + 4.0 * kappa).abs())
+        a, b = 0.5 * (s[0] + root_a) + small, 0.5 * (s[1] + root_b) + small
+        slope = a * b + c * (2.0 * c - s[2]) * (b / (root_a + small) + a / (root_b + small))
+        c = torch.maximum(c - (a * b * c - 1.0) / slope, 0.1 * c)
+    return c
+
+
+def _stretches(s: list[Tensor], c: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
+    """Of the stationary family with v3 = c: v, the multiplier and |v - s|^2."""
+    k = c * (c - s[2])
+    a = 0.5 * (s[0] + torch.sqrt(torch.clamp(s[0] * s[0] + 4.0 * k, min=0.0)))
+    b = 0.5 * (s[1] + torch.sqrt(torch.clamp(s[1] * s[1] + 4.0 * k, min=0.0)))
+    cost = (a - s[0]) ** 2 + (b - s[1]) ** 2 + (c - s[2]) ** 2
+    return [a, b, c], k, cost

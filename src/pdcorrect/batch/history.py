@@ -1,0 +1,96 @@
+"""Pairs of L-BFGS for a batch, in compact form (Byrd, Nocedal and Schnabel 1994).
+
+As `pdcorrect.solvers.lbfgs.History`, but each scene fills its own ring of places, so that
+scenes may accept steps in different iterations.  A place is known by its number; the
+order of the pairs is only needed to find the oldest one, since removing the oldest pair
+from an upper triangular R removes a row and a column from its inverse.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_CURVATURE = 1e-12
+
+
+class BatchHistory:
+    """S = steps and Z = changes of G^-1 g, (B, m, D), and their small matrices.
+
+    All methods change the tensors in place.
+    """
+
+    def __init__(self, scenes: int, length: int, size: int, like: Tensor) -> None:
+        def zeros(*shape: int) -> Tensor:
+            return torch.zeros(shape, dtype=like.dtype, device=like.device)
+
+        self._S, self._Z = zeros(scenes, length, size), zeros(scenes, length, size)
+        self._r_inverse, self._yz = zeros(scenes, length, length), zeros(scenes, length, length)
+        self._d = zeros(scenes, length)
+        self._sg, self._zg = zeros(scenes, length), zeros(scenes, length)
+        self._age = torch.full((scenes, length), -1, dtype=torch.int64, device=like.device)
+        self._scenes = torch.arange(scenes, device=like.device)
+
+    def clear(self, which: Tensor) -> None:
+        """Forget all pairs of the scenes where ``which`` (B,) holds."""
+        keep = (~which).to(self._d.dtype)
+        for small in (self._d, self._sg, self._zg):
+            small.mul_(keep[:, None])
+        for matrix in (self._r_inverse, self._yz):
+            matrix.mul_(keep[:, None, None])
+        self._age.masked_fill_(which[:, None], -1)
+
+    @property
+    def empty(self) -> Tensor:
+        """Whether a scene has no pairs, (B,)."""
+        return (self._age < 0).all(dim=1)
+
+    def direction(self, x: Tensor) -> Tensor:
+        """-H g (B, D) for the gradient that `append` was last given, with x = G^-1 g."""
+        w = _times(self._r_inverse, self._sg)
+        mixed = self._d * w + _times(self._yz, w) - self._zg
+        back = _times(self._r_inverse.transpose(1, 2), mixed)
+        out = torch.bmm(w[:, None], self._Z) - torch.bmm(back[:, None], self._S)
+        return out[:, 0] - x
+
+    def append(
+        self, step: Tensor, change: Tensor, gradient: Tensor, new_gradient: Tensor, moved: Tensor
+    ) -> None:
+        """Add a pair to the scenes that ``moved`` (B,) between two gradients, all else (B, D).
+
+        A pair without positive curvature is not stored.
+        """
+        sg, zg = _times(self._S, new_gradient), _times(self._Z, new_gradient)
+        s_new, z_new = (step * new_gradient).sum(1), (change * new_gradient).sum(1)
+        y_s, y_z = s_new - (step * gradient).sum(1), z_new - (change * gradient).sum(1)
+        floor = _CURVATURE * torch.sqrt(y_z.abs() * (step * step).sum(1))
+        good = moved & (y_s > floor) & (y_z > 0.0)
+        place = self._age.argmin(dim=1)
+        unit = torch.nn.functional.one_hot(place, self._age.shape[1]).to(sg.dtype)
+        unit = unit * good.to(sg.dtype)[:, None]
+        kept = 1.0 - unit
+        sy, zy = (sg - self._sg) * kept, (zg - self._zg) * kept
+        both = kept[:, :, None] * kept[:, None, :]
+        y_s = torch.where(good, y_s, torch.ones_like(y_s))
+        self._r_inverse.mul_(both)
+        column = (unit - _times(self._r_inverse, sy)) / y_s[:, None]
+        self._r_inverse.add_(column[:, :, None] * unit[:, None, :])
+        self._yz.mul_(both)
+        cross = zy[:, :, None] * unit[:, None, :]
+        self._yz.add_(cross + cross.transpose(1, 2))
+        self._yz.add_(y_z[:, None, None] * unit[:, :, None] * unit[:, None, :])
+        self._d.copy_(self._d * kept + y_s[:, None] * unit)
+        seen = moved[:, None]
+        new = (sg * kept + s_new[:, None] * unit, zg * kept + z_new[:, None] * unit)
+        self._sg.copy_(torch.where(seen, new[0], self._sg))
+        self._zg.copy_(torch.where(seen, new[1], self._zg))
+        for pairs, value in ((self._S, step), (self._Z, change)):
+            old = pairs[self._scenes, place]
+            pairs[self._scenes, place] = torch.where(good[:, None], value, old)
+        newest = self._age.amax(dim=1) + 1
+        age = torch.where(unit > 0.0, newest[:, None], self._age)
+        self._age.copy_(age)
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return torch.bmm(matrix, vector[:, :, None])[:, :, 0]

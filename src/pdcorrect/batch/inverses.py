@@ -1,0 +1,302 @@
+"""First Hessians of a batch: dense inverses, applied as matrix products.
+
+Triangular solves hardly run in parallel; products with a dense inverse do, at the speed
+of the memory, and since an inverse is only a preconditioner here it may be stored in
+single precision.  Scenes that share mesh, material, clamps and step share one.
+
+"G" is the thesis's global matrix (eq. 3-14), one scalar matrix for all coordinates;
+"G-scaled" the same with less volume weight; "rest" the true Hessian of the rest shape,
+turned with the body (`pdcorrect.solvers.first_hessian`), which has three unknowns a node
+and so nine times the entries.  Internal modes are eliminated cell by cell.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.decomposition import transposed
+from pdcorrect.errors import ConvergenceError
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.projective import VOLUME_SCALE
+
+Array = NDArray[np.float64]
+Factors = tuple[float, float]
+BatchHessian = Literal["auto", "G", "G-scaled", "rest"]
+
+
+def chosen(name: BatchHessian, unknowns: int) -> BatchHessian:
+    """What "auto" is for bodies of so many nodes."""
+    if name != "auto":
+        return name
+    return "rest" if unknowns <= LARGEST_REST else "G-scaled"
+
+
+LARGEST_REST = 1500
+"""Nodes above which the nine times larger inverse of the rest Hessian does not pay."""
+
+
+class DenseInverse:
+    """R -> H^-1 r on configurations (B, U, 3), zero where clamped.
+
+    Parameters
+    ----------
+    cells : CellBatch
+    problems : sequence of Problem
+    factors : (float, float)
+        On mass (1/s2) and stiffness.
+    kind : {"G", "G-scaled", "rest"}
+    storage : torch.dtype
+        Of the inverse.
+
+    Attributes
+    ----------
+    bytes : int
+        Of all inverses.
+    """
+
+    def __init__(
+        self,
+        cells: CellBatch,
+        problems: Sequence[Problem],
+        factors: Factors,
+        kind: BatchHessian,
+        storage: torch.dtype = torch.float32,
+    ) -> None:
+        self._cells, self.kind = cells, kind
+        self._width = 3 if kind == "rest" else 1
+        distinct, owners = _distinct(problems)
+        self._axes = 1
+        if kind != "rest" and any((p.free != p.free[:, :1]).any() for p in problems):
+            self._axes = 3
+        n = cells.sizes
+        size = self._width * n.nodes
+        shape = (len(distinct), self._axes, size, size)
+        self._inverse = torch.zeros(shape, dtype=storage, device=cells.device)
+        self.bytes = self._inverse.numel() * self._inverse.element_size()
+        solved, inverted = [], []
+        for i, problem in enumerate(distinct):
+            blocks = _node_blocks(problem, factors, kind)
+            kept, inverse, coupling = _eliminated(blocks, problem.cells.shape[1] * self._width)
+            solved.append(coupling)
+            inverted.append(inverse)
+            self._fill(i, problem, kept, factors[0])
+        if n.modes:
+            modes = self._width * (n.width - problems[0].cells.shape[1])
+            nodes = self._width * problems[0].cells.shape[1]
+            owner = torch.as_tensor(owners, device=cells.device)
+            self._solved = cells.tensor(padded(solved, (n.cells, modes, nodes)))[owner]
+            self._mode_inverse = cells.tensor(padded(inverted, (n.cells, modes, modes)))[owner]
+        self._members = _members(owners, len(distinct), n.scenes, cells.device)
+        self._rotations: list[Tensor] = []
+        if kind == "rest":
+            self._turning = _Turning(cells, problems)
+            room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
+            self._rotations = list(room)
+        self._free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
+
+    def turn(self, y: Tensor) -> None:
+        """Turn the rest Hessian to a configuration."""
+        if self.kind == "rest":
+            for kept, new in zip(self._rotations, self._turning.since_rest(y), strict=True):
+                kept.copy_(new)
+
+    def __call__(self, r: Tensor) -> Tensor:
+        r = r * self._free
+        if self._rotations:
+            r = _rotated(transposed(self._rotations), r)
+        n = self._cells.sizes
+        nodal = r if not n.modes else self._reduced(r)
+        x = self._product(nodal[:, : n.nodes])
+        if n.modes:
+            x = self._recovered(x, r)
+        if self._rotations:
+            x = _rotated(self._rotations, x)
+        return x * self._free
+
+    # --- the product ------------------------------------------------------------------
+
+    def _product(self, r: Tensor) -> Tensor:
+        """(B, N, 3) -> (B, N, 3), scenes with one inverse side by side."""
+        scenes, nodes, _ = r.shape
+        count, most = self._members.shape
+        r = r.to(self._inverse.dtype)
+        shared = count * most != scenes
+        if shared:
+            r = torch.cat([r, r.new_zeros(1, nodes, 3)])
+        r = r[self._members] if shared or most > 1 else r[:, None]
+        if self._width == 3:
+            columns = r.reshape(count, most, 1, 3 * nodes).permute(0, 2, 3, 1)
+        elif self._axes == 1:
+            columns = r.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
+        else:
+            columns = r.permute(0, 3, 2, 1)
+        x = self._inverse @ columns
+        if self._width == 3:
+            x = x.permute(0, 3, 1, 2).reshape(count, most, nodes, 3)
+        elif self._axes == 1:
+            x = x.reshape(count, nodes, most, 3).permute(0, 2, 1, 3)
+        else:
+            x = x.permute(0, 3, 2, 1)
+        x = x.to(self._cells.dtype)
+        if not shared and most == 1:
+            return x[:, 0]
+        out = x.new_zeros(scenes + 1, nodes, 3)
+        out[self._members] = x
+        return out[:scenes]
+
+    # --- internal modes ------------------------------------------------------------------
+
+    def _reduced(self, r: Tensor) -> Tensor:
+        """Right-hand side with the modes' part moved to the nodes."""
+        local = self._cells.local(r)
+        nodes = self._solved.shape[-1] // self._width
+        modes = self._flat(local[:, :, nodes:])
+        back = self._unflat(self._solved.transpose(-1, -2) @ modes)
+        return r - self._cells.summed(torch.cat([back, local[:, :, nodes:] * 0.0], dim=2))
+
+    def _recovered(self, x: Tensor, r: Tensor) -> Tensor:
+        n = self._cells.sizes
+        whole = torch.cat([x, x.new_zeros(n.scenes, n.modes, 3)], dim=1)
+        nodes = self._solved.shape[-1] // self._width
+        modes = self._flat(self._cells.local(r)[:, :, nodes:])
+        moved = self._flat(self._cells.local(whole)[:, :, :nodes])
+        found = self._unflat(self._mode_inverse @ modes - self._solved @ moved)
+        zeros = found.new_zeros(n.scenes, n.cells, nodes, 3)
+        return whole + self._cells.summed(torch.cat([zeros, found], dim=2))
+
+    def _flat(self, local: Tensor) -> Tensor:
+        """(B, C, k, 3) as columns of what the eliminated blocks multiply."""
+        return local if self._width == 1 else local.reshape(*local.shape[:2], -1, 1)
+
+    def _unflat(self, columns: Tensor) -> Tensor:
+        return columns if self._width == 1 else columns.reshape(*columns.shape[:2], -1, 3)
+
+    # --- preparation -----------------------------------------------------------------------
+
+    def _fill(self, i: int, problem: Problem, blocks: Array, mass_factor: float) -> None:
+        """Invert one problem's matrix into the store."""
+        device, width = self._cells.device, self._width
+        size = width * len(problem.positions)
+        cells = width * problem.cells[:, :, None] + np.arange(width)
+        cells = torch.as_tensor(cells.reshape(len(cells), -1), device=device)
+        matrix = torch.zeros(size * size, dtype=torch.float64, device=device)
+        places = (cells[:, :, None] * size + cells[:, None, :]).reshape(-1)
+        matrix.index_add_(0, places, torch.as_tensor(blocks, device=device).reshape(-1))
+        mass = problem.mass_matrix.tocoo()
+        values = torch.as_tensor(mass_factor * mass.data, device=device)
+        for k in range(width):
+            rows = torch.as_tensor(width * mass.row.astype(np.int64) + k, device=device)
+            columns = torch.as_tensor(width * mass.col.astype(np.int64) + k, device=device)
+            matrix.index_add_(0, rows * size + columns, values)
+        matrix = matrix.reshape(size, size)
+        for axis in range(self._axes):
+            free = problem.free.ravel() if width == 3 else problem.free[:, axis]
+            keep = torch.as_tensor(free, device=device).to(torch.float64)
+            held = matrix * keep[:, None] * keep + torch.diag(1.0 - keep)
+            factor, info = torch.linalg.cholesky_ex(held)
+            if int(info):
+                raise ConvergenceError(
+                    f"scene {problem.scene.name!r}: the matrix of the step is not positive "
+                    "definite: expected clamps, or inertia that matters beside the stiffness."
+                )
+            inverse = torch.cholesky_inverse(factor) * keep[:, None] * keep
+            self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
+
+
+class _Turning:
+    """How nodes and modes have turned since rest, as `first_hessian.Rotations`."""
+
+    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
+        self._cells = cells
+        n = cells.sizes
+        shares = [
+            p.quadrature.weights / p.quadrature.weights.sum(axis=1, keepdims=True) for p in problems
+        ]
+        self._shares = cells.tensor(padded(shares, (n.cells, n.points)))
+        held = [~p.free.all(axis=1) for p in problems]
+        self._held = cells.nodal([np.where(h, 1.0, 0.0) for h in held]) > 0.5
+        self._nodes = problems[0].cells.shape[1]
+
+    def since_rest(self, y: Tensor) -> list[Tensor]:
+        """Rotations of nodes and modes, nine tensors (B, U)."""
+        cells, n = self._cells, self._cells.sizes
+        u = y - cells.rest
+        u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
+        F = cells.gradients(u, 1.0).reshape(9, n.scenes, n.cells, n.points)
+        mean = (F * self._shares).sum(dim=-1).reshape(9, -1)
+        turns = cells.rotations(mean).T.reshape(n.scenes, n.cells, 1, 9)
+        by_cell = turns.expand(-1, -1, n.width, -1)
+        sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
+        total = torch.cat(sums, dim=-1)  # (B, U, 9)
+        identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
+        still = self._held | (total.abs().sum(dim=-1) == 0.0)
+        total = torch.where(still[..., None], identity, total)
+        out = cells.rotations(total.reshape(-1, 9).T.contiguous())
+        return list(out.reshape(9, n.scenes, n.unknowns))
+
+
+def _rotated(R: list[Tensor], x: Tensor) -> Tensor:
+    a, b, c = x.unbind(-1)
+    rows = [R[3 * i] * a + R[3 * i + 1] * b + R[3 * i + 2] * c for i in range(3)]
+    return torch.stack(rows, dim=-1)
+
+
+def _distinct(problems: Sequence[Problem]) -> tuple[list[Problem], list[int]]:
+    """Problems that differ in their matrix, and which of them each one is."""
+    seen: dict[bytes, int] = {}
+    distinct: list[Problem] = []
+    owners = []
+    for problem in problems:
+        digest = hashlib.blake2b()
+        materials, mass = problem.materials, problem.mass_matrix
+        for array in (
+            problem.positions, problem.cells, problem.free, materials.mu,
+            materials.volume_weight, mass.data, mass.indices,
+        ):  # fmt: skip
+            digest.update(np.ascontiguousarray(array).data)
+        key = digest.digest()
+        if key not in seen:
+            seen[key] = len(distinct)
+            distinct.append(problem)
+        owners.append(seen[key])
+    return distinct, owners
+
+
+def _members(owners: list[int], count: int, scenes: int, device: torch.device) -> Tensor:
+    """Scenes (K, m) that share each inverse, filled up with ``scenes``."""
+    lists: list[list[int]] = [[] for _ in range(count)]
+    for scene, owner in enumerate(owners):
+        lists[owner].append(scene)
+    most = max(map(len, lists))
+    return torch.tensor([row + [scenes] * (most - len(row)) for row in lists], device=device)
+
+
+def _node_blocks(problem: Problem, factors: Factors, kind: BatchHessian) -> Array:
+    """Stiffness of each cell, (C, w L, w L), N/m."""
+    if kind == "rest":
+        rest = problem.extended(problem.positions)
+        blocks = factors[1] * problem.linearise(rest, project=True).blocks()
+        count, width = blocks.shape[:2]
+        return np.ascontiguousarray(blocks.swapaxes(2, 3)).reshape(count, 3 * width, 3 * width)
+    weights, lanes = problem.point_weights, problem.quadrature.lanes
+    scale = VOLUME_SCALE if kind == "G-scaled" else 1.0
+    coefficient = factors[1] * (2.0 * weights[:, 0] + scale * weights[:, 1])
+    rows = lanes.reshape(*lanes.shape[:2], -1)
+    scaled = (lanes * coefficient[:, None, None, :]).reshape(rows.shape)
+    return rows @ scaled.swapaxes(1, 2)
+
+
+def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
+    """Blocks of the nodes with the modes eliminated, K_bb^-1 and K_bb^-1 K_bu."""
+    inverse = np.linalg.inv(blocks[:, nodes:, nodes:])
+    solved = inverse @ blocks[:, nodes:, :nodes]
+    kept = blocks[:, :nodes, :nodes] - blocks[:, :nodes, nodes:] @ solved
+    return np.ascontiguousarray(kept), inverse, solved

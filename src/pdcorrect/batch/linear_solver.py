@@ -1,0 +1,137 @@
+"""Conjugate gradients with the true Hessians of a batch, for error estimates and adjoints."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.inverses import DenseInverse
+from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
+from pdcorrect.batch.recording import Recorder
+
+_CHUNK = 2
+"""Steps between two looks at the scenes' progress."""
+
+
+class BatchConjugateGradients:
+    """Solve H x = b in each scene, H the Hessian at a configuration.
+
+    As `pdcorrect.fem.conjugate_gradients`; scenes that are done, or meet negative
+    curvature, stand still.
+
+    Attributes
+    ----------
+    x : (B, U, 3)
+    converged : (B,)
+        Whether x is a solution.
+    steps : int
+        That the slowest scene took.
+    """
+
+    def __init__(
+        self, objective: BatchObjective, inverse: DenseInverse, recorder: Recorder
+    ) -> None:
+        self._objective, self._inverse = objective, inverse
+        rest = objective.cells.rest
+        self.x, self._b, self._y, self._r, self._d = (torch.zeros_like(rest) for _ in range(5))
+        self._y.copy_(rest)
+        numbers = rest.new_zeros(3, rest.shape[0])
+        self._r_z, self._target, self._limit = numbers
+        flags = torch.zeros(3, rest.shape[0], dtype=torch.bool, device=rest.device)
+        self._which, self._active, self.converged = flags
+        self._tolerance, self._share, self._settled = rest.new_zeros(3)
+        self._busy = torch.zeros((), dtype=torch.bool, device=rest.device)
+        self.steps = 0
+        self._tangent = objective.cells.linearise(self._y)
+        self._begin = recorder(self._set_up)
+        self._advance = recorder(self._chunk)
+
+    def solve(
+        self,
+        y: Tensor,
+        b: Tensor,
+        start: Tensor | None,
+        which: Tensor,
+        *,
+        tolerance: float,
+        residual_share: float = math.inf,
+        settled: float = math.inf,
+        max_steps: int,
+    ) -> None:
+        """Set ``x`` and ``converged`` for the scenes where ``which`` (B,) holds.
+
+        Parameters
+        ----------
+        y, b : (B, U, 3)
+            Where the Hessian is taken, and the right-hand side, zero where clamped.
+        start : (B, U, 3) or None
+            First iterate.
+        tolerance : float
+            Of the residual in the preconditioner's norm, relative to its first value.
+        residual_share : float
+            Largest Euclidean norm of the residual, of b's.
+        settled : float
+            Largest displacement of the last change, of the solution's.
+        """
+        self._y.copy_(y)
+        self._b.copy_(b)
+        if start is None:
+            self.x.zero_()
+        else:
+            self.x.copy_(start)
+        self._which.copy_(which)
+        for room, value in (
+            (self._tolerance, tolerance),
+            (self._share, residual_share),
+            (self._settled, settled),
+        ):
+            room.fill_(value)
+        self._begin()
+        self.steps = 0
+        while self.steps < max_steps and bool(self._busy):
+            self._advance()
+            self.steps += _CHUNK
+
+    def hessian(self, x: Tensor) -> Tensor:
+        """H x on all components, at the y of the last solution."""
+        return self._objective.hessian(self._tangent, x)
+
+    def _product(self, x: Tensor) -> Tensor:
+        return self.hessian(x) * self._objective.free
+
+    def _set_up(self) -> None:
+        self._tangent = self._objective.cells.linearise(self._y)
+        self._r.copy_(self._b - self._product(self.x))
+        z = self._inverse(self._r)
+        self._d.copy_(z)
+        self._r_z.copy_(dot(self._r, z))
+        self._target.copy_(self._tolerance**2 * self._r_z)
+        self._limit.copy_(self._share**2 * dot(self._b, self._b))
+        self.converged.copy_(self._which & (self._r_z == 0.0))
+        self._active.copy_(self._which & (self._r_z > 0.0))
+        self._busy.copy_(self._active.any())
+
+    def _chunk(self) -> None:
+        for _ in range(_CHUNK):
+            self._step()
+        self._busy.copy_(self._active.any())
+
+    def _step(self) -> None:
+        image = self._product(self._d)
+        curvature = dot(self._d, image)
+        active = self._active & (curvature > 0.0)
+        alpha = torch.where(active, self._r_z / curvature, 0.0)
+        change = by_scene(alpha) * self._d
+        self.x.add_(torch.where(by_scene(active), change, 0.0))
+        self._r.sub_(torch.where(by_scene(active), by_scene(alpha) * image, 0.0))
+        z = self._inverse(self._r)
+        r_z = torch.where(active, dot(self._r, z), self._r_z)
+        ratio = torch.where(active, r_z / self._r_z, 0.0)
+        self._d.copy_(torch.where(by_scene(active), z + by_scene(ratio) * self._d, self._d))
+        short = largest_displacement(change) <= self._settled * largest_displacement(self.x)
+        done = (r_z <= self._target) & (dot(self._r, self._r) <= self._limit) & short
+        self._r_z.copy_(r_z)
+        self.converged.logical_or_(active & done)
+        self._active.copy_(active & ~done & (r_z > 0.0) & torch.isfinite(r_z))

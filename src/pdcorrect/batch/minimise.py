@@ -1,0 +1,220 @@
+"""The minimisation loop of `pdcorrect.solvers.lbfgs` for B scenes, each with its own progress.
+
+One iteration evaluates every scene once: scenes whose trial step is accepted move and take
+a new direction, the others try a shorter step.  It has no branches that depend on values,
+so a GPU replays it (`recording`).  A scene stops when its own step is short; then the
+remaining displacement is estimated with the true Hessian, by conjugate gradients, for all
+scenes that wait for it.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.history import BatchHistory
+from pdcorrect.batch.inverses import DenseInverse
+from pdcorrect.batch.linear_solver import BatchConjugateGradients
+from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
+from pdcorrect.batch.recording import Recorder
+from pdcorrect.solvers.lbfgs import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
+
+_ROUND_OFF = {torch.float64: 1e-13, torch.float32: 1e-5}
+_HISTORY = 12
+_CHUNK = 2
+"""Iterations between two looks at the scenes' progress."""
+_CG_STEPS = 60
+
+
+class Phase(IntEnum):
+    """Where a scene is."""
+
+    RUNNING = 0
+    WAITING = 1
+    CONVERGED = 2
+    LINE_SEARCH = 3
+    NOT_FINITE = 4
+    LIMIT = 5
+
+
+class BatchMinimiser:
+    """L-BFGS on a `BatchObjective`.
+
+    Parameters
+    ----------
+    objective : BatchObjective
+    inverse : DenseInverse
+    tolerance : (B,)
+        m, of each scene's estimated largest displacement from its minimum.
+    max_iterations : int
+
+    Attributes
+    ----------
+    y, gradient : (B, U, 3)
+    phase, iterations, evaluations : (B,)
+    estimate : (B,)
+        m; infinite where there is none.
+    linear_solver : BatchConjugateGradients
+    """
+
+    def __init__(
+        self,
+        objective: BatchObjective,
+        inverse: DenseInverse,
+        tolerance: Tensor,
+        max_iterations: int,
+    ) -> None:
+        self._objective, self._inverse = objective, inverse
+        self._tolerance, self._most = tolerance, max_iterations
+        rest, scenes = objective.cells.rest, len(tolerance)
+        self.y, self._start, self.gradient, self._x, self._d = (
+            torch.zeros_like(rest) for _ in range(5)
+        )
+        self._start.copy_(rest)
+        numbers = torch.zeros(6, scenes, dtype=rest.dtype, device=rest.device)
+        self._value, self._scale, self._step, self._slope, self._threshold, self.estimate = numbers
+        counters = torch.zeros(4, scenes, dtype=torch.int64, device=rest.device)
+        self.phase, self.iterations, self.evaluations, self._tried = counters
+        self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
+        self._left = torch.zeros(2, dtype=torch.bool, device=rest.device)
+        self._history = BatchHistory(scenes, _HISTORY, rest[0].numel(), rest)
+        recorder = Recorder(rest.device)
+        self.linear_solver = BatchConjugateGradients(objective, inverse, recorder)
+        self._begin = recorder(self._set_up)
+        self._advance = recorder(self._chunk)
+        self._judge = recorder(self._conclude)
+
+    def run(self, start: Tensor, alive: Tensor) -> None:
+        """Minimise from ``start`` (B, U, 3) the scenes where ``alive`` (B,) holds."""
+        self._start.copy_(start)
+        self._alive.copy_(alive)
+        self._begin()
+        while True:
+            running, waiting = self._left.tolist()
+            if not running and not waiting:
+                return
+            if running:
+                self._advance()
+            else:
+                self._estimate()
+
+    # --- one iteration ------------------------------------------------------------------
+
+    def _set_up(self) -> None:
+        self._inverse.turn(self._start)
+        value, gradient, scale = self._objective(self._start)
+        self.y.copy_(self._start)
+        self.gradient.copy_(gradient)
+        self._value.copy_(value)
+        self._scale.copy_(scale)
+        self._x.copy_(self._inverse(gradient))
+        self._d.copy_(-self._x)
+        self._slope.copy_(dot(gradient, self._d))
+        self._step.fill_(1.0)
+        self._threshold.copy_(FIRST_CHECK * self._tolerance)
+        self.estimate.fill_(math.inf)
+        self.iterations.zero_()
+        self._tried.zero_()
+        self.evaluations.fill_(1)
+        self._history.clear(torch.ones_like(self._alive))
+        finite = self._alive & torch.isfinite(value) & torch.isfinite(self._slope)
+        short = largest_displacement(self._d) <= self._threshold
+        phase = torch.where(short, int(Phase.WAITING), int(Phase.RUNNING))
+        self.phase.copy_(torch.where(finite, phase, int(Phase.NOT_FINITE)))
+        self._look()
+
+    def _look(self) -> None:
+        self._left[0] = (self.phase == Phase.RUNNING).any()
+        self._left[1] = (self.phase == Phase.WAITING).any()
+
+    def _chunk(self) -> None:
+        for _ in range(_CHUNK):
+            self._iterate()
+        self._look()
+
+    def _iterate(self) -> None:
+        running = self.phase == Phase.RUNNING
+        step = torch.where(by_scene(running), by_scene(self._step) * self._d, 0.0)
+        trial = self.y + step
+        value, gradient, scale = self._objective(trial)
+        fall = value - self._value
+        good = fall <= ARMIJO * self._step * self._slope
+        noise = _ROUND_OFF[value.dtype] * self._scale
+        level = dot(gradient, self._d) <= -0.8 * self._slope
+        good = (good | ((fall.abs() <= noise) & level)) & (self._slope < 0.0)
+        moved = running & good & torch.isfinite(value)
+        x = self._inverse(gradient)
+        flat = [a.flatten(1) for a in (step, x - self._x, self.gradient, gradient)]
+        self._history.append(*flat, moved)
+        for old, new in ((self.y, trial), (self.gradient, gradient), (self._x, x)):
+            old.copy_(torch.where(by_scene(moved), new, old))
+        self._value.copy_(torch.where(moved, value, self._value))
+        self._scale.copy_(torch.where(moved, scale, self._scale))
+        self._backtrack(running & ~moved, fall)
+        self._turn(moved)
+        self.evaluations.add_(running)
+        self.iterations.add_(moved)
+        spent = (self.phase == Phase.RUNNING) & (self.iterations >= self._most)
+        self.phase.copy_(torch.where(spent, int(Phase.LIMIT), self.phase))
+
+    def _backtrack(self, failed: Tensor, fall: Tensor) -> None:
+        """A shorter step; after many, another start along -G^-1 g, and then the end."""
+        curvature = 2.0 * (fall - self._step * self._slope) / self._step**2
+        usable = (curvature > 0.0) & torch.isfinite(curvature)
+        best = torch.where(usable, -self._slope / curvature, 0.0)
+        shorter = torch.minimum(torch.maximum(best, 0.1 * self._step), 0.5 * self._step)
+        self._tried.copy_(torch.where(failed, self._tried + 1, 0))
+        spent = failed & ((self._tried >= BACKTRACKS) | ~(self._slope < 0.0))
+        last = spent & self._history.empty
+        self._step.copy_(torch.where(failed & ~spent, shorter, 1.0))
+        self._tried.copy_(torch.where(spent, 0, self._tried))
+        self._history.clear(spent)
+        self._d.copy_(torch.where(by_scene(spent), -self._x, self._d))
+        self._slope.copy_(torch.where(spent, -dot(self.gradient, self._x), self._slope))
+        self.phase.copy_(torch.where(last, int(Phase.LINE_SEARCH), self.phase))
+
+    def _turn(self, moved: Tensor) -> None:
+        """New directions for the scenes that moved."""
+        d = self._history.direction(self._x.flatten(1)).reshape(self._d.shape)
+        self._d.copy_(torch.where(by_scene(moved), d, self._d))
+        self._slope.copy_(torch.where(moved, dot(self.gradient, self._d), self._slope))
+        short = moved & (largest_displacement(self._d) <= self._threshold)
+        self.phase.copy_(torch.where(short, int(Phase.WAITING), self.phase))
+
+    # --- the end of a scene ----------------------------------------------------------------
+
+    def _estimate(self) -> None:
+        """Judge the scenes that wait by a Newton step, which is also their next direction."""
+        self.linear_solver.solve(
+            self.y,
+            -self.gradient,
+            self._d,
+            self.phase == Phase.WAITING,
+            tolerance=0.1,
+            residual_share=0.03,
+            settled=0.1,
+            max_steps=_CG_STEPS,
+        )
+        self._judge()
+
+    def _conclude(self) -> None:
+        waiting, sure = self.phase == Phase.WAITING, self.linear_solver.converged
+        newton = self.linear_solver.x
+        estimate = torch.where(sure, largest_displacement(newton), math.inf)
+        limit = torch.where(self.iterations > 0, 1.0, NO_MOTION) * self._tolerance
+        done = waiting & (estimate <= limit)
+        again = waiting & ~done
+        ratio = (0.5 * self._tolerance / estimate).clamp(0.05, 0.5)
+        lower = again & (estimate > self._tolerance)
+        shorter = largest_displacement(self._d) * ratio
+        self._threshold.copy_(torch.where(lower, shorter, self._threshold))
+        use = again & sure
+        self._d.copy_(torch.where(by_scene(use), newton, self._d))
+        self._slope.copy_(torch.where(use, dot(self.gradient, self._d), self._slope))
+        self.estimate.copy_(torch.where(waiting, estimate, self.estimate))
+        phase = torch.where(again, int(Phase.RUNNING), self.phase)
+        self.phase.copy_(torch.where(done, int(Phase.CONVERGED), phase))
+        self._look()

@@ -1,0 +1,42 @@
+"""Device work that is launched as a whole.
+
+On a GPU a step is hundreds of small kernels, and launching each from Python takes longer
+than running it.  A function that works in place on fixed tensors, and does nothing that
+depends on values, is recorded once as a CUDA graph and replayed.  Elsewhere it is called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+
+class Recorder:
+    """Records functions for one device; their intermediate results share memory."""
+
+    def __init__(self, device: torch.device) -> None:
+        self._on_gpu = device.type == "cuda"
+        self._device = device
+        self._pool: Any = None
+
+    def __call__(self, function: Callable[[], None]) -> Callable[[], None]:
+        """The function as something to replay.
+
+        On a GPU it is run twice for this, so what it works on must not matter yet.
+        """
+        if not self._on_gpu:
+            return function
+        with torch.cuda.device(self._device):
+            stream = torch.cuda.Stream()
+            stream.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(stream):
+                function()
+                function()
+            torch.cuda.current_stream().wait_stream(stream)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, pool=self._pool):
+                function()
+            self._pool = graph.pool()
+        return graph.replay

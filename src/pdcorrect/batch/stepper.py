@@ -1,0 +1,400 @@
+"""`BatchStepper`: one implicit step of many scenes together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
+from pdcorrect.batch.loads import BatchLoads
+from pdcorrect.batch.minimise import BatchMinimiser, Phase
+from pdcorrect.batch.objective import BatchObjective, by_scene
+from pdcorrect.errors import InputError, PdcorrectError
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.integrators import integrator as make_integrator
+from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.projective import ProjectiveDynamics
+from pdcorrect.solvers.schemes import Scheme
+from pdcorrect.state import State, Status, StepResult
+
+Array = NDArray[np.float64]
+
+_STATUSES = {
+    Phase.CONVERGED: Status.CONVERGED,
+    Phase.LINE_SEARCH: Status.LINE_SEARCH,
+    Phase.NOT_FINITE: Status.NOT_FINITE,
+    Phase.LIMIT: Status.ITERATION_LIMIT,
+    Phase.RUNNING: Status.ITERATION_LIMIT,
+    Phase.WAITING: Status.ITERATION_LIMIT,
+}
+"""What the loop's phases mean for a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class BatchState:
+    """States of B scenes, padded: nodal tensors (B, N, 3), zero beyond a scene's nodes.
+
+    Attributes
+    ----------
+    positions, velocities : (B, N, 3) tensors
+        m and m/s.
+    times : tuple of float
+        s.
+    memory : mapping of str to (B, N, 3) tensors
+        See `State.memory`.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    times: tuple[float, ...]
+    memory: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult:
+    """Outcome of a step of B scenes.
+
+    Attributes
+    ----------
+    state : BatchState
+    statuses : list of Status
+    iterations, evaluations : (B,) int
+    error_estimates : (B,)
+        m; infinite where there is none.
+    """
+
+    state: BatchState
+    statuses: list[Status]
+    iterations: NDArray[np.int64]
+    evaluations: NDArray[np.int64]
+    error_estimates: Array
+
+
+class BatchStepper:
+    """Steps many scenes by projective dynamics, in torch, on one device.
+
+    The same minimisation as `ProjectiveDynamics`, to the same tolerance; scenes do not
+    influence each other.  They may differ in everything except the element, the energy,
+    the integrator and the time step.
+
+    Parameters
+    ----------
+    problems : sequence of Problem
+    tolerance : float, optional
+        Of each scene's coarse cell size; the first scene's by default.
+    first_hessian : {"auto", "G", "G-scaled", "rest"}
+        See `DenseInverse`; "auto" is "rest" for small meshes.
+    max_iterations : int
+    time_step, integrator : optional
+        The first scene's by default.
+    device : str
+        "cpu", "cuda", "cuda:1", ...
+    dtype : torch.dtype
+        Of states, energies and gradients.
+    storage : torch.dtype
+        Of the inverses.
+    recover : bool
+        Whether scenes that do not converge are tried again, one at a time, with
+        `ProjectiveDynamics` and its fallbacks.
+    """
+
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        tolerance: float | None = None,
+        *,
+        first_hessian: BatchHessian = "auto",
+        max_iterations: int = 300,
+        time_step: float | None = None,
+        integrator: str | None = None,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float64,
+        storage: torch.dtype = torch.float32,
+        recover: bool = True,
+    ) -> None:
+        self.problems = tuple(problems)
+        _check_problems(self.problems, time_step, integrator)
+        first = self.problems[0]
+        time = first.scene.time
+        self.tolerance = first.scene.solver.tolerance if tolerance is None else float(tolerance)
+        self.time_step = first.time_step if time_step is None else float(time_step)
+        self.integrator = time.integrator if integrator is None else integrator
+        self.integrate = make_integrator(self.integrator, time.spectral_radius)
+        self.device, self.dtype = torch.device(device), dtype
+        self.cells = CellBatch(self.problems, self.device, dtype)
+        self.objective = BatchObjective(self.cells, self.problems)
+        self.first_hessian = chosen(first_hessian, self.cells.sizes.nodes)
+        self._storage, self._most, self._recover = storage, max_iterations, recover
+        self._loads = BatchLoads(self.cells, self.problems)
+        self._held = 1.0 - self.objective.free
+        self._clamped = self.cells.nodal([p.positions for p in self.problems])
+        self._minimiser: BatchMinimiser | None = None
+        self._inverse: DenseInverse | None = None
+        self._single: dict[int, ProjectiveDynamics] = {}
+
+    # --- states -------------------------------------------------------------------------
+
+    def state(self, states: Sequence[State]) -> BatchState:
+        """States of the scenes together.
+
+        Raises
+        ------
+        InputError
+            If there is not one for each scene, or shapes are wrong.
+        """
+        if len(states) != len(self.problems):
+            raise InputError(f"{len(states)} states: expected {len(self.problems)}, one a scene.")
+        for i, (state, problem) in enumerate(zip(states, self.problems, strict=True)):
+            if state.positions.shape != problem.positions.shape:
+                raise InputError(
+                    f"state {i} has {len(state.positions)} nodes: expected "
+                    f"{len(problem.positions)}."
+                )
+        names = set(states[0].memory)
+        if any(set(s.memory) != names for s in states):
+            raise InputError("some states have a memory that others lack: expected all or none.")
+        return BatchState(
+            self._nodal([s.positions for s in states]),
+            self._nodal([s.velocities for s in states]),
+            tuple(s.time for s in states),
+            {name: self._nodal([s.memory[name] for s in states]) for name in names},
+        )
+
+    def rest_state(self) -> BatchState:
+        """All scenes at rest at time zero."""
+        return self.state([p.rest_state() for p in self.problems])
+
+    def states(self, batch: BatchState) -> list[State]:
+        """The scenes' states one by one."""
+        counts = self.cells.node_counts
+        host = {
+            "positions": batch.positions, "velocities": batch.velocities, **batch.memory,
+        }  # fmt: skip
+        arrays = {n: t.detach().to("cpu", torch.float64).numpy() for n, t in host.items()}
+        out = []
+        for i, count in enumerate(counts):
+            memory = {name: arrays[name][i, :count] for name in batch.memory}
+            out.append(
+                State(
+                    arrays["positions"][i, :count],
+                    arrays["velocities"][i, :count],
+                    batch.times[i],
+                    memory,
+                )
+            )
+        return out
+
+    def _nodal(self, arrays: Sequence[Array]) -> Tensor:
+        return self.cells.nodal(arrays)[:, : self.cells.sizes.nodes]
+
+    def _extended(self, nodal: Tensor) -> Tensor:
+        """(B, N, 3) as configurations (B, U, 3)."""
+        n = self.cells.sizes
+        if not n.modes:
+            return nodal
+        return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
+
+    # --- a step ---------------------------------------------------------------------------
+
+    def __call__(self, state: BatchState, forces: Tensor | None = None) -> BatchResult:
+        """Advance all scenes by one step, with extra nodal forces (B, N, 3), N."""
+        scheme, known = self.prepare(state, forces)
+        minimiser = self._minimiser
+        assert minimiser is not None
+        start = self._start(scheme, known)
+        alive = torch.isfinite(start).all(dim=2).all(dim=1)
+        minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
+        after = self._finish(scheme, known, minimiser.y, state)
+        phases = minimiser.phase.tolist()
+        result = BatchResult(
+            after,
+            [_STATUSES[Phase(p)] for p in phases],
+            minimiser.iterations.cpu().numpy(),
+            minimiser.evaluations.cpu().numpy(),
+            minimiser.estimate.to("cpu", torch.float64).numpy() * scheme.gain,
+        )
+        return self._recovered(state, forces, result) if self._recover else result
+
+    def prepare(
+        self, state: BatchState, forces: Tensor | None = None
+    ) -> tuple[Scheme, dict[str, Any]]:
+        """Set up the step's objective and first Hessian."""
+        h = self.time_step
+        scheme = self.integrate.scheme_of(h, bool(state.memory))
+        known = self._known(scheme, state)
+        free = self.objective.free[:, : self.cells.sizes.nodes] > 0.5
+
+        def split(on_free: Linear, on_clamped: Linear | None) -> Tensor:
+            values = on_free(known)
+            if on_clamped is not None:
+                values = torch.where(free, values, on_clamped(known))
+            return values
+
+        objective = self.objective
+        alpha = self.problems[0].scene.damping.mass
+        factors = (objective.inertia, objective.damping)
+        objective.inertia, objective.damping = scheme.inertia, scheme.rate * alpha
+        objective.target.copy_(self._extended(split(scheme.target, scheme.clamped_target)))
+        if objective.damping:
+            objective.origin.copy_(self._extended(split(scheme.origin, scheme.clamped_origin)))
+        total = self._loads(state.times, scheme.loads_over, h, scheme.loads_at(known))
+        if forces is not None:
+            total = total + self._extended(forces.to(total))
+        objective.forces.copy_(total)
+        if self._minimiser is None or factors != (objective.inertia, objective.damping):
+            self._inverse = DenseInverse(
+                self.cells, self.problems, objective.factors, self.first_hessian, self._storage
+            )
+            sizes = [self.tolerance * p.cell_size / scheme.gain for p in self.problems]
+            tolerance = self.cells.tensor(np.array(sizes))
+            self._minimiser = BatchMinimiser(objective, self._inverse, tolerance, self._most)
+        return scheme, known
+
+    def _known(self, scheme: Scheme, state: BatchState) -> dict[str, Any]:
+        h = self.time_step
+        known: dict[str, Any] = {
+            "positions": state.positions,
+            "velocities": state.velocities,
+            "prescribed": self._prescribed([t + h for t in state.times]),
+            "time": torch.zeros_like(state.positions)
+            + by_scene(state.positions.new_tensor(state.times)),
+            **state.memory,
+            "clamp_velocity": 0.0,
+            "clamp_velocity_at_y": 0.0,
+            "clamp_jump": 0.0,
+        }
+        if "accelerations" in scheme.memory and "accelerations" not in known:
+            raise InputError(
+                "generalised-alpha in a batch starts from states with accelerations: expected "
+                "memory. Take the first step of each scene with ProjectiveDynamics."
+            )
+        return known
+
+    def _prescribed(self, times: Sequence[float]) -> Tensor:
+        if not any(p.clamps.moving for p in self.problems):
+            return self._clamped[:, : self.cells.sizes.nodes]
+        pairs = zip(self.problems, times, strict=True)
+        return self._nodal([p.clamped_positions(t) for p, t in pairs])
+
+    def _start(self, scheme: Scheme, known: Mapping[str, Any]) -> Tensor:
+        nodes = self.cells.sizes.nodes
+        free = self.objective.free[:, :nodes] > 0.5
+        return self._extended(torch.where(free, scheme.start(known), scheme.clamped(known)))
+
+    def _finish(
+        self, scheme: Scheme, known: dict[str, Any], y: Tensor, state: BatchState
+    ) -> BatchState:
+        nodes = self.cells.sizes.nodes
+        free = self.objective.free[:, :nodes] > 0.5
+        known = {**known, "y": y[:, :nodes].clone()}  # the next step overwrites y
+
+        def split(on_free: Linear, on_clamped: Linear | None) -> Tensor:
+            values = on_free(known)
+            if isinstance(values, float):
+                values = torch.zeros_like(state.positions)
+            if on_clamped is not None:
+                values = torch.where(free, values, on_clamped(known))
+            return values
+
+        memory = {name: split(*rows) for name, rows in scheme.memory.items()}
+        velocities = split(scheme.velocities, scheme.clamped_velocities)
+        times = tuple(t + self.time_step for t in state.times)
+        return BatchState(split(scheme.positions, None), velocities, times, memory)
+
+    # --- scenes that did not converge -------------------------------------------------------
+
+    def _recovered(
+        self, state: BatchState, forces: Tensor | None, result: BatchResult
+    ) -> BatchResult:
+        """Try scenes that failed, and are finite, again one at a time."""
+        failed = [
+            i
+            for i, status in enumerate(result.statuses)
+            if status in (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
+        ]
+        if not failed:
+            return result
+        before, after = self.states(state), self.states(result.state)
+        statuses, estimates = list(result.statuses), result.error_estimates.copy()
+        iterations = result.iterations.copy()
+        for i in failed:
+            found = self._alone(i, before[i], forces)
+            if found is None:
+                continue
+            after[i], statuses[i] = found.state, found.status
+            if found.status is Status.CONVERGED:
+                statuses[i] = Status.RECOVERED
+            estimates[i] = found.error_estimate
+            iterations[i] += found.iterations
+        names = {n for s in after for n in s.memory}
+        whole = [replace(s, memory={n: s.memory[n] for n in names if n in s.memory}) for s in after]
+        return replace(
+            result,
+            state=self.state(whole),
+            statuses=statuses,
+            iterations=iterations,
+            error_estimates=estimates,
+        )
+
+    def _alone(self, i: int, state: State, forces: Tensor | None) -> StepResult | None:
+        problem = self.problems[i]
+        if i not in self._single:
+            self._single[i] = ProjectiveDynamics(
+                problem, self.tolerance, time_step=self.time_step, integrator=self.integrator
+            )
+        extra = None
+        if forces is not None:
+            extra = forces[i, : len(problem.positions)].to("cpu", torch.float64).numpy()
+        try:
+            return self._single[i](state, extra)
+        except PdcorrectError:
+            return None
+
+    @property
+    def inverse_bytes(self) -> int:
+        """Memory of the inverses; 0 before the first step."""
+        return 0 if self._inverse is None else self._inverse.bytes
+
+
+def _check_problems(
+    problems: tuple[Problem, ...], time_step: float | None, integrator: str | None
+) -> None:
+    if not problems:
+        raise InputError("no problems: expected one or more scenes.")
+    first = problems[0]
+    for i, problem in enumerate(problems):
+        scene, other = problem.scene, first.scene
+        pairs = [
+            ("element", problem.element, first.element),
+            ("energy", problem.materials.model, first.materials.model),
+            ("damping.mass", scene.damping.mass, other.damping.mass),
+        ]
+        if time_step is None:
+            pairs.append(("time.step", scene.time.step, other.time.step))
+        if integrator is None:
+            pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
+        for name, mine, theirs in pairs:
+            if mine != theirs:
+                raise InputError(
+                    f"scene {i} ({scene.name!r}): {name} = {mine!r}, the first one's is "
+                    f"{theirs!r}: expected the same. Make a batch of each kind."
+                )
+        if scene.damping.stiffness:
+            raise InputError(
+                f"scene {i} ({scene.name!r}): damping.stiffness is not available in batches: "
+                "expected 0. Use ProjectiveDynamics."
+            )
+        if problem.clamps.moving and scene.time.integrator in ("midpoint", "generalised-alpha"):
+            raise InputError(
+                f"scene {i} ({scene.name!r}): moving clamps with {scene.time.integrator} are not "
+                "available in batches. Use ProjectiveDynamics."
+            )
+    assert math.isfinite(first.time_step)
