@@ -32,6 +32,9 @@ _HOME = {
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
     "Newton": "pdcorrect.solvers.newton",
     "adjoint": "pdcorrect.solvers.adjoint",
+    "BatchStepper": "pdcorrect.batch.stepper",
+    "BatchGradients": "pdcorrect.batch.adjoint",
+    "PDLayer": "pdcorrect.torch_layer",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
@@ -60,6 +63,9 @@ __all__ = [  # noqa: RUF022
     "ProjectiveDynamics",
     "Newton",
     "adjoint",
+    "BatchStepper",
+    "BatchGradients",
+    "PDLayer",
     "rollout",
     "march",
     "restrict",
@@ -80,6 +86,8 @@ __all__ = [  # noqa: RUF022
 
 if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report
+    from pdcorrect.batch.adjoint import BatchGradients
+    from pdcorrect.batch.stepper import BatchStepper
     from pdcorrect.evaluate import compare
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
@@ -94,6 +102,7 @@ if TYPE_CHECKING:
     from pdcorrect.solvers.reactions import reactions
     from pdcorrect.solvers.rollout import march, restrict, rollout
     from pdcorrect.state import State, Status, Stepper, StepResult, Trajectory
+    from pdcorrect.torch_layer import PDLayer
 
 
 def __getattr__(name: str) -> Any:

@@ -42,7 +42,8 @@ def padded(arrays: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float =
     """Arrays stacked into (B, *shape), each in the low corner."""
     out = np.full((len(arrays), *shape), fill, dtype=arrays[0].dtype)
     for i, array in enumerate(arrays):
-        out[(i, *(slice(n) for n in array.shape))] = array
+        corner: tuple[Any, ...] = (i, *(slice(n) for n in array.shape))
+        out[corner] = array
     return out
 
 
@@ -143,6 +144,18 @@ class CellBatch:
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
         return self.gathered(self._points.product(tangent, self.gradients(x, 0.0)))
+
+    def set_weights(self, mu: Tensor, omega: Tensor) -> None:
+        """Weights of the two energy terms from now on, (B, C), Pa; absent terms stay absent."""
+        shape = (2, self.sizes.scenes, self.sizes.cells, self.sizes.points)
+        values = torch.stack([mu, omega])[..., None] * self._volumes.reshape(shape)
+        self._weights.copy_(torch.where(self._weights != 0.0, values.reshape(2, -1), 0.0))
+
+    @property
+    def terms(self) -> Tensor:
+        """Whether each cell has each of the two energy terms, (2, B, C)."""
+        n = self.sizes
+        return (self._weights.reshape(2, n.scenes, n.cells, n.points) != 0.0).any(dim=-1)
 
     def rotations(self, F: Tensor) -> Tensor:
         """Nearest rotations (9, M) of matrices (9, M)."""

@@ -185,8 +185,8 @@ class DenseInverse:
         """Invert one problem's matrix into the store."""
         device, width = self._cells.device, self._width
         size = width * len(problem.positions)
-        cells = width * problem.cells[:, :, None] + np.arange(width)
-        cells = torch.as_tensor(cells.reshape(len(cells), -1), device=device)
+        numbers = width * problem.cells[:, :, None] + np.arange(width)
+        cells = torch.as_tensor(numbers.reshape(len(numbers), -1), device=device)
         matrix = torch.zeros(size * size, dtype=torch.float64, device=device)
         places = (cells[:, :, None] * size + cells[:, None, :]).reshape(-1)
         matrix.index_add_(0, places, torch.as_tensor(blocks, device=device).reshape(-1))
@@ -199,7 +199,7 @@ class DenseInverse:
         matrix = matrix.reshape(size, size)
         for axis in range(self._axes):
             free = problem.free.ravel() if width == 3 else problem.free[:, axis]
-            keep = torch.as_tensor(free, device=device).to(torch.float64)
+            keep = torch.as_tensor(free.astype(np.float64), device=device)
             held = matrix * keep[:, None] * keep + torch.diag(1.0 - keep)
             factor, info = torch.linalg.cholesky_ex(held)
             if int(info):
@@ -296,7 +296,7 @@ def _node_blocks(problem: Problem, factors: Factors, kind: BatchHessian) -> Arra
 
 def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
     """Blocks of the nodes with the modes eliminated, K_bb^-1 and K_bb^-1 K_bu."""
-    inverse = np.linalg.inv(blocks[:, nodes:, nodes:])
+    inverse = np.asarray(np.linalg.inv(blocks[:, nodes:, nodes:]), dtype=np.float64)
     solved = inverse @ blocks[:, nodes:, :nodes]
     kept = blocks[:, :nodes, :nodes] - blocks[:, :nodes, nodes:] @ solved
     return np.ascontiguousarray(kept), inverse, solved

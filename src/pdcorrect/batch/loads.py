@@ -1,4 +1,4 @@
-"""External forces of the scenes of a batch."""
+"""External forces of the scenes of a batch, and their derivatives."""
 
 from __future__ import annotations
 
@@ -9,72 +9,98 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.objective import BatchMass
 from pdcorrect.fem.problem import Problem
+
+Spans = Sequence[tuple[float, float]]
+"""The time interval (s) of each scene's loads; a moment where both ends are equal."""
 
 
 class BatchLoads:
-    """All loads of B scenes, averaged over a step.
+    """All loads of B scenes, averaged over time intervals.
 
     Patterns of loads that do not follow the body stay on the device; those that do are
     sampled on the CPU, one scene at a time.
     """
 
-    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
-        self._cells = cells
-        fixed = [[load for load in p.loads if load.sample is None] for p in problems]
-        self._following = [[load for load in p.loads if load.sample is not None] for p in problems]
-        self._any_following = any(self._following)
-        most = max(map(len, fixed))
-        self._patterns = torch.stack(
-            [
-                cells.nodal(
-                    [
-                        loads[k].pattern if k < len(loads) else np.zeros_like(p.positions)
-                        for loads, p in zip(fixed, problems, strict=True)
-                    ]
-                )
-                for k in range(most)
-            ]
-        ) if most else None  # fmt: skip
-        self._fixed = fixed
-        self._last: tuple[tuple[tuple[float, ...], ...], Tensor] | None = None
+    def __init__(self, cells: CellBatch, problems: Sequence[Problem], mass: BatchMass) -> None:
+        self._cells, self._mass = cells, mass
+        self._gravity = [[k for k in p.loads if k.acceleration is not None] for p in problems]
+        self._following = [[k for k in p.loads if k.sample is not None] for p in problems]
+        self._fixed = [
+            [k for k in p.loads if k.sample is None and k.acceleration is None] for p in problems
+        ]
+        most = max(map(len, self._fixed))
+        self._patterns = [
+            cells.nodal(
+                [
+                    loads[k].pattern if k < len(loads) else np.zeros_like(p.positions)
+                    for loads, p in zip(self._fixed, problems, strict=True)
+                ]
+            )
+            for k in range(most)
+        ]
+        self._known: tuple[tuple[float, ...], ...] | None = None
+        self._sum, self._acceleration = torch.zeros_like(cells.rest), cells.rest[:, :1] * 0.0
 
-    def __call__(
-        self, times: Sequence[float], over: tuple[float, float], h: float, positions: Tensor
-    ) -> Tensor:
-        """Nodal forces (B, U, 3), N, over a step of h seconds from ``times``.
+    @property
+    def follow(self) -> bool:
+        """Whether any load depends on the positions."""
+        return any(self._following)
 
-        ``over`` as in `Scheme.loads_over`; ``positions`` (B, N, 3) are where follower
-        loads are sampled.
-        """
-        spans = [(t + over[0] * h, t + over[1] * h) for t in times]
+    def __call__(self, spans: Spans, positions: Tensor) -> Tensor:
+        """Nodal forces (B, U, 3), N; follower loads are sampled at positions (B, N, 3)."""
+        fall = self._mass.nodal[..., None] * self.acceleration(spans)
+        total = self._sum + fall
+        if not self.follow:
+            return total
+        sampled = []
+        for at, loads, span in zip(self._host(positions), self._following, spans, strict=True):
+            out = np.zeros_like(at)
+            if np.isfinite(at).all():
+                for load in loads:
+                    out += load.forces(*span, at)
+            sampled.append(out)
+        return total + self._cells.nodal(sampled)
+
+    def acceleration(self, spans: Spans) -> Tensor:
+        """Of gravity, (B, 1, 3), m/s2."""
         amplitudes = tuple(
-            tuple(load.amplitude.mean(*span) for load in loads)
-            for loads, span in zip(self._fixed, spans, strict=True)
+            tuple(load.amplitude.mean(*span) for load in (*fixed, *gravity))
+            for fixed, gravity, span in zip(self._fixed, self._gravity, spans, strict=True)
         )
-        if self._last is None or self._last[0] != amplitudes:
-            self._last = amplitudes, self._sum(amplitudes)
-        total = self._last[1]
-        if self._any_following:
-            total = total + self._sampled(spans, positions)
-        return total
+        if amplitudes != self._known:
+            self._update(amplitudes)
+        return self._acceleration
 
-    def _sum(self, amplitudes: tuple[tuple[float, ...], ...]) -> Tensor:
-        if self._patterns is None:
-            return torch.zeros_like(self._cells.rest)
-        most = len(self._patterns)
-        table = [list(row) + [0.0] * (most - len(row)) for row in amplitudes]
-        factors = self._cells.tensor(np.array(table).T)
-        return (factors[:, :, None, None] * self._patterns).sum(dim=0)
-
-    def _sampled(self, spans: Sequence[tuple[float, float]], positions: Tensor) -> Tensor:
-        arrays = []
-        host = positions.detach().to("cpu", torch.float64).numpy()
-        for i, (loads, span) in enumerate(zip(self._following, spans, strict=True)):
-            at = host[i, : self._cells.node_counts[i]]
-            total = np.zeros_like(at)
+    def pulled(self, spans: Spans, positions: Tensor, x: Tensor) -> Tensor:
+        """Derivatives (B, N, 3) of x . forces by the positions, N/m, for x (B, N, 3)."""
+        out = []
+        every = zip(self._host(positions), self._host(x), self._following, spans, strict=True)
+        for at, along, loads, span in every:
+            slope = np.zeros_like(at)
             for load in loads:
-                if np.isfinite(at).all():
-                    total += load.forces(*span, at)
-            arrays.append(total)
-        return self._cells.nodal(arrays)
+                slope += load.pulled(*span, at, along)
+            out.append(slope)
+        return self._cells.nodal(out)[:, : positions.shape[1]]
+
+    def _update(self, amplitudes: tuple[tuple[float, ...], ...]) -> None:
+        total = torch.zeros_like(self._cells.rest)
+        for k, pattern in enumerate(self._patterns):
+            factors = [
+                row[k] if k < len(fixed) else 0.0
+                for row, fixed in zip(amplitudes, self._fixed, strict=True)
+            ]
+            total = total + self._cells.tensor(np.array(factors))[:, None, None] * pattern
+        fall = np.zeros((len(amplitudes), 1, 3))
+        for i, (row, fixed, gravity) in enumerate(
+            zip(amplitudes, self._fixed, self._gravity, strict=True)
+        ):
+            for factor, load in zip(row[len(fixed) :], gravity, strict=True):
+                fall[i, 0] += factor * np.asarray(load.acceleration)
+        self._sum, self._acceleration = total, self._cells.tensor(fall)
+        self._known = amplitudes
+
+    def _host(self, x: Tensor) -> list[np.ndarray]:
+        host = x.detach().to("cpu", torch.float64).numpy()
+        return [host[i, :count] for i, count in enumerate(self._cells.node_counts)]

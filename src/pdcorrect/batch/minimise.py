@@ -147,8 +147,8 @@ class BatchMinimiser:
         good = (good | ((fall.abs() <= noise) & level)) & (self._slope < 0.0)
         moved = running & good & torch.isfinite(value)
         x = self._inverse(gradient)
-        flat = [a.flatten(1) for a in (step, x - self._x, self.gradient, gradient)]
-        self._history.append(*flat, moved)
+        s, z = step.flatten(1), (x - self._x).flatten(1)
+        self._history.append(s, z, self.gradient.flatten(1), gradient.flatten(1), moved)
         for old, new in ((self.y, trial), (self.gradient, gradient), (self._x, x)):
             old.copy_(torch.where(by_scene(moved), new, old))
         self._value.copy_(torch.where(moved, value, self._value))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
@@ -15,43 +13,64 @@ from pdcorrect.fem.problem import Problem
 
 
 class BatchMass:
-    """M x for nodal fields (B, U, 3), kg; internal modes have no mass."""
+    """M x for nodal fields (B, U, 3), kg; internal modes have no mass.
+
+    Attributes
+    ----------
+    nodal : (B, U)
+        Row sums, kg.
+    density : (B, C)
+        kg/m3.
+    """
 
     def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
-        self.nodal = cells.nodal([p.mass for p in problems])
+        self._cells = cells
+        n = cells.sizes
+        nodes = problems[0].cells.shape[1]
+        blocks = [p.space.cell_masses(p.mass_rule) for p in problems]
+        self._blocks = cells.tensor(padded(blocks, (n.cells, nodes, nodes)))
         self._diagonal = all(p.mass_is_diagonal for p in problems)
-        if not self._diagonal:
-            columns, values = zip(*(_rows(p) for p in problems), strict=True)
-            most = max(c.shape[1] for c in columns)
-            n = cells.sizes
-            offsets = np.arange(n.scenes)[:, None, None] * n.unknowns
-            places = padded(columns, (n.unknowns, most)) + offsets
-            self._columns = torch.as_tensor(places.reshape(-1), device=cells.device)
-            self._values = cells.tensor(padded(values, (n.unknowns, most)))
+        self.density = cells.tensor(padded([p.materials.density for p in problems], (n.cells,)))
+        self.nodal = torch.zeros(n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
+        self.set_density(self.density)
+
+    def set_density(self, density: Tensor) -> None:
+        """Densities (B, C), kg/m3, from now on."""
+        self.density.copy_(density)
+        rows = self._blocks.sum(dim=-1) * self.density[..., None]
+        local = self._filled(rows[..., None].expand(-1, -1, -1, 3))
+        self.nodal.copy_(self._cells.summed(local)[..., 0])
 
     def __call__(self, x: Tensor) -> Tensor:
         if self._diagonal:
             return self.nodal[..., None] * x
-        picked = x.reshape(-1, 3)[self._columns].reshape(*self._values.shape, 3)
-        return (self._values[..., None] * picked).sum(dim=2)
+        return self._cells.summed(self._filled(self.density[..., None, None] * self._by_cell(x)))
 
+    def slopes(self, a: Tensor, b: Tensor) -> Tensor:
+        """Derivatives of a . M b by the densities, (B, C), for (B, U, 3)."""
+        return (self._local(a) * self._by_cell(b)).sum(dim=(2, 3))
 
-def _rows(problem: Problem) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Columns and values of each row of the mass matrix, (N, most)."""
-    matrix = problem.mass_matrix.tocsr()
-    counts = np.diff(matrix.indptr)
-    place = np.arange(matrix.nnz) - np.repeat(matrix.indptr[:-1], counts)
-    rows = np.repeat(np.arange(len(counts)), counts)
-    columns = np.zeros((len(counts), counts.max()), dtype=np.int64)
-    values = np.zeros(columns.shape)
-    columns[rows, place], values[rows, place] = matrix.indices, matrix.data
-    return columns, values
+    def row_slopes(self, x: Tensor) -> Tensor:
+        """Derivatives (B, C) of the sum of x (B, U) times ``nodal`` by the densities."""
+        columns = x[..., None].expand(-1, -1, 3).contiguous()
+        return (self._blocks.sum(dim=-1) * self._local(columns)[..., 0]).sum(dim=2)
+
+    def _by_cell(self, x: Tensor) -> Tensor:
+        return self._blocks @ self._local(x)
+
+    def _local(self, x: Tensor) -> Tensor:
+        return self._cells.local(x)[:, :, : self._blocks.shape[-1]]
+
+    def _filled(self, local: Tensor) -> Tensor:
+        """Zeros for the cells' modes."""
+        missing = self._cells.sizes.width - local.shape[2]
+        return torch.nn.functional.pad(local, (0, 0, 0, missing))
 
 
 class BatchObjective:
     """gamma of B steps; what a step depends on is copied into fixed tensors.
 
-    So that a recorded graph of kernels can be replayed for the next step.
+    So that recorded work can be replayed for the next step.
 
     Attributes
     ----------
@@ -77,24 +96,19 @@ class BatchObjective:
 
     def __call__(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""
-        value, gradient, scale = self.balance(y)
-        return value, gradient * self.free, scale
-
-    def balance(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The same with the gradient on all components."""
         energy, elastic = self.cells.energy_and_forces(y)
         offset = y - self.target
         momentum = self.inertia * self.mass(offset)
-        kinetic = 0.5 * (offset * momentum).sum(dim=(1, 2))
-        work = (self.forces * (y - self.cells.rest)).sum(dim=(1, 2))
+        kinetic = 0.5 * dot(offset, momentum)
+        work = dot(self.forces, y - self.cells.rest)
         gradient = momentum - elastic - self.forces
         value, scale = energy + kinetic - work, energy + kinetic + work.abs()
         if self.damping:
             offset = y - self.origin
             drag = self.damping * self.mass(offset)
-            loss = 0.5 * (offset * drag).sum(dim=(1, 2))
+            loss = 0.5 * dot(offset, drag)
             value, scale, gradient = value + loss, scale + loss, gradient + drag
-        return value, gradient, scale
+        return value, gradient * self.free, scale
 
     def hessian(self, tangent: tuple[Tensor, Tensor, Tensor], x: Tensor) -> Tensor:
         """H x on all components, for a tangent of the cells."""
@@ -112,6 +126,6 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(dim=(1, 2))
 
 
-def by_scene(values: Any) -> Any:
+def by_scene(values: Tensor) -> Tensor:
     """(B,) as factors of (B, U, 3)."""
     return values[:, None, None]

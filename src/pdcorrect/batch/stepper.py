@@ -12,14 +12,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
+from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.errors import InputError, PdcorrectError
 from pdcorrect.fem.problem import Problem
+from pdcorrect.scene.materials import lame
 from pdcorrect.solvers.integrators import integrator as make_integrator
+from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.linear import Linear
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.schemes import Scheme
@@ -27,6 +30,8 @@ from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
 
+_ADJOINT_STEPS = 400
+"""Of conjugate gradients."""
 _STATUSES = {
     Phase.CONVERGED: Status.CONVERGED,
     Phase.LINE_SEARCH: Status.LINE_SEARCH,
@@ -59,20 +64,35 @@ class BatchState:
 
 
 @dataclass(frozen=True, eq=False)
-class BatchResult:
+class Solved:
+    """The solutions of a step's equations, which its derivatives need.
+
+    Attributes
+    ----------
+    y : (B, U, 3) tensor
+        Configurations.
+    statuses : list of Status
+    """
+
+    y: Tensor
+    statuses: list[Status]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult(Solved):
     """Outcome of a step of B scenes.
 
     Attributes
     ----------
+    y, statuses
+        See `Solved`.
     state : BatchState
-    statuses : list of Status
     iterations, evaluations : (B,) int
     error_estimates : (B,)
         m; infinite where there is none.
     """
 
     state: BatchState
-    statuses: list[Status]
     iterations: NDArray[np.int64]
     evaluations: NDArray[np.int64]
     error_estimates: Array
@@ -131,10 +151,16 @@ class BatchStepper:
         self.device, self.dtype = torch.device(device), dtype
         self.cells = CellBatch(self.problems, self.device, dtype)
         self.objective = BatchObjective(self.cells, self.problems)
+        self._young, self._poisson = (
+            self.cells.tensor(padded(values, (self.cells.sizes.cells,)))
+            for values in (
+                [p.materials.young for p in self.problems],
+                [p.materials.poisson for p in self.problems],
+            )
+        )
         self.first_hessian = chosen(first_hessian, self.cells.sizes.nodes)
         self._storage, self._most, self._recover = storage, max_iterations, recover
-        self._loads = BatchLoads(self.cells, self.problems)
-        self._held = 1.0 - self.objective.free
+        self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
         self._clamped = self.cells.nodal([p.positions for p in self.problems])
         self._minimiser: BatchMinimiser | None = None
         self._inverse: DenseInverse | None = None
@@ -195,12 +221,40 @@ class BatchStepper:
     def _nodal(self, arrays: Sequence[Array]) -> Tensor:
         return self.cells.nodal(arrays)[:, : self.cells.sizes.nodes]
 
-    def _extended(self, nodal: Tensor) -> Tensor:
+    def extended(self, nodal: Tensor) -> Tensor:
         """(B, N, 3) as configurations (B, U, 3)."""
         n = self.cells.sizes
         if not n.modes:
             return nodal
         return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
+
+    # --- material --------------------------------------------------------------------------
+
+    @property
+    def material(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell, (B, C)."""
+        return self._young, self._poisson, self.objective.mass.density
+
+    def set_material(
+        self,
+        young: Tensor | None = None,
+        poisson: Tensor | None = None,
+        density: Tensor | None = None,
+    ) -> None:
+        """Other material values from now on, each (B, C) or what broadcasts to it.
+
+        First Hessians stay those of the problems: they are only preconditioners.
+        """
+        if young is not None:
+            self._young.copy_(young)
+        if poisson is not None:
+            self._poisson.copy_(poisson)
+        if young is not None or poisson is not None:
+            mu, lam = lame(self._young, self._poisson)  # type: ignore[type-var]
+            published = self.problems[0].scene.material.volume_weight == "published"
+            self.cells.set_weights(mu, lam if published else 3.0 * lam)
+        if density is not None:
+            self.objective.mass.set_density(density + torch.zeros_like(self._young))
 
     # --- a step ---------------------------------------------------------------------------
 
@@ -212,11 +266,12 @@ class BatchStepper:
         start = self._start(scheme, known)
         alive = torch.isfinite(start).all(dim=2).all(dim=1)
         minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
-        after = self._finish(scheme, known, minimiser.y, state)
+        y = minimiser.y.clone()  # the next step overwrites it
         phases = minimiser.phase.tolist()
         result = BatchResult(
-            after,
+            y,
             [_STATUSES[Phase(p)] for p in phases],
+            self._finish(scheme, known, y, state),
             minimiser.iterations.cpu().numpy(),
             minimiser.evaluations.cpu().numpy(),
             minimiser.estimate.to("cpu", torch.float64).numpy() * scheme.gain,
@@ -242,12 +297,12 @@ class BatchStepper:
         alpha = self.problems[0].scene.damping.mass
         factors = (objective.inertia, objective.damping)
         objective.inertia, objective.damping = scheme.inertia, scheme.rate * alpha
-        objective.target.copy_(self._extended(split(scheme.target, scheme.clamped_target)))
+        objective.target.copy_(self.extended(split(scheme.target, scheme.clamped_target)))
         if objective.damping:
-            objective.origin.copy_(self._extended(split(scheme.origin, scheme.clamped_origin)))
-        total = self._loads(state.times, scheme.loads_over, h, scheme.loads_at(known))
+            objective.origin.copy_(self.extended(split(scheme.origin, scheme.clamped_origin)))
+        total = self.loads(self.spans(scheme, state), scheme.loads_at(known))
         if forces is not None:
-            total = total + self._extended(forces.to(total))
+            total = total + self.extended(forces.to(total))
         objective.forces.copy_(total)
         if self._minimiser is None or factors != (objective.inertia, objective.damping):
             self._inverse = DenseInverse(
@@ -257,6 +312,11 @@ class BatchStepper:
             tolerance = self.cells.tensor(np.array(sizes))
             self._minimiser = BatchMinimiser(objective, self._inverse, tolerance, self._most)
         return scheme, known
+
+    def spans(self, scheme: Scheme, state: BatchState) -> list[tuple[float, float]]:
+        """Time intervals over which each scene's loads act in a step, s."""
+        first, last = scheme.loads_over
+        return [(t + first * self.time_step, t + last * self.time_step) for t in state.times]
 
     def _known(self, scheme: Scheme, state: BatchState) -> dict[str, Any]:
         h = self.time_step
@@ -287,14 +347,14 @@ class BatchStepper:
     def _start(self, scheme: Scheme, known: Mapping[str, Any]) -> Tensor:
         nodes = self.cells.sizes.nodes
         free = self.objective.free[:, :nodes] > 0.5
-        return self._extended(torch.where(free, scheme.start(known), scheme.clamped(known)))
+        return self.extended(torch.where(free, scheme.start(known), scheme.clamped(known)))
 
     def _finish(
         self, scheme: Scheme, known: dict[str, Any], y: Tensor, state: BatchState
     ) -> BatchState:
         nodes = self.cells.sizes.nodes
         free = self.objective.free[:, :nodes] > 0.5
-        known = {**known, "y": y[:, :nodes].clone()}  # the next step overwrites y
+        known = {**known, "y": y[:, :nodes]}
 
         def split(on_free: Linear, on_clamped: Linear | None) -> Tensor:
             values = on_free(known)
@@ -308,6 +368,25 @@ class BatchStepper:
         velocities = split(scheme.velocities, scheme.clamped_velocities)
         times = tuple(t + self.time_step for t in state.times)
         return BatchState(split(scheme.positions, None), velocities, times, memory)
+
+    def solve_adjoint(
+        self, y: Tensor, b: Tensor, which: Tensor, tolerance: float
+    ) -> BatchConjugateGradients:
+        """H x = b at configurations y, for the step that was prepared last.
+
+        For the scenes where ``which`` (B,) holds; b (B, U, 3) counts on free components.
+        """
+        assert self._inverse is not None
+        assert self._minimiser is not None
+        self._inverse.turn(y)
+        solver = self._minimiser.linear_solver
+        b = torch.where(by_scene(which), b * self.objective.free, 0.0)
+        y = torch.where(by_scene(which), y, self.cells.rest)
+        solver.solve(
+            y, b, None, which, tolerance=math.inf, residual_share=tolerance,
+            max_steps=_ADJOINT_STEPS,
+        )  # fmt: skip
+        return solver
 
     # --- scenes that did not converge -------------------------------------------------------
 
@@ -324,7 +403,7 @@ class BatchStepper:
             return result
         before, after = self.states(state), self.states(result.state)
         statuses, estimates = list(result.statuses), result.error_estimates.copy()
-        iterations = result.iterations.copy()
+        iterations, y = result.iterations.copy(), result.y.clone()
         for i in failed:
             found = self._alone(i, before[i], forces)
             if found is None:
@@ -334,11 +413,13 @@ class BatchStepper:
                 statuses[i] = Status.RECOVERED
             estimates[i] = found.error_estimate
             iterations[i] += found.iterations
+            y[i] = self._configuration(i, before[i], found.state)
         names = {n for s in after for n in s.memory}
         whole = [replace(s, memory={n: s.memory[n] for n in names if n in s.memory}) for s in after]
         return replace(
             result,
             state=self.state(whole),
+            y=y,
             statuses=statuses,
             iterations=iterations,
             error_estimates=estimates,
@@ -358,6 +439,14 @@ class BatchStepper:
         except PdcorrectError:
             return None
 
+    def _configuration(self, i: int, before: State, after: State) -> Tensor:
+        """The y of a scene that was stepped alone."""
+        scheme = self.integrate.scheme(before, self.time_step)
+        found = solution(scheme, before, after, self.problems[i])
+        rest = [p.extended(p.positions) for p in self.problems]
+        rest[i] = found
+        return self.cells.configurations(rest)[i]
+
     @property
     def inverse_bytes(self) -> int:
         """Memory of the inverses; 0 before the first step."""
@@ -374,7 +463,8 @@ def _check_problems(
         scene, other = problem.scene, first.scene
         pairs = [
             ("element", problem.element, first.element),
-            ("energy", problem.materials.model, first.materials.model),
+            ("material.energy", scene.material.energy, other.material.energy),
+            ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
             ("damping.mass", scene.damping.mass, other.damping.mass),
         ]
         if time_step is None:

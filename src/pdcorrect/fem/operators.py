@@ -120,23 +120,23 @@ class Space:
         per_point = np.broadcast_to(density[:, None], basis.dx.shape)
         return sp.csr_matrix(_density_product.assemble(basis, density=per_point))
 
-    def cell_products(self, a: Array, b: Array, rule: str) -> Array:
-        """Derivatives of a . M b by the cells' densities, (C,), for nodal fields (N, 3).
-
-        M by the rule of `mass_matrix`.
-        """
+    def cell_masses(self, rule: str) -> Array:
+        """Each cell's share of the mass matrix at density 1, (C, K, K), m3, by `mass_matrix`."""
         if rule == "per-node":
             share = self.volumes()[:, None] / np.bincount(self.cells.ravel())[self.cells]
-            return np.einsum("ck,cki,cki->c", share, a[self.cells], b[self.cells])
+            return share[:, :, None] * np.eye(self.cells.shape[1])
         basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
         values = np.stack([np.asarray(basis.basis[k][0])[0] for k in self._to_vtk])
-        x, y = (np.einsum("cki,kq->cqi", z[self.cells], values) for z in (a, b))
-        consistent = np.einsum("cq,cqi,cqi->c", basis.dx, x, y)
+        consistent = np.einsum("cq,kq,lq->ckl", basis.dx, values, values, optimize=True)
         if rule == "consistent":
             return consistent
-        nodal = np.einsum("cki,cki->ck", a[self.cells], b[self.cells])
-        diagonal = np.einsum("cq,kq,ck->c", basis.dx, values, nodal)
+        diagonal = consistent.sum(axis=2)[:, :, None] * np.eye(len(values))
         return diagonal if rule == "lumped" else 0.5 * (consistent + diagonal)
+
+    def cell_products(self, a: Array, b: Array, rule: str) -> Array:
+        """Derivatives of a . M b by the cells' densities, (C,), for nodal fields (N, 3)."""
+        masses = self.cell_masses(rule)
+        return np.einsum("cki,ckl,cli->c", a[self.cells], masses, b[self.cells], optimize=True)
 
     def volumes(self) -> Array:
         """Rest volume of each cell, (C,), m3."""

@@ -41,6 +41,7 @@ from pdcorrect.solvers.adjoint_terms import (
     mass_slope,
 )
 from pdcorrect.solvers.implicit import ImplicitStepper
+from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.linear import Linear
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.state import State, Status, StepResult
@@ -378,11 +379,8 @@ def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:
 def _solution(step: _Step, result: StepResult) -> Array:
     """The configuration y that the step's equation was solved for."""
     scheme = step.stepper.integrate.scheme(step.state, step.time_step)
-    row = scheme.positions.coefficients
-    rest = Linear(**{name: c for name, c in row.items() if name != "y"})
-    known = {"positions": step.state.positions}
     problem = step.stepper.problem
-    y = problem.relaxed((result.state.positions - rest(known)) / row["y"])
+    y = solution(scheme, step.state, result.state, problem)
     if problem.scene.damping.stiffness and problem.space.internal:
         y = _damped_modes(step.objective(), y)
     return y
