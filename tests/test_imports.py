@@ -73,6 +73,7 @@ ORDER = [
     "batch.energies",
     "batch.points",
     "batch.cells",
+    "batch.tall",
     "batch.inverses",
     "batch.objective",
     "batch.recording",

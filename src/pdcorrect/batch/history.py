@@ -47,8 +47,15 @@ class BatchHistory:
 
     def direction(self, x: Tensor) -> Tensor:
         """-H g (B, D) for the gradient that `append` was last given, with x = G^-1 g."""
-        w = _times(self._r_inverse, self._sg)
-        mixed = self._d * w + _times(self._yz, w) - self._zg
+        return self._product(self._sg, self._zg, x)
+
+    def improved(self, r: Tensor, x: Tensor) -> Tensor:
+        """H r (B, D) for any r, with x = G^-1 r: a better preconditioner than G."""
+        return -self._product(_times(self._S, r), _times(self._Z, r), x)
+
+    def _product(self, sg: Tensor, zg: Tensor, x: Tensor) -> Tensor:
+        w = _times(self._r_inverse, sg)
+        mixed = self._d * w + _times(self._yz, w) - zg
         back = _times(self._r_inverse.transpose(1, 2), mixed)
         out = torch.bmm(w[:, None], self._Z) - torch.bmm(back[:, None], self._S)
         return out[:, 0] - x

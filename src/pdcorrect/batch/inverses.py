@@ -23,6 +23,7 @@ from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
@@ -138,7 +139,8 @@ class DenseInverse:
             columns = r.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
         else:
             columns = r.permute(0, 3, 2, 1)
-        x = self._inverse @ columns
+        flat = tall_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
+        x = flat.reshape(count, self._axes, *flat.shape[1:])
         if self._width == 3:
             x = x.permute(0, 3, 1, 2).reshape(count, most, nodes, 3)
         elif self._axes == 1:

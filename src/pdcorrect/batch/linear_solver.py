@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.inverses import DenseInverse
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
 from pdcorrect.batch.recording import Recorder
 
@@ -31,9 +31,12 @@ class BatchConjugateGradients:
     """
 
     def __init__(
-        self, objective: BatchObjective, inverse: DenseInverse, recorder: Recorder
+        self,
+        objective: BatchObjective,
+        precondition: Callable[[Tensor], Tensor],
+        recorder: Recorder,
     ) -> None:
-        self._objective, self._inverse = objective, inverse
+        self._objective, self._precondition = objective, precondition
         rest = objective.cells.rest
         self.x, self._b, self._y, self._r, self._d = (torch.zeros_like(rest) for _ in range(5))
         self._y.copy_(rest)
@@ -104,7 +107,7 @@ class BatchConjugateGradients:
     def _set_up(self) -> None:
         self._tangent = self._objective.cells.linearise(self._y)
         self._r.copy_(self._b - self._product(self.x))
-        z = self._inverse(self._r)
+        z = self._precondition(self._r)
         self._d.copy_(z)
         self._r_z.copy_(dot(self._r, z))
         self._target.copy_(self._tolerance**2 * self._r_z)
@@ -126,7 +129,7 @@ class BatchConjugateGradients:
         change = by_scene(alpha) * self._d
         self.x.add_(torch.where(by_scene(active), change, 0.0))
         self._r.sub_(torch.where(by_scene(active), by_scene(alpha) * image, 0.0))
-        z = self._inverse(self._r)
+        z = self._precondition(self._r)
         r_z = torch.where(active, dot(self._r, z), self._r_z)
         ratio = torch.where(active, r_z / self._r_z, 0.0)
         self._d.copy_(torch.where(by_scene(active), z + by_scene(ratio) * self._d, self._d))

@@ -82,7 +82,7 @@ class BatchMinimiser:
         self._left = torch.zeros(2, dtype=torch.bool, device=rest.device)
         self._history = BatchHistory(scenes, _HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        self.linear_solver = BatchConjugateGradients(objective, inverse, recorder)
+        self.linear_solver = BatchConjugateGradients(objective, self._precondition, recorder)
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._chunk)
         self._judge = recorder(self._conclude)
@@ -100,6 +100,14 @@ class BatchMinimiser:
                 self._advance()
             else:
                 self._estimate()
+
+    def forget(self) -> None:
+        """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
+        self._history.clear(torch.ones_like(self._alive))
+
+    def _precondition(self, r: Tensor) -> Tensor:
+        x = self._inverse(r)
+        return self._history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
 
     # --- one iteration ------------------------------------------------------------------
 

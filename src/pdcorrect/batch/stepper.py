@@ -379,6 +379,7 @@ class BatchStepper:
         assert self._inverse is not None
         assert self._minimiser is not None
         self._inverse.turn(y)
+        self._minimiser.forget()
         solver = self._minimiser.linear_solver
         b = torch.where(by_scene(which), b * self.objective.free, 0.0)
         y = torch.where(by_scene(which), y, self.cells.rest)
