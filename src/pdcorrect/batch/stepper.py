@@ -132,7 +132,7 @@ class BatchStepper:
         tolerance: float | None = None,
         *,
         first_hessian: BatchHessian = "auto",
-        max_iterations: int = 300,
+        max_iterations: int = 1000,
         time_step: float | None = None,
         integrator: str | None = None,
         device: str | torch.device = "cpu",
