@@ -74,6 +74,8 @@ ORDER = [
     "batch.points",
     "batch.cells",
     "batch.tall",
+    "batch.sharing",
+    "batch.coarse",
     "batch.inverses",
     "batch.objective",
     "batch.recording",

@@ -7,37 +7,54 @@ single precision.  Scenes that share mesh, material, clamps and step share one.
 "G" is the thesis's global matrix (eq. 3-14), one scalar matrix for all coordinates;
 "G-scaled" the same with less volume weight; "rest" the true Hessian of the rest shape,
 turned with the body (`pdcorrect.solvers.first_hessian`), which has three unknowns a node
-and so nine times the entries.  Internal modes are eliminated cell by cell.
+and so nine times the entries; "two-level" is "G-scaled" with a correction from the coarse
+mesh (`CoarseCorrection`).  Internal modes are eliminated cell by cell.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.coarse import CoarseCorrection
 from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.tall import tall_product
-from pdcorrect.errors import ConvergenceError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
 
 Array = NDArray[np.float64]
 Factors = tuple[float, float]
-BatchHessian = Literal["auto", "G", "G-scaled", "rest"]
+BatchHessian = Literal["auto", "G", "G-scaled", "two-level", "rest"]
 
 
-def chosen(name: BatchHessian, unknowns: int) -> BatchHessian:
-    """What "auto" is for bodies of so many nodes."""
+def chosen(name: BatchHessian, problems: Sequence[Problem]) -> BatchHessian:
+    """What "auto" is for some problems.
+
+    Raises
+    ------
+    InputError
+        If there are no two levels.
+    """
+    refined = all(p.refine > 1 for p in problems)
+    if name == "two-level" and not refined:
+        raise InputError(
+            "first_hessian = 'two-level' for meshes that are not refined: expected refine of 2 "
+            "or more."
+        )
     if name != "auto":
         return name
-    return "rest" if unknowns <= LARGEST_REST else "G-scaled"
+    if max(len(p.positions) for p in problems) <= LARGEST_REST:
+        return "rest"
+    return "two-level" if refined else "G-scaled"
 
 
 LARGEST_REST = 1500
@@ -53,7 +70,7 @@ class DenseInverse:
     problems : sequence of Problem
     factors : (float, float)
         On mass (1/s2) and stiffness.
-    kind : {"G", "G-scaled", "rest"}
+    kind : {"G", "G-scaled", "two-level", "rest"}
     storage : torch.dtype
         Of the inverse.
 
@@ -73,7 +90,8 @@ class DenseInverse:
     ) -> None:
         self._cells, self.kind = cells, kind
         self._width = 3 if kind == "rest" else 1
-        distinct, owners = _distinct(problems)
+        self._sharing = Sharing(problems, cells.device)
+        distinct, owners = self._sharing.distinct, self._sharing.owners
         self._axes = 1
         if kind != "rest" and any((p.free != p.free[:, :1]).any() for p in problems):
             self._axes = 3
@@ -82,22 +100,27 @@ class DenseInverse:
         shape = (len(distinct), self._axes, size, size)
         self._inverse = torch.zeros(shape, dtype=storage, device=cells.device)
         self.bytes = self._inverse.numel() * self._inverse.element_size()
-        solved, inverted = [], []
+        solved, inverted, matrices = [], [], []
         for i, problem in enumerate(distinct):
             blocks = _node_blocks(problem, factors, kind)
             kept, inverse, coupling = _eliminated(blocks, problem.cells.shape[1] * self._width)
             solved.append(coupling)
             inverted.append(inverse)
             self._fill(i, problem, kept, factors[0])
+            if kind == "two-level":
+                matrices.append(_summed(problem, kept, factors[0]))
         if n.modes:
             modes = self._width * (n.width - problems[0].cells.shape[1])
             nodes = self._width * problems[0].cells.shape[1]
             owner = torch.as_tensor(owners, device=cells.device)
             self._solved = cells.tensor(padded(solved, (n.cells, modes, nodes)))[owner]
             self._mode_inverse = cells.tensor(padded(inverted, (n.cells, modes, modes)))[owner]
-        self._members = _members(owners, len(distinct), n.scenes, cells.device)
+        self._coarse: CoarseCorrection | None = None
+        if kind == "two-level":
+            self._coarse = CoarseCorrection(cells, distinct, matrices, factors, self._sharing)
+            self.bytes += self._coarse.bytes
         self._rotations: list[Tensor] = []
-        if kind == "rest":
+        if kind in ("rest", "two-level"):
             self._turning = _Turning(cells, problems)
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
@@ -105,20 +128,24 @@ class DenseInverse:
 
     def turn(self, y: Tensor) -> None:
         """Turn the rest Hessian to a configuration."""
-        if self.kind == "rest":
+        if self._rotations:
             for kept, new in zip(self._rotations, self._turning.since_rest(y), strict=True):
                 kept.copy_(new)
 
     def __call__(self, r: Tensor) -> Tensor:
         r = r * self._free
-        if self._rotations:
-            r = _rotated(transposed(self._rotations), r)
         n = self._cells.sizes
-        nodal = r if not n.modes else self._reduced(r)
-        x = self._product(nodal[:, : n.nodes])
+        turned = self.kind == "rest"
+        if turned:
+            r = _rotated(transposed(self._rotations), r)
+        nodal = (r if not n.modes else self._reduced(r))[:, : n.nodes]
+        x = self._product(nodal)
+        if self._coarse is not None:
+            R = [a[:, : n.nodes] for a in self._rotations]
+            x = x + _rotated(R, self._coarse(_rotated(transposed(R), nodal)))
         if n.modes:
             x = self._recovered(x, r)
-        if self._rotations:
+        if turned:
             x = _rotated(self._rotations, x)
         return x * self._free
 
@@ -126,19 +153,14 @@ class DenseInverse:
 
     def _product(self, r: Tensor) -> Tensor:
         """(B, N, 3) -> (B, N, 3), scenes with one inverse side by side."""
-        scenes, nodes, _ = r.shape
-        count, most = self._members.shape
-        r = r.to(self._inverse.dtype)
-        shared = count * most != scenes
-        if shared:
-            r = torch.cat([r, r.new_zeros(1, nodes, 3)])
-        r = r[self._members] if shared or most > 1 else r[:, None]
+        shared = self._sharing.gathered(r.to(self._inverse.dtype))
+        count, most, nodes, _ = shared.shape
         if self._width == 3:
-            columns = r.reshape(count, most, 1, 3 * nodes).permute(0, 2, 3, 1)
+            columns = shared.reshape(count, most, 1, 3 * nodes).permute(0, 2, 3, 1)
         elif self._axes == 1:
-            columns = r.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
+            columns = shared.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
         else:
-            columns = r.permute(0, 3, 2, 1)
+            columns = shared.permute(0, 3, 2, 1)
         flat = tall_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
         x = flat.reshape(count, self._axes, *flat.shape[1:])
         if self._width == 3:
@@ -147,12 +169,7 @@ class DenseInverse:
             x = x.reshape(count, nodes, most, 3).permute(0, 2, 1, 3)
         else:
             x = x.permute(0, 3, 2, 1)
-        x = x.to(self._cells.dtype)
-        if not shared and most == 1:
-            return x[:, 0]
-        out = x.new_zeros(scenes + 1, nodes, 3)
-        out[self._members] = x
-        return out[:scenes]
+        return self._sharing.scattered(x.to(self._cells.dtype))
 
     # --- internal modes ------------------------------------------------------------------
 
@@ -251,36 +268,6 @@ def _rotated(R: list[Tensor], x: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1)
 
 
-def _distinct(problems: Sequence[Problem]) -> tuple[list[Problem], list[int]]:
-    """Problems that differ in their matrix, and which of them each one is."""
-    seen: dict[bytes, int] = {}
-    distinct: list[Problem] = []
-    owners = []
-    for problem in problems:
-        digest = hashlib.blake2b()
-        materials, mass = problem.materials, problem.mass_matrix
-        for array in (
-            problem.positions, problem.cells, problem.free, materials.mu,
-            materials.volume_weight, mass.data, mass.indices,
-        ):  # fmt: skip
-            digest.update(np.ascontiguousarray(array).data)
-        key = digest.digest()
-        if key not in seen:
-            seen[key] = len(distinct)
-            distinct.append(problem)
-        owners.append(seen[key])
-    return distinct, owners
-
-
-def _members(owners: list[int], count: int, scenes: int, device: torch.device) -> Tensor:
-    """Scenes (K, m) that share each inverse, filled up with ``scenes``."""
-    lists: list[list[int]] = [[] for _ in range(count)]
-    for scene, owner in enumerate(owners):
-        lists[owner].append(scene)
-    most = max(map(len, lists))
-    return torch.tensor([row + [scenes] * (most - len(row)) for row in lists], device=device)
-
-
 def _node_blocks(problem: Problem, factors: Factors, kind: BatchHessian) -> Array:
     """Stiffness of each cell, (C, w L, w L), N/m."""
     if kind == "rest":
@@ -289,11 +276,19 @@ def _node_blocks(problem: Problem, factors: Factors, kind: BatchHessian) -> Arra
         count, width = blocks.shape[:2]
         return np.ascontiguousarray(blocks.swapaxes(2, 3)).reshape(count, 3 * width, 3 * width)
     weights, lanes = problem.point_weights, problem.quadrature.lanes
-    scale = VOLUME_SCALE if kind == "G-scaled" else 1.0
+    scale = 1.0 if kind == "G" else VOLUME_SCALE
     coefficient = factors[1] * (2.0 * weights[:, 0] + scale * weights[:, 1])
     rows = lanes.reshape(*lanes.shape[:2], -1)
     scaled = (lanes * coefficient[:, None, None, :]).reshape(rows.shape)
     return rows @ scaled.swapaxes(1, 2)
+
+
+def _summed(problem: Problem, blocks: Array, mass_factor: float) -> sp.csr_matrix:
+    """Scalar blocks of the cells (C, K, K) summed, with the mass, (N, N)."""
+    cells, width, size = problem.cells, problem.cells.shape[1], len(problem.positions)
+    places = (np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel())
+    matrix = sp.coo_matrix((blocks.ravel(), places), shape=(size, size))
+    return sp.csr_matrix(matrix + mass_factor * problem.mass_matrix)
 
 
 def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:

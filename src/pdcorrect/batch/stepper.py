@@ -110,8 +110,9 @@ class BatchStepper:
     problems : sequence of Problem
     tolerance : float, optional
         Of each scene's coarse cell size; the first scene's by default.
-    first_hessian : {"auto", "G", "G-scaled", "rest"}
-        See `DenseInverse`; "auto" is "rest" for small meshes.
+    first_hessian : {"auto", "G", "G-scaled", "two-level", "rest"}
+        See `DenseInverse`; "auto" is "rest" for small meshes and "two-level" for others
+        that are refined.
     max_iterations : int
     time_step, integrator : optional
         The first scene's by default.
@@ -158,7 +159,7 @@ class BatchStepper:
                 [p.materials.poisson for p in self.problems],
             )
         )
-        self.first_hessian = chosen(first_hessian, self.cells.sizes.nodes)
+        self.first_hessian = chosen(first_hessian, self.problems)
         self._storage, self._most, self._recover = storage, max_iterations, recover
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
         self._clamped = self.cells.nodal([p.positions for p in self.problems])

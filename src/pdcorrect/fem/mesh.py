@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -122,6 +123,45 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
     """
     if k == 1:
         return mesh
+    corner, weight, inverse = _lattice(mesh, k)
+    positions = np.einsum("nk,nki->ni", weight / k**3, mesh.positions[corner])
+
+    is_corner = weight.max(axis=1) == k**3
+    coarse_nodes = np.empty(len(mesh.positions), dtype=np.int64)
+    coarse_nodes[corner[is_corner].max(axis=1)] = np.flatnonzero(is_corner)
+    positions[coarse_nodes] = mesh.positions
+
+    small = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    local = np.ravel_multi_index(
+        tuple(np.moveaxis(small[:, None] + VTK_CORNERS, -1, 0)), (k + 1,) * 3
+    )  # (k^3, 8)
+    cells = inverse[:, local].reshape(-1, 8)
+    return HexMesh(
+        positions,
+        np.ascontiguousarray(cells, dtype=np.int64),
+        coarse_nodes[mesh.coarse_nodes],
+    )
+
+
+def interpolation(mesh: HexMesh, k: int) -> sp.csr_matrix:
+    """Trilinear interpolation from a mesh's nodes to those of ``refine(mesh, k)``, (N, N_c)."""
+    if k == 1:
+        return sp.eye_array(len(mesh.positions)).tocsr()
+    corner, weight, _ = _lattice(mesh, k)
+    rows, columns = np.nonzero(weight)
+    values = weight[rows, columns] / k**3
+    shape = (len(weight), len(mesh.positions))
+    return sp.csr_matrix((values, (rows, corner[rows, columns])), shape=shape)
+
+
+def _lattice(
+    mesh: HexMesh, k: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Points of a k x k x k cutting of all cells, each once.
+
+    Corners (N, 8) that a point depends on, its integer weights on them (N, 8), which sum
+    to k^3, and the point at each place of each cell's lattice, (C, (k + 1)^3).
+    """
     steps = np.arange(k + 1)
     lattice = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     factors = np.where(VTK_CORNERS[None] == 1, lattice[:, None], k - lattice[:, None])
@@ -140,24 +180,7 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
         return_index=True,
         return_inverse=True,
     )
-    point_corner, point_weight = corner[first], weight[first]
-    positions = np.einsum("nk,nki->ni", point_weight / k**3, mesh.positions[point_corner])
-
-    is_corner = point_weight.max(axis=1) == k**3
-    coarse_nodes = np.empty(len(mesh.positions), dtype=np.int64)
-    coarse_nodes[point_corner[is_corner].max(axis=1)] = np.flatnonzero(is_corner)
-    positions[coarse_nodes] = mesh.positions
-
-    small = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    local = np.ravel_multi_index(
-        tuple(np.moveaxis(small[:, None] + VTK_CORNERS, -1, 0)), (k + 1,) * 3
-    )  # (k^3, 8)
-    cells = inverse.reshape(count, -1)[:, local].reshape(-1, 8)
-    return HexMesh(
-        positions,
-        np.ascontiguousarray(cells, dtype=np.int64),
-        coarse_nodes[mesh.coarse_nodes],
-    )
+    return corner[first], weight[first], inverse.reshape(count, -1)
 
 
 def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

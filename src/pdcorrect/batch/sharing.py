@@ -1,0 +1,71 @@
+"""Scenes of a batch that share a matrix."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pdcorrect.fem.problem import Problem
+
+
+class Sharing:
+    """Which scenes have the same mesh, material and clamps.
+
+    Attributes
+    ----------
+    distinct : list of Problem
+        One of each kind.
+    owners : list of int
+        Which of them each scene is.
+    """
+
+    def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
+        seen: dict[bytes, int] = {}
+        self.distinct: list[Problem] = []
+        self.owners: list[int] = []
+        for problem in problems:
+            key = _key(problem)
+            if key not in seen:
+                seen[key] = len(self.distinct)
+                self.distinct.append(problem)
+            self.owners.append(seen[key])
+        members: list[list[int]] = [[] for _ in self.distinct]
+        for scene, owner in enumerate(self.owners):
+            members[owner].append(scene)
+        most = max(map(len, members))
+        self._scenes = len(problems)
+        filled = [row + [self._scenes] * (most - len(row)) for row in members]
+        self._members = torch.tensor(filled, device=device)
+        self._alone = most == 1
+        self._full = len(members) * most == self._scenes
+
+    def gathered(self, x: Tensor) -> Tensor:
+        """(B, ...) -> (K, m, ...): side by side what shares a matrix, filled up with zeros."""
+        if self._alone:
+            return x[:, None]
+        if not self._full:
+            x = torch.cat([x, x.new_zeros(1, *x.shape[1:])])
+        return x[self._members]
+
+    def scattered(self, x: Tensor) -> Tensor:
+        """The reverse of `gathered`."""
+        if self._alone:
+            return x[:, 0]
+        out = x.new_zeros(self._scenes + 1, *x.shape[2:])
+        out[self._members] = x
+        return out[: self._scenes]
+
+
+def _key(problem: Problem) -> bytes:
+    digest = hashlib.blake2b()
+    materials, mass = problem.materials, problem.mass_matrix
+    for array in (
+        problem.positions, problem.cells, problem.free, materials.mu, materials.volume_weight,
+        mass.data, mass.indices,
+    ):  # fmt: skip
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
