@@ -23,7 +23,7 @@ from pdcorrect.batch.recording import Recorder
 from pdcorrect.solvers.lbfgs import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
 
 _ROUND_OFF = {torch.float64: 1e-13, torch.float32: 1e-5}
-_HISTORY = 12
+HISTORY = 12
 _CHUNK = 2
 """Iterations between two looks at the scenes' progress."""
 _CG_STEPS = 60
@@ -80,7 +80,7 @@ class BatchMinimiser:
         self.phase, self.iterations, self.evaluations, self._tried = counters
         self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
         self._left = torch.zeros(2, dtype=torch.bool, device=rest.device)
-        self._history = BatchHistory(scenes, _HISTORY, rest[0].numel(), rest)
+        self._history = BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
         self.linear_solver = BatchConjugateGradients(objective, self._precondition, recorder)
         self._begin = recorder(self._set_up)

@@ -16,7 +16,7 @@ from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
-from pdcorrect.batch.minimise import BatchMinimiser, Phase
+from pdcorrect.batch.minimise import HISTORY, BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.errors import InputError, PdcorrectError
 from pdcorrect.fem.problem import Problem
@@ -32,6 +32,8 @@ Array = NDArray[np.float64]
 
 _ADJOINT_STEPS = 400
 """Of conjugate gradients."""
+_VECTORS, _NUMBERS_A_POINT = 40, 150
+"""Of working memory."""
 _STATUSES = {
     Phase.CONVERGED: Status.CONVERGED,
     Phase.LINE_SEARCH: Status.LINE_SEARCH,
@@ -453,6 +455,19 @@ class BatchStepper:
     def inverse_bytes(self) -> int:
         """Memory of the inverses; 0 before the first step."""
         return 0 if self._inverse is None else self._inverse.bytes
+
+    @property
+    def expected_bytes(self) -> int:
+        """Expected peak memory of steps and derivatives on the device.
+
+        The inverses, 4 (w N)^2 bytes for each distinct one of N nodes with w = 3 for "rest"
+        and 1 otherwise; what is known of each node and mode (24 vectors of L-BFGS and about
+        40 others); and of each quadrature point (about 150 numbers).
+        """
+        n, size = self.cells.sizes, torch.finfo(self.dtype).bits // 8
+        nodal = n.scenes * n.unknowns * 3 * (2 * HISTORY + _VECTORS)
+        points = n.scenes * n.cells * n.points * _NUMBERS_A_POINT
+        return self.inverse_bytes + size * (nodal + points)
 
 
 def _check_problems(

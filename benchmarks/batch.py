@@ -1,0 +1,202 @@
+"""Batches of scenes on one device: steps and derivatives a second, memory, scaling.
+
+    python benchmarks/batch.py [cuda|cpu] [results.json]
+
+Cross-shaped bodies of one size, each with its own Young's modulus and gravity (so none
+share a first Hessian, unless said so), to 1e-4 of the coarse cell size, float64, after
+four steps from rest.  Times are the median of five steps, or of five derivatives.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import pdcorrect as pc
+from pdcorrect.environment import environment
+
+COARSE, FINE = (16, 7), (12, 5)
+"""Cells along the body and along its arms: 405 coarse nodes, 10 449 fine ones."""
+
+
+def scene(seed: int, shape: tuple[int, int], shared: bool) -> pc.Scene:
+    """A cross with four arms, clamped at one end."""
+    rng = np.random.default_rng(seed)
+    young = 2e5 if shared else float(rng.uniform(1.5e5, 4e5))
+    return pc.Scene(
+        body={
+            "shape": "cross", "cells": [shape[0], 2, 2], "cell_size": 0.05, "arms": 4,
+            "arm_start": 5, "arm_width": 2, "arm_length": shape[1],
+        },
+        material={"young": young, "poisson": 0.35, "density": 1e3},
+        time={"step": 0.01, "frames": 10},
+        clamps=[{"region": {"plane": "x", "at": 0.0}}],
+        loads=[{"kind": "gravity", "acceleration": rng.uniform(-15, 15, 3).tolist()}],
+    )  # fmt: skip
+
+
+def measure(
+    count: int,
+    shape: tuple[int, int],
+    refine: int,
+    device: str,
+    first_hessian: str = "auto",
+    shared: bool = False,
+) -> dict[str, Any]:
+    """One batch: times of a step and of its derivative, and what memory they take."""
+    if device == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+    problems = [pc.discretise(scene(i, shape, shared), refine=refine) for i in range(count)]
+    stepper = pc.BatchStepper(
+        problems, 1e-4, first_hessian=first_hessian, device=device, recover=False
+    )
+    started = time.perf_counter()
+    result = stepper(stepper.rest_state())
+    prepared = synchronised(device) - started
+    for _ in range(3):
+        result = stepper(result.state)
+    step_s, iterations = [], []
+    for _ in range(5):
+        before = result.state
+        started = synchronised(device)
+        result = stepper(before)
+        step_s.append(synchronised(device) - started)
+        iterations.append(float(result.iterations.mean()))
+    gradient = torch.ones_like(before.positions)
+    found: list[pc.BatchGradients] = []
+
+    def backward() -> None:
+        found[:] = [pc.BatchGradients(stepper, before, result, gradient, tolerance=1e-4)]
+
+    backward_s = median(backward, device)
+    sizes, step = stepper.cells.sizes, statistics.median(step_s)
+    row = {
+        "scenes": count,
+        "nodes": sizes.nodes,
+        "cells": sizes.cells,
+        "first_hessian": stepper.first_hessian,
+        "sharing": shared,
+        "converged": all(s is pc.Status.CONVERGED for s in result.statuses),
+        "largest_error_estimate_of_a_cell": float(
+            max(result.error_estimates) / problems[0].cell_size
+        ),
+        "prepare_and_first_step_s": prepared,
+        "step_ms": 1e3 * step,
+        "step_ms_a_scene": 1e3 * step / count,
+        "iterations": statistics.mean(iterations),
+        "scene_steps_a_second": count / step,
+        "backward_ms": 1e3 * backward_s,
+        "backward_solved": bool(found[0].ok.all()),
+        "forward_and_backward_a_second": count / (step + backward_s),
+    }
+    if device == "cuda":
+        row["memory_bytes"] = torch.cuda.max_memory_allocated()
+        row["memory_by_formula"] = stepper.expected_bytes
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def one_at_a_time(shape: tuple[int, int], refine: int) -> dict[str, Any]:
+    """The same scene on the CPU by `ProjectiveDynamics`."""
+    problem = pc.discretise(scene(0, shape, False), refine=refine)
+    stepper = pc.ProjectiveDynamics(problem, 1e-4).prepare()
+    state = problem.rest_state()
+    for _ in range(4):
+        state = stepper(state).state
+    step_s = median(lambda: stepper(state), "cpu")
+    result = stepper(state)
+    g = np.ones_like(state.positions)
+    back_s = median(lambda: pc.adjoint(stepper, state, result, g, tolerance=1e-4).positions, "cpu")
+    row = {
+        "nodes": len(problem.positions),
+        "step_ms": 1e3 * step_s,
+        "backward_ms": 1e3 * back_s,
+        "iterations": result.iterations,
+    }
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def newton_bound(count: int = 256) -> dict[str, Any]:
+    """Newton's share in factorisations alone, if each step factorised dense Hessians.
+
+    A lower bound of a batched Newton step for the coarse scenes.
+    """
+    problem = pc.discretise(scene(0, COARSE, False))
+    newton, state = pc.Newton(problem, 1e-4), problem.rest_state()
+    for _ in range(4):
+        state = newton(state).state
+    iterations = newton(state).iterations
+    size = 3 * int(problem.free.all(axis=1).sum())
+    H = torch.eye(size, dtype=torch.float64, device="cuda").expand(count, -1, -1).clone()
+    seconds = median(lambda: torch.linalg.cholesky_ex(H), "cuda")
+    row = {
+        "scenes": count,
+        "unknowns": size,
+        "newton_iterations": iterations,
+        "factorisation_ms": 1e3 * seconds,
+        "least_step_ms": 1e3 * seconds * iterations,
+    }
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def synchronised(device: str) -> float:
+    """The time when all work is done."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def median(function: Callable[[], Any], device: str, runs: int = 5) -> float:
+    """Of several runs, s, after one that does not count."""
+    function()
+    taken = []
+    for _ in range(runs):
+        started = synchronised(device)
+        function()
+        taken.append(synchronised(device) - started)
+    return statistics.median(taken)
+
+
+def main() -> None:
+    """Measure and write JSON."""
+    device = sys.argv[1] if len(sys.argv) > 1 else "cpu"
+    gpu = device == "cuda"
+    coarse = (1, 4, 16, 64, 256, 1024) if gpu else (1, 4, 16)
+    fine = (1, 2, 4, 8, 16) if gpu else (1,)
+    record: dict[str, Any] = {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": f"python benchmarks/batch.py {device}",
+        "environment": {
+            **environment(),
+            "torch": torch.__version__,
+            "device": torch.cuda.get_device_name() if gpu else "CPU",
+            "torch threads": torch.get_num_threads(),
+        },
+        "coarse": [measure(n, COARSE, 1, device) for n in coarse],
+        "fine": [measure(n, FINE, 4, device) for n in fine],
+        "one at a time, CPU": [one_at_a_time(COARSE, 1), one_at_a_time(FINE, 4)],
+    }
+    if gpu:
+        record["fine, other first Hessians"] = [
+            measure(8, FINE, 4, device, "G-scaled"),
+            measure(8, FINE, 4, device, "two-level", shared=True),
+        ]
+        record["newton"] = newton_bound()
+    path = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("batch.json")
+    path.write_text(json.dumps(record, indent=2) + "\n")
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()
