@@ -9,6 +9,7 @@ four steps from rest.  Times are the median of five steps, or of five derivative
 
 from __future__ import annotations
 
+import gc
 import json
 import statistics
 import sys
@@ -53,6 +54,7 @@ def measure(
 ) -> dict[str, Any]:
     """One batch: times of a step and of its derivative, and what memory they take."""
     if device == "cuda":
+        gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     problems = [pc.discretise(scene(i, shape, shared), refine=refine) for i in range(count)]

@@ -151,8 +151,8 @@ class BatchStepper:
         self.time_step = first.time_step if time_step is None else float(time_step)
         self.integrator = time.integrator if integrator is None else integrator
         self.integrate = make_integrator(self.integrator, time.spectral_radius)
-        self.device, self.dtype = torch.device(device), dtype
-        self.cells = CellBatch(self.problems, self.device, dtype)
+        self.cells = CellBatch(self.problems, torch.device(device), dtype)
+        self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
         self.objective = BatchObjective(self.cells, self.problems)
         self._young, self._poisson = (
             self.cells.tensor(padded(values, (self.cells.sizes.cells,)))
