@@ -211,6 +211,37 @@ def growth(refine: str, method: str, body: str = "beam") -> dict[str, Any]:
     }
 
 
+def adjoint(length: str, refine: str, rules: str = "diffpd") -> list[dict[str, Any]]:
+    """Seconds of a step to the default tolerance and of its derivative."""
+    problem = pc.discretise(beam(int(length), rules), refine=int(refine))
+    stepper = pc.ProjectiveDynamics(problem, 1e-5).prepare()
+    state = pc.rollout(stepper, 5).state()
+    result = stepper(state)
+    gradient = np.random.default_rng(0).normal(size=state.positions.shape)
+    forward = best(lambda: stepper(state), runs=7)
+    rows = []
+    for tolerance in (1e-4, 1e-6, 1e-10):
+
+        def backward(tolerance: float = tolerance) -> Any:
+            found = pc.adjoint(stepper, state, result, gradient, tolerance=tolerance)
+            return found, found.positions, found.velocities
+
+        found = backward()[0]
+        rows.append(
+            {
+                "nodes": len(problem.positions),
+                "rules": rules,
+                "tolerance": tolerance,
+                "forward_ms": 1e3 * forward,
+                "forward_iterations": result.iterations,
+                "backward_ms": 1e3 * best(backward, runs=7),
+                "backward_iterations": found.iterations,
+                "residual": found.residual,
+            }
+        )
+    return rows
+
+
 def tangents(length: str, refine: str) -> dict[str, Any]:
     """Seconds of factorising and solving with a tangent: band against cholespy."""
     import scipy.sparse as sp

@@ -140,6 +140,16 @@ def powers(rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
     return out
 
 
+def adjoint() -> list[dict[str, Any]]:
+    """A step and its derivative, one and two threads."""
+    rows = []
+    for length, refine in SIZES:
+        for threads in (1, 2):
+            for row in measure(threads, "adjoint", length=length, refine=refine):
+                rows.append({"threads": threads, **row})
+    return rows
+
+
 def first_guesses() -> list[dict[str, Any]]:
     """Mean iterations of a step by where it starts, with the rest shape's turned Hessian.
 
@@ -177,4 +187,5 @@ CASES: dict[str, Callable[[], Any]] = {
     "tangent_factors": tangent_factors,
     "growth": growth,
     "first_guesses": first_guesses,
+    "adjoint": adjoint,
 }

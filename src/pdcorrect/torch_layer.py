@@ -62,7 +62,7 @@ class PDLayer(nn.Module):
         *,
         mode: Mode = "unrolled",
         on_failure: OnFailure = "raise",
-        tolerance: float = 1e-8,
+        tolerance: float = 1e-6,
     ) -> None:
         super().__init__()
         if mode not in ("unrolled", "checkpointed", "detached"):

@@ -54,7 +54,7 @@ class BatchGradients:
         *,
         grad_memory: Mapping[str, Tensor] | None = None,
         forces: Tensor | None = None,
-        tolerance: float = 1e-8,
+        tolerance: float = 1e-6,
     ) -> None:
         self._stepper, self._before, self._y = stepper, before, result.y
         self._after = {

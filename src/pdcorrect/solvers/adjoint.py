@@ -40,7 +40,7 @@ from pdcorrect.solvers.adjoint_terms import (
     gravity_slope,
     mass_slope,
 )
-from pdcorrect.solvers.implicit import ImplicitStepper
+from pdcorrect.solvers.implicit import ImplicitStepper, quiet_blas
 from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.linear import Linear
 from pdcorrect.solvers.step import StepObjective
@@ -311,7 +311,7 @@ def adjoint(
     forces: Array | None = None,
     time_step: float | None = None,
     solver: AdjointSolver = "auto",
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-6,
 ) -> Gradients:
     """Derivatives of a loss by the inputs of the step ``result = stepper(state)``.
 
@@ -333,7 +333,8 @@ def adjoint(
     solver : {"auto", "cg", "direct", "fixed-point"}
         Of the linear system, see `solve_adjoint`.
     tolerance : float
-        Of its residual, relative.
+        Of its residual, relative.  The default suits steps solved to the default
+        tolerance; for gradients of steps that were solved closely it may be 1e-12.
 
     Returns
     -------
@@ -362,7 +363,8 @@ def adjoint(
     checked = {name: _gradient(f"grad_{name}", g, shape) for name, g in after.items()}
     h = stepper.time_step if time_step is None else float(time_step)
     step = _Step(stepper, state, forces, h, solver, tolerance)
-    return Gradients(step, checked, _solution(step, result))
+    with quiet_blas():
+        return Gradients(step, checked, _solution(step, result))
 
 
 def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:

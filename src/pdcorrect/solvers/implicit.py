@@ -124,7 +124,7 @@ class ImplicitStepper:
         _positive("time_step", h)
         if h != self.time_step:  # several-step integrators need equal steps
             state = replace(state, memory={})
-        with _quiet_blas():
+        with quiet_blas():
             return self._step(state, forces, h)
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
@@ -138,7 +138,7 @@ class ImplicitStepper:
 
     def prepare(self) -> Self:
         """Factorise and load the kernels now, so that the first step is like the others."""
-        with _quiet_blas():
+        with quiet_blas():
             rest = self.problem.rest_state()
             objective = self.objective(rest, None, self.time_step)
             objective.value_and_gradient(objective.start)
@@ -322,7 +322,7 @@ def _threadpools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _quiet_blas() -> AbstractContextManager[Any]:
+def quiet_blas() -> AbstractContextManager[Any]:
     """BLAS on one thread: idle BLAS threads spin and take the kernels' cores.
 
     The products here are too small to gain from threads (``benchmarks``, case
