@@ -14,7 +14,7 @@ from pdcorrect.fem.factorisation import NotPositiveDefinite, choose_backend, fac
 from pdcorrect.fem.multigrid import Multigrid, rigid_motions
 from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.newton import _IterativeSteps
-from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.step import StepObjective, global_backend
 from pdcorrect.solvers.tangent_solver import TangentFactory
 
 BACKENDS = ["cholespy", "splu", "amg"]
@@ -191,3 +191,46 @@ def test_the_linear_solver_follows_size_and_back_end():
     assert pc.Newton(problem, backend="amg").linear_solver == "cg"
     with pytest.raises(InputError, match="expected 'auto', 'direct' or 'cg'"):
         pc.Newton(problem, linear_solver="magic")
+
+
+@pytest.mark.parametrize(
+    ("cells", "nodes", "expected"),
+    [
+        ((171, 16, 16), 49_708, "cholespy"),
+        ((18, 18, 18), 6_859, "amg"),
+        ((12, 12, 12), 2_197, "cholespy"),
+    ],
+    ids=["slender beam", "block", "small block"],
+)
+def test_the_global_matrix_of_a_slender_body_is_factorised_and_of_a_block_not(
+    cells, nodes, expected
+):
+    problem = pc.discretise(beam(cells))
+    assert len(problem.positions) == nodes
+    assert global_backend(problem) == expected
+
+
+def test_elements_for_which_multigrid_is_slow_are_factorised_up_to_a_size():
+    for element in ("hex27", "hex8-bubble"):
+        problem = pc.discretise(
+            beam((10, 10, 10)), refine=1 if element == "hex27" else 2, element=element
+        )
+        assert problem.band_order.bandwidth > factorisation.LARGEST_BANDWIDTH
+        assert global_backend(problem) == "cholespy"
+
+
+def test_a_thin_factor_is_expected_to_fit_where_a_compact_one_is_not():
+    assert choose_backend(90_000, memory=1e9) == "amg"
+    assert choose_backend(90_000, memory=1e9, bandwidth=300) == "cholespy"
+    assert choose_backend(900_000, memory=1e9, bandwidth=300) == "amg"
+
+
+def test_a_block_steps_by_multigrid_without_being_told():
+    problem = pc.discretise(beam((18, 18, 18)))
+    chosen = pc.ProjectiveDynamics(problem, 1e-6, first_hessian="G")
+    factorised = pc.ProjectiveDynamics(problem, 1e-6, first_hessian="G", backend="cholespy")
+    assert chosen.describe()["factorisation"] == "amg"
+    results = [stepper(problem.rest_state()) for stepper in (chosen, factorised)]
+    moved = [result.state.positions for result in results]
+    assert all(result.status is pc.Status.CONVERGED for result in results)
+    np.testing.assert_allclose(*moved, rtol=0, atol=2e-6 * problem.cell_size)

@@ -324,6 +324,16 @@ def test_energy_curves(run, tmp_path, monkeypatch):
         figures.plot_energy(dataclasses.replace(run, stats={}), tmp_path / "a.png", labels=["a"])
 
 
+def test_energy_curves_show_the_loss_to_damping_where_there_is_any(run, tmp_path, monkeypatch):
+    seen = caught_lines(monkeypatch)
+    figures.plot_energy(run, tmp_path / "a.png", labels=["a"])
+    assert len(seen) == 3
+    damped = {**run.stats, "damping_loss": np.full(len(run), 0.5)}
+    figures.plot_energy(dataclasses.replace(run, stats=damped), tmp_path / "b.png", labels=["a"])
+    assert "damping" in seen[-1][0]
+    np.testing.assert_allclose(seen[-1][3], 0.5 * np.arange(1, 1 + len(run)))
+
+
 def test_error_curves(run, tmp_path, monkeypatch):
     seen = caught_lines(monkeypatch)
     errors = {"one": np.linspace(0, 0.002, 7), "two": np.linspace(0, 0.001, 7)}

@@ -120,6 +120,16 @@ def changed(old, new):
         (changed("name = ", "self = 1\nname = "), ["self: unknown key"]),
         (changed("name = ", "__source__ = 1\nname = "), ["__source__: unknown key"]),
         (changed("kind = ", "window = [-2, -1]\nkind = "), ["ends after time 0"]),
+        (
+            changed("young = 1.0e6", "yung = 1.0e6"),
+            ["material.yung: unknown key; did you mean young?"],
+        ),
+        (changed("[solver]", "[dampings]\nmass = 1.0\n\n[solver]"), ["did you mean damping?"]),
+        (
+            changed('"gravity"', '"gravty"'),
+            ["loads[0].kind = 'gravty': expected one of 'gravity',"],
+        ),
+        (changed('kind = "gravity"\n', ""), ["loads[0].kind: missing"]),
     ],
 )
 def test_wrong_scenes_are_refused_in_one_paragraph(text, words):

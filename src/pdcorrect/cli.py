@@ -275,9 +275,16 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     _say(
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
-        f"over the run {stats['external_work'].sum():.4g} J"
+        f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
     )
     _say(inverted_frames(stats, problem.time_step) or "")
+
+
+def _other_work(stats: dict[str, Any]) -> str:
+    """Work of moving clamps and loss to damping over a run, where there is any."""
+    named = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
+    sums = {text: stats[name].sum() for name, text in named.items() if stats[name].any()}
+    return "".join(f", {text} {total:.4g} J" for text, total in sums.items())
 
 
 def _progress(hidden: bool = False) -> Any:

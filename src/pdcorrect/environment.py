@@ -112,7 +112,8 @@ def _factorisations() -> list[Check]:
         except ImportError as error:
             remedy = f"missing ({error}); pip install {backend.replace('amg', 'pyamg')}"
             checks.append(Check(f"factorisation {backend}", remedy, backend == "amg"))
-    checks.append(Check("factorisation used for G", choose_backend(10)))
+    direct = choose_backend(10)
+    checks.append(Check("factorisation of G", f"{direct}; amg for large compact meshes"))
     return checks
 
 

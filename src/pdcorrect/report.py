@@ -63,9 +63,9 @@ def notes(comparison: Comparison) -> list[str]:
         f"{1e3 * moved:.3g} mm. Errors (RMS, worst) are distances of the coarse nodes from the "
         f"reference, {comparison.reference}, with the same time step, over all frames. Times and "
         "iterations are for one frame.",
-        f"Material: E = {scene.material.young:g} Pa and Poisson's ratio "
+        f"Material: E = {scene.material.young:.6g} Pa and Poisson's ratio "
         f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
-        f"E = {effective.young:.4g} Pa and {effective.poisson:.4g} "
+        f"E = {effective.young:.6g} Pa and {effective.poisson:.4g} "
         f"(volume weight '{scene.material.volume_weight}').",
         f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
         "Newton. "

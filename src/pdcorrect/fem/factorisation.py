@@ -2,7 +2,7 @@
 
 Back ends: cholespy (CHOLMOD), SciPy's `splu` with a symmetric ordering where
 cholespy is missing, and conjugate gradients preconditioned by algebraic
-multigrid (pyamg) where a factor would not fit into memory.
+multigrid (pyamg) where a factor would fill too much.
 """
 
 from __future__ import annotations
@@ -33,8 +33,14 @@ _AMG_STEPS = 500
 LARGEST_DIRECT = 100_000
 """Rows of G, or nodes of a tangent, above which multigrid takes over.
 
-At 180 000 nodes a step takes less time with it, and the preparation 2 s instead of 37 s; at
-56 000 nodes a step takes more (``benchmarks``, case growth).
+For a matrix of which no more than the size is known: a slender beam's step takes less time
+with multigrid at 180 000 nodes, and more at 56 000 (``benchmarks``, case growth).
+"""
+LARGEST_BANDWIDTH = 1000
+"""Unknowns of a `BandOrder`'s half bandwidth above which multigrid takes over for G.
+
+Size alone does not decide: a step takes less time with multigrid for a block of 6 859 nodes
+(1 085), and more for a block of 2 197 (509) and a beam of 55 777 (923; case growth).
 """
 MEMORY_SHARE = 0.5
 """Share of the machine's memory that a factor may be expected to take."""
@@ -182,9 +188,9 @@ def factorise(
     ----------
     matrix : (n, n) sparse
     backend : {"auto", "cholespy", "splu", "amg"}
-        "auto" takes a direct factor where it is expected to fit into memory
-        (cholespy if installed), otherwise multigrid; so does "band", which is a
-        choice for tangents only (`BandOrder`).
+        "auto" takes what `choose_backend` does by the size: a direct factor
+        (cholespy if installed), or multigrid; so does "band", which is a choice
+        for tangents only (`BandOrder`).
     unknowns : int
         For each node: 1 for G, 3 for a tangent.
     near_nullspace : (n, k), optional
@@ -214,13 +220,23 @@ def check_backend(backend: str) -> None:
         raise InputError(f"backend {backend!r}: expected {', '.join(names)}.")
 
 
-def choose_backend(size: int, unknowns: int = 1, memory: float | None = None) -> Backend:
+def choose_backend(
+    size: int, unknowns: int = 1, memory: float | None = None, bandwidth: int | None = None
+) -> Backend:
     """The back end for a matrix of ``size`` rows.
 
-    ``memory`` (bytes) defaults to the machine's.
+    ``memory`` (bytes) defaults to the machine's.  ``bandwidth``, where it is known, is the
+    half bandwidth of the best `BandOrder` (three unknowns a node); it then decides instead
+    of the size.
     """
     memory = total_memory() if memory is None else memory
-    if factor_bytes(size, unknowns) > MEMORY_SHARE * memory or size > unknowns * LARGEST_DIRECT:
+    needed = factor_bytes(size, unknowns)
+    if bandwidth is None:
+        slow = size > unknowns * LARGEST_DIRECT
+    else:
+        slow = bandwidth > LARGEST_BANDWIDTH
+        needed = min(needed, 12.0 * size * unknowns * bandwidth / 3)  # it fills no more
+    if slow or needed > MEMORY_SHARE * memory:
         return "amg"
     return "cholespy" if importlib.util.find_spec("cholespy") else "splu"
 

@@ -99,12 +99,12 @@ def check_cells(
     if smallest.min() > 0:
         return
     cell = int(np.argmin(smallest))
-    where = points[np.argmin(jacobian[cell])]
+    where = np.round(points[np.argmin(jacobian[cell])], 3).tolist()
     bad = int((smallest <= 0).sum())
     text = (
         f"cell {cell} around {_centre(positions, cells, cell)} is inverted or flat (smallest "
-        f"Jacobian {smallest[cell]:.3g} m3, at the point {where} of the unit cell): expected VTK "
-        "node order and a convex cell."
+        f"Jacobian {smallest[cell]:.3g} m3, at {where} of the unit cell): expected VTK node "
+        "order and a convex cell."
     )
     if 2 * bad > len(cells):
         text += (

@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, SceneError
+from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
@@ -124,6 +125,11 @@ class Problem(ElasticBody):
         """Components that may move of a configuration, (N + B, 3); modes always may."""
         modes = np.ones((self.space.internal, 3), dtype=bool)
         return np.concatenate([self.free, modes])
+
+    @cached_property
+    def band_order(self) -> BandOrder:
+        """An order of the nodes' free components in which cells couple near neighbours."""
+        return BandOrder(self.positions, self.cells, self.free)
 
     def global_matrix(self, time_step: float, volume_scale: float = 1.0) -> sp.csr_matrix:
         """G of eq. 3-14: M/h^2 + sum (2 mu + omega) w D^T D, (N + B, N + B), N/m.

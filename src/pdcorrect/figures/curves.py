@@ -22,6 +22,8 @@ _ENERGIES = {
     "kinetic_energy": "kinetic [J]",
     "external_work": "work of the loads [J]",
 }
+_OTHER_WORK = {"clamp_work": "work of the clamps [J]", "damping_loss": "lost to damping [J]"}
+"""Drawn where a run has any."""
 
 
 def _axes(rows: int, height: float) -> tuple[Any, Any]:
@@ -106,6 +108,8 @@ def plot_energy(
 ) -> Path:
     """Elastic and kinetic energy and the work of the loads so far, over time, J.
 
+    Likewise the work of moving clamps and the loss to damping, where there is any.
+
     Raises
     ------
     InputError
@@ -115,17 +119,26 @@ def plot_energy(
     names = {name: t for name, t in _ENERGIES.items() if any(name in r.stats for r, _ in runs)}
     if not names:
         raise InputError(f"no run has any of {', '.join(_ENERGIES)} among its statistics.")
+    for name, title in _OTHER_WORK.items():
+        if any(_matters(run, name) for run, _ in runs):
+            names[name] = title
     figure, axes = _axes(len(names), 1.0 + 2.0 * len(names))
     for axis, (name, title) in zip(axes, names.items(), strict=True):
         axis.set_ylabel(title)
         for index, (run, label) in enumerate(runs):
             if name in run.stats:
                 values = np.asarray(run.stats[name], dtype=np.float64)
-                values = np.cumsum(values) if name == "external_work" else values
+                values = values if name.endswith("energy") else np.cumsum(values)
                 axis.plot(run.times[1:], values, label=label, **_style(index))
     _legend(figure, axes)
     axes[-1].set_xlabel("time [s]")
     return _save(figure, output)
+
+
+def _matters(run: Trajectory, work: str) -> bool:
+    """Whether some work of a run is more than rounding beside its energies."""
+    energies = [np.abs(run.stats[name]).max() for name in _ENERGIES if name in run.stats]
+    return work in run.stats and np.abs(run.stats[work]).max() > 1e-9 * max(energies, default=0.0)
 
 
 def plot_error_over_time(errors: Mapping[str, Array], times: Array, output: str | Path) -> Path:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
 from pydantic import Field, ValidationError, field_validator
+from pydantic_core import ErrorDetails
 
 from pdcorrect.errors import SceneError
 from pdcorrect.scene.bodies import Body, MeshFile
@@ -234,16 +236,37 @@ def _explain(error: ValidationError) -> str:
     for item in error.errors():
         key = _key(item["loc"])
         if item["type"] == "extra_forbidden":
-            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
+            sentences.append(f"{key}: unknown key; {_advice(str(item['loc'][-1]))}")
         elif item["type"] == "missing":
             sentences.append(f"{key}: missing; a value is required.")
+        elif item["type"] == "union_tag_not_found":
+            sentences.append(f"{key}.{_tag_name(item)}: missing; a value is required.")
+        elif item["type"] == "union_tag_invalid":
+            context = item["ctx"]
+            sentences.append(
+                f"{key}.{_tag_name(item)} = {context['tag']!r}: expected one of "
+                f"{context['expected_tags']}."
+            )
         else:
             message = item["msg"].removeprefix("Value error, ").replace("tuple", "list")
-            message = message.replace("Input tag", "kind").replace("tags", "kinds")
             value = repr(item["input"])
             value = value if len(value) < 80 else value[:77] + "..."
             sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")
     return " ".join(" ".join(dict.fromkeys(sentences)).split())
+
+
+def _tag_name(item: ErrorDetails) -> str:
+    """The key that chooses among the kinds of a section: kind, shape."""
+    return str(item["ctx"]["discriminator"]).strip("'")
+
+
+def _advice(name: str) -> str:
+    """What to do about an unknown key: the known one that is spelled much like it, if any."""
+    schema = Scene.model_json_schema()
+    sections = [schema, *schema.get("$defs", {}).values()]
+    known = {key for section in sections for key in section.get("properties", ())} - {name}
+    close = get_close_matches(name, sorted(known), n=1)
+    return f"did you mean {close[0]}?" if close else "remove it or check its spelling."
 
 
 def _key(location: tuple[int | str, ...]) -> str:

@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.assembly import Linearisation
-from pdcorrect.fem.factorisation import Backend, Factor, NotPositiveDefinite, factorise
+from pdcorrect.fem.factorisation import (
+    Backend,
+    Factor,
+    NotPositiveDefinite,
+    choose_backend,
+    factorise,
+)
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import Stage
 from pdcorrect.state import State
@@ -206,6 +212,19 @@ class HessianOperator:
         return out
 
 
+def global_backend(problem: Problem) -> Backend:
+    """The back end for a problem's G, chosen without factorising.
+
+    By the bandwidth for cells with eight nodes: a slender body's factor stays sparse where
+    a compact body's of the same size does not.  By the size alone for `hex27` and for
+    elements with internal modes, where a multigrid cycle takes more steps.
+    """
+    size = int(problem.free_unknowns.any(axis=1).sum())
+    if problem.space.internal or problem.cells.shape[1] != 8:
+        return choose_backend(size)
+    return choose_backend(size, bandwidth=problem.band_order.bandwidth)
+
+
 class GlobalSolver:
     """G^-1 on the free components: one factor for each distinct column of ``free``.
 
@@ -215,7 +234,7 @@ class GlobalSolver:
     factors : tuple of float
         On mass (1/s2) and stiffness, see `hessian_factors`.
     backend : str
-        See `factorise`.
+        See `factorise`; "auto" is `global_backend`.
     volume_scale : float
         Factor on the volume weight inside G (the energy is not changed).
     """
@@ -227,6 +246,7 @@ class GlobalSolver:
         backend: Backend = "auto",
         volume_scale: float = 1.0,
     ) -> None:
+        backend = global_backend(problem) if backend in ("auto", "band") else backend
         matrix = problem.scalar_matrix(*factors, volume_scale)
         free = problem.free_unknowns
         columns, group = np.unique(free, axis=1, return_inverse=True)

@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.fem.assembly import Assembly
-from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.factorisation import (
     MEMORY_SHARE,
     Backend,
@@ -61,7 +60,7 @@ class TangentFactory:
 
     def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
         self.problem = problem
-        self.order = BandOrder(problem.positions, problem.cells, problem.free)
+        self.order = problem.band_order
         self.backend = ("band" if self._band_pays else "amg") if backend == "auto" else backend
         self._nodes = Assembly(problem.cells, len(problem.positions))
         self._free = np.flatnonzero(problem.free.ravel())
