@@ -46,6 +46,7 @@ _HOME = {
     "render": "pdcorrect.figures",
     "compare": "pdcorrect.evaluate",
 }
+_NEEDS_TORCH = ("BatchStepper", "BatchGradients", "PDLayer")
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
 __all__ = [  # noqa: RUF022
@@ -106,6 +107,9 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _NEEDS_TORCH:
+        errors_module = importlib.import_module("pdcorrect.errors")
+        errors_module.require_extra("torch", "learn")
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _MODULES:

@@ -16,7 +16,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from pdcorrect.batch.adjoint import BatchGradients
-from pdcorrect.batch.stepper import BatchState, BatchStepper, Solved
+from pdcorrect.batch.states import BatchState, Solved
+from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import ConvergenceError, InputError
 
 Mode = Literal["unrolled", "checkpointed", "detached"]

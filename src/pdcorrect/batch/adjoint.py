@@ -9,7 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.stepper import BatchResult, BatchState, BatchStepper, Solved
+from pdcorrect.batch.states import BatchResult, BatchState, Solved
+from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import InputError
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.linear import Linear

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,20 +12,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.checks import check_problems
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.minimise import HISTORY, BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
-from pdcorrect.errors import InputError, PdcorrectError
+from pdcorrect.batch.retry import OneByOne
+from pdcorrect.batch.states import BatchResult, BatchState, apart, together
+from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene.materials import lame
 from pdcorrect.solvers.integrators import integrator as make_integrator
-from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.linear import Linear
-from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.schemes import Scheme
-from pdcorrect.state import State, Status, StepResult
+from pdcorrect.state import State, Status
 
 Array = NDArray[np.float64]
 
@@ -43,61 +43,6 @@ _STATUSES = {
     Phase.WAITING: Status.ITERATION_LIMIT,
 }
 """What the loop's phases mean for a step."""
-
-
-@dataclass(frozen=True, eq=False)
-class BatchState:
-    """States of B scenes, padded: nodal tensors (B, N, 3), zero beyond a scene's nodes.
-
-    Attributes
-    ----------
-    positions, velocities : (B, N, 3) tensors
-        m and m/s.
-    times : tuple of float
-        s.
-    memory : mapping of str to (B, N, 3) tensors
-        See `State.memory`.
-    """
-
-    positions: Tensor
-    velocities: Tensor
-    times: tuple[float, ...]
-    memory: Mapping[str, Tensor] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """The solutions of a step's equations, which its derivatives need.
-
-    Attributes
-    ----------
-    y : (B, U, 3) tensor
-        Configurations.
-    statuses : list of Status
-    """
-
-    y: Tensor
-    statuses: list[Status]
-
-
-@dataclass(frozen=True, eq=False)
-class BatchResult(Solved):
-    """Outcome of a step of B scenes.
-
-    Attributes
-    ----------
-    y, statuses
-        See `Solved`.
-    state : BatchState
-    iterations, evaluations : (B,) int
-    error_estimates : (B,)
-        m; infinite where there is none.
-    """
-
-    state: BatchState
-    iterations: NDArray[np.int64]
-    evaluations: NDArray[np.int64]
-    error_estimates: Array
 
 
 class BatchStepper:
@@ -144,7 +89,7 @@ class BatchStepper:
         recover: bool = True,
     ) -> None:
         self.problems = tuple(problems)
-        _check_problems(self.problems, time_step, integrator)
+        check_problems(self.problems, time_step, integrator)
         first = self.problems[0]
         time = first.scene.time
         self.tolerance = first.scene.solver.tolerance if tolerance is None else float(tolerance)
@@ -167,35 +112,15 @@ class BatchStepper:
         self._clamped = self.cells.nodal([p.positions for p in self.problems])
         self._minimiser: BatchMinimiser | None = None
         self._inverse: DenseInverse | None = None
-        self._single: dict[int, ProjectiveDynamics] = {}
+        self._one_by_one = OneByOne(
+            self.cells, self.problems, self.tolerance, self.time_step, self.integrator
+        )
 
     # --- states -------------------------------------------------------------------------
 
     def state(self, states: Sequence[State]) -> BatchState:
-        """States of the scenes together.
-
-        Raises
-        ------
-        InputError
-            If there is not one for each scene, or shapes are wrong.
-        """
-        if len(states) != len(self.problems):
-            raise InputError(f"{len(states)} states: expected {len(self.problems)}, one a scene.")
-        for i, (state, problem) in enumerate(zip(states, self.problems, strict=True)):
-            if state.positions.shape != problem.positions.shape:
-                raise InputError(
-                    f"state {i} has {len(state.positions)} nodes: expected "
-                    f"{len(problem.positions)}."
-                )
-        names = set(states[0].memory)
-        if any(set(s.memory) != names for s in states):
-            raise InputError("some states have a memory that others lack: expected all or none.")
-        return BatchState(
-            self._nodal([s.positions for s in states]),
-            self._nodal([s.velocities for s in states]),
-            tuple(s.time for s in states),
-            {name: self._nodal([s.memory[name] for s in states]) for name in names},
-        )
+        """States of the scenes together, see `together`."""
+        return together(self.cells, states)
 
     def rest_state(self) -> BatchState:
         """All scenes at rest at time zero."""
@@ -203,26 +128,7 @@ class BatchStepper:
 
     def states(self, batch: BatchState) -> list[State]:
         """The scenes' states one by one."""
-        counts = self.cells.node_counts
-        host = {
-            "positions": batch.positions, "velocities": batch.velocities, **batch.memory,
-        }  # fmt: skip
-        arrays = {n: t.detach().to("cpu", torch.float64).numpy() for n, t in host.items()}
-        out = []
-        for i, count in enumerate(counts):
-            memory = {name: arrays[name][i, :count] for name in batch.memory}
-            out.append(
-                State(
-                    arrays["positions"][i, :count],
-                    arrays["velocities"][i, :count],
-                    batch.times[i],
-                    memory,
-                )
-            )
-        return out
-
-    def _nodal(self, arrays: Sequence[Array]) -> Tensor:
-        return self.cells.nodal(arrays)[:, : self.cells.sizes.nodes]
+        return apart(self.cells, batch)
 
     def extended(self, nodal: Tensor) -> Tensor:
         """(B, N, 3) as configurations (B, U, 3)."""
@@ -279,7 +185,7 @@ class BatchStepper:
             minimiser.evaluations.cpu().numpy(),
             minimiser.estimate.to("cpu", torch.float64).numpy() * scheme.gain,
         )
-        return self._recovered(state, forces, result) if self._recover else result
+        return self._one_by_one(state, forces, result) if self._recover else result
 
     def prepare(
         self, state: BatchState, forces: Tensor | None = None
@@ -345,7 +251,8 @@ class BatchStepper:
         if not any(p.clamps.moving for p in self.problems):
             return self._clamped[:, : self.cells.sizes.nodes]
         pairs = zip(self.problems, times, strict=True)
-        return self._nodal([p.clamped_positions(t) for p, t in pairs])
+        held = self.cells.nodal([p.clamped_positions(t) for p, t in pairs])
+        return held[:, : self.cells.sizes.nodes]
 
     def _start(self, scheme: Scheme, known: Mapping[str, Any]) -> Tensor:
         nodes = self.cells.sizes.nodes
@@ -392,65 +299,6 @@ class BatchStepper:
         )  # fmt: skip
         return solver
 
-    # --- scenes that did not converge -------------------------------------------------------
-
-    def _recovered(
-        self, state: BatchState, forces: Tensor | None, result: BatchResult
-    ) -> BatchResult:
-        """Try scenes that failed, and are finite, again one at a time."""
-        failed = [
-            i
-            for i, status in enumerate(result.statuses)
-            if status in (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
-        ]
-        if not failed:
-            return result
-        before, after = self.states(state), self.states(result.state)
-        statuses, estimates = list(result.statuses), result.error_estimates.copy()
-        iterations, y = result.iterations.copy(), result.y.clone()
-        for i in failed:
-            found = self._alone(i, before[i], forces)
-            if found is None:
-                continue
-            after[i], statuses[i] = found.state, found.status
-            if found.status is Status.CONVERGED:
-                statuses[i] = Status.RECOVERED
-            estimates[i] = found.error_estimate
-            iterations[i] += found.iterations
-            y[i] = self._configuration(i, before[i], found.state)
-        names = {n for s in after for n in s.memory}
-        whole = [replace(s, memory={n: s.memory[n] for n in names if n in s.memory}) for s in after]
-        return replace(
-            result,
-            state=self.state(whole),
-            y=y,
-            statuses=statuses,
-            iterations=iterations,
-            error_estimates=estimates,
-        )
-
-    def _alone(self, i: int, state: State, forces: Tensor | None) -> StepResult | None:
-        problem = self.problems[i]
-        if i not in self._single:
-            self._single[i] = ProjectiveDynamics(
-                problem, self.tolerance, time_step=self.time_step, integrator=self.integrator
-            )
-        extra = None
-        if forces is not None:
-            extra = forces[i, : len(problem.positions)].to("cpu", torch.float64).numpy()
-        try:
-            return self._single[i](state, extra)
-        except PdcorrectError:
-            return None
-
-    def _configuration(self, i: int, before: State, after: State) -> Tensor:
-        """The y of a scene that was stepped alone."""
-        scheme = self.integrate.scheme(before, self.time_step)
-        found = solution(scheme, before, after, self.problems[i])
-        rest = [p.extended(p.positions) for p in self.problems]
-        rest[i] = found
-        return self.cells.configurations(rest)[i]
-
     @property
     def inverse_bytes(self) -> int:
         """Memory of the inverses; 0 before the first step."""
@@ -468,40 +316,3 @@ class BatchStepper:
         nodal = n.scenes * n.unknowns * 3 * (2 * HISTORY + _VECTORS)
         points = n.scenes * n.cells * n.points * _NUMBERS_A_POINT
         return self.inverse_bytes + size * (nodal + points)
-
-
-def _check_problems(
-    problems: tuple[Problem, ...], time_step: float | None, integrator: str | None
-) -> None:
-    if not problems:
-        raise InputError("no problems: expected one or more scenes.")
-    first = problems[0]
-    for i, problem in enumerate(problems):
-        scene, other = problem.scene, first.scene
-        pairs = [
-            ("element", problem.element, first.element),
-            ("material.energy", scene.material.energy, other.material.energy),
-            ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
-            ("damping.mass", scene.damping.mass, other.damping.mass),
-        ]
-        if time_step is None:
-            pairs.append(("time.step", scene.time.step, other.time.step))
-        if integrator is None:
-            pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
-        for name, mine, theirs in pairs:
-            if mine != theirs:
-                raise InputError(
-                    f"scene {i} ({scene.name!r}): {name} = {mine!r}, the first one's is "
-                    f"{theirs!r}: expected the same. Make a batch of each kind."
-                )
-        if scene.damping.stiffness:
-            raise InputError(
-                f"scene {i} ({scene.name!r}): damping.stiffness is not available in batches: "
-                "expected 0. Use ProjectiveDynamics."
-            )
-        if problem.clamps.moving and scene.time.integrator in ("midpoint", "generalised-alpha"):
-            raise InputError(
-                f"scene {i} ({scene.name!r}): moving clamps with {scene.time.integrator} are not "
-                "available in batches. Use ProjectiveDynamics."
-            )
-    assert math.isfinite(first.time_step)

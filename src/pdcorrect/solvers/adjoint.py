@@ -23,8 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.internal_modes import Condensed
+from pdcorrect.errors import InputError
 from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
@@ -41,15 +40,13 @@ from pdcorrect.solvers.adjoint_terms import (
     mass_slope,
 )
 from pdcorrect.solvers.implicit import ImplicitStepper, quiet_blas
-from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.linear import Linear
 from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
 
-_MODE_STEPS, _SETTLED = 100, 1e-13
-"""Newton steps to find internal modes, and the last one's length, of the cell size."""
 _STEP = 1e-3
 """Of the time step, for differences of fourth order at fixed y."""
 
@@ -364,7 +361,8 @@ def adjoint(
     h = stepper.time_step if time_step is None else float(time_step)
     step = _Step(stepper, state, forces, h, solver, tolerance)
     with quiet_blas():
-        return Gradients(step, checked, _solution(step, result))
+        y = step_solution(step.objective(), step.stepper.integrate, step.time_step, result)
+        return Gradients(step, checked, y)
 
 
 def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:
@@ -376,31 +374,3 @@ def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:
     if not np.isfinite(out).all():
         raise InputError(f"{name} contains NaN or infinite entries: expected finite numbers.")
     return out
-
-
-def _solution(step: _Step, result: StepResult) -> Array:
-    """The configuration y that the step's equation was solved for."""
-    scheme = step.stepper.integrate.scheme(step.state, step.time_step)
-    problem = step.stepper.problem
-    y = solution(scheme, step.state, result.state, problem)
-    if problem.scene.damping.stiffness and problem.space.internal:
-        y = _damped_modes(step.objective(), y)
-    return y
-
-
-def _damped_modes(objective: StepObjective, y: Array) -> Array:
-    """Y with internal modes in equilibrium with their damping too, by Newton's method."""
-    problem, nodes = objective.problem, len(objective.problem.positions)
-    for _ in range(_MODE_STEPS):
-        _, gradient = objective.value_and_gradient(y)
-        gradient[:nodes] = 0.0
-        blocks = objective.cell_hessians(y, project=True)
-        following = Condensed(blocks, problem.space.local, problem.cells.shape[1])
-        change = following.recovered(np.zeros((nodes, 3)), gradient)
-        y = y - change
-        if np.abs(change).max() <= _SETTLED * problem.cell_size:
-            return y
-    raise ConvergenceError(
-        f"internal modes of the step are not in equilibrium after {_MODE_STEPS} Newton steps: "
-        "expected a state that a step converged to."
-    )

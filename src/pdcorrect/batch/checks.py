@@ -1,0 +1,46 @@
+"""What the scenes of a batch must have in common."""
+
+from __future__ import annotations
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem
+
+
+def check_problems(
+    problems: tuple[Problem, ...], time_step: float | None, integrator: str | None
+) -> None:
+    """Refuse scenes that cannot step together, naming one and what differs.
+
+    ``time_step`` and ``integrator`` are those asked for, or None for the scenes' own.
+    """
+    if not problems:
+        raise InputError("no problems: expected one or more scenes.")
+    first = problems[0]
+    for i, problem in enumerate(problems):
+        scene, other = problem.scene, first.scene
+        pairs = [
+            ("element", problem.element, first.element),
+            ("material.energy", scene.material.energy, other.material.energy),
+            ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
+            ("damping.mass", scene.damping.mass, other.damping.mass),
+        ]
+        if time_step is None:
+            pairs.append(("time.step", scene.time.step, other.time.step))
+        if integrator is None:
+            pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
+        for name, mine, theirs in pairs:
+            if mine != theirs:
+                raise InputError(
+                    f"scene {i} ({scene.name!r}): {name} = {mine!r}, the first one's is "
+                    f"{theirs!r}: expected the same. Make a batch of each kind."
+                )
+        if scene.damping.stiffness:
+            raise InputError(
+                f"scene {i} ({scene.name!r}): damping.stiffness is not available in batches: "
+                "expected 0. Use ProjectiveDynamics."
+            )
+        if problem.clamps.moving and scene.time.integrator in ("midpoint", "generalised-alpha"):
+            raise InputError(
+                f"scene {i} ({scene.name!r}): moving clamps with {scene.time.integrator} are not "
+                "available in batches. Use ProjectiveDynamics."
+            )

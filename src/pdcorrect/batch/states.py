@@ -1,0 +1,115 @@
+"""States of many scenes together, and what a step makes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch
+from pdcorrect.errors import InputError
+from pdcorrect.state import State, Status
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchState:
+    """States of B scenes, padded: nodal tensors (B, N, 3), zero beyond a scene's nodes.
+
+    Attributes
+    ----------
+    positions, velocities : (B, N, 3) tensors
+        m and m/s.
+    times : tuple of float
+        s.
+    memory : mapping of str to (B, N, 3) tensors
+        See `State.memory`.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    times: tuple[float, ...]
+    memory: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The solutions of a step's equations, which its derivatives need.
+
+    Attributes
+    ----------
+    y : (B, U, 3) tensor
+        Configurations.
+    statuses : list of Status
+    """
+
+    y: Tensor
+    statuses: list[Status]
+
+
+@dataclass(frozen=True, eq=False)
+class BatchResult(Solved):
+    """Outcome of a step of B scenes.
+
+    Attributes
+    ----------
+    y, statuses
+        See `Solved`.
+    state : BatchState
+    iterations, evaluations : (B,) int
+    error_estimates : (B,)
+        m; infinite where there is none.
+    """
+
+    state: BatchState
+    iterations: NDArray[np.int64]
+    evaluations: NDArray[np.int64]
+    error_estimates: Array
+
+
+def together(cells: CellBatch, states: Sequence[State]) -> BatchState:
+    """States of the scenes of a batch together.
+
+    Raises
+    ------
+    InputError
+        If there is not one for each scene, or shapes are wrong.
+    """
+    if len(states) != len(cells.node_counts):
+        raise InputError(f"{len(states)} states: expected {len(cells.node_counts)}, one a scene.")
+    for i, (state, count) in enumerate(zip(states, cells.node_counts, strict=True)):
+        if len(state.positions) != count:
+            raise InputError(f"state {i} has {len(state.positions)} nodes: expected {count}.")
+    names = set(states[0].memory)
+    if any(set(s.memory) != names for s in states):
+        raise InputError("some states have a memory that others lack: expected all or none.")
+
+    def nodal(arrays: Sequence[Array]) -> Tensor:
+        return cells.nodal(arrays)[:, : cells.sizes.nodes]
+
+    return BatchState(
+        nodal([s.positions for s in states]),
+        nodal([s.velocities for s in states]),
+        tuple(s.time for s in states),
+        {name: nodal([s.memory[name] for s in states]) for name in names},
+    )
+
+
+def apart(cells: CellBatch, batch: BatchState) -> list[State]:
+    """The scenes' states one by one."""
+    tensors = {"positions": batch.positions, "velocities": batch.velocities, **batch.memory}
+    host = {n: t.detach().to("cpu", torch.float64).numpy() for n, t in tensors.items()}
+    return [
+        State(
+            host["positions"][i, :count],
+            host["velocities"][i, :count],
+            batch.times[i],
+            {name: host[name][i, :count] for name in batch.memory},
+        )
+        for i, count in enumerate(cells.node_counts)
+    ]
