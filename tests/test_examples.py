@@ -1,7 +1,9 @@
-"""Every scene in examples/ and every command and snippet of the documentation runs."""
+"""Every scene and script in examples/ and every command and snippet of the documentation runs."""
 
+import importlib.util
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,39 @@ def test_example_scenes_run_with_both_solvers(path):
     assert set(pd.stats["status"]) == {"CONVERGED"}
     assert np.abs(pd.positions - newton.positions).max() < 1e-5 * problem.cell_size
     assert pc.metrics.largest_displacement(pd) > 0.02 * problem.cell_size
+
+
+def run_script(name, folder):
+    """The summary of a script in examples/, which draws one figure of its name."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    try:
+        spec.loader.exec_module(module)
+        summary = module.main(folder)
+    finally:
+        del sys.modules[name]
+    assert [path.name for path in folder.iterdir()] == [f"{name}.png"]
+    return summary
+
+
+def test_the_material_is_recovered(tmp_path):
+    summary = run_script("recover_material", tmp_path)
+    assert summary["error of young"] < 0.002
+    assert summary["error of poisson"] < 0.002
+    assert summary["rms cells"] == pytest.approx(3**0.5 * 1e-4, rel=0.05)
+
+
+def test_the_target_is_reached(tmp_path):
+    distances = run_script("reach_target", tmp_path)
+    assert set(distances) == {"initial velocity", "six actuators"}
+    assert max(distances.values()) < 1e-3
+
+
+def test_the_network_learns_to_reach_targets(tmp_path):
+    pytest.importorskip("torch")
+    summary = run_script("train_with_layer", tmp_path)
+    assert summary["factor"] > 20.0
 
 
 def blocks(language):
@@ -58,8 +93,6 @@ def shell_lines():
 
 def test_documented_commands_run(monkeypatch, tmp_path, capsys):
     """In the order of the pages, few frames each, as the commands build on each other's files."""
-    import sys
-
     from pdcorrect import cli
 
     lines = list(dict.fromkeys(line for _, line in shell_lines()))
@@ -100,7 +133,6 @@ def test_documented_links_exist():
 
 def test_the_documentation_builds_without_warnings(tmp_path):
     import subprocess
-    import sys
 
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", ROOT / "docs", tmp_path]
     built = subprocess.run(command, capture_output=True, text=True)
