@@ -247,6 +247,20 @@ def test_scenes_that_fail_are_tried_again_alone():
         assert furthest(alone(problem, state, 1), after) < 1e-9
 
 
+def test_they_are_tried_with_the_material_that_they_have():
+    problem = pc.discretise(beam((3, 1, 1)))
+    state = moving_states([problem])[0]
+    stepper = pc.BatchStepper([problem], 1e-9, max_iterations=1)
+    values = {"young": 2e5, "poisson": 0.2, "density": 1500.0}
+    stepper.set_material(*(torch.tensor([[v]], dtype=torch.float64) for v in values.values()))
+    found, result = stepped(stepper, [state], 1)
+    assert result.statuses == [pc.Status.RECOVERED]
+    assert furthest(alone(problem.with_material(**values), state, 1), found[0]) < 1e-9
+    stepper.set_material()
+    found, _ = stepped(stepper, [state], 1)
+    assert furthest(alone(problem, state, 1), found[0]) < 1e-9
+
+
 @on_every_device
 def test_single_precision_reaches_a_loose_tolerance(device):
     problems = [pc.discretise(unlike(seed)) for seed in range(4)]
@@ -283,6 +297,13 @@ def test_batches_that_cannot_be_are_refused_by_name():
         batch(unlike(0), unlike(1, "hex8-mean"))
     with pytest.raises(InputError, match=r"time\.step"):
         batch(unlike(0), unlike(1, time={"step": 0.02}))
+    radii = ({"integrator": "generalised-alpha", "spectral_radius": r} for r in (0.5, 0.8))
+    with pytest.raises(InputError, match=r"time\.spectral_radius"):
+        batch(*(unlike(i, time=time) for i, time in enumerate(radii)))
+    shift = {"times": [0.0, 1.0], "displacement": [[0, 0, 0], [0.1, 0, 0]]}
+    moved = [{"region": {"plane": "x", "at": 0.0}, "motion": shift}]
+    with pytest.raises(InputError, match="moving clamps with midpoint"):
+        batch(unlike(0, clamps=moved), integrator="midpoint")
     with pytest.raises(InputError, match=r"damping\.stiffness"):
         batch(unlike(0, damping={"stiffness": 0.1}))
     adrift = batch(beam((2, 1, 1), clamps=[], loads=[]), integrator="quasi-static")

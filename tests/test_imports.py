@@ -84,6 +84,7 @@ ORDER = [
     "batch.history",
     "batch.minimise",
     "batch.loads",
+    "batch.threads",
     "batch.checks",
     "batch.states",
     "batch.retry",

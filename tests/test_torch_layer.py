@@ -79,7 +79,10 @@ def inputs(stepper):
     return [t.detach().requires_grad_() for t in (p, v, f)]
 
 
-def test_gradcheck_passes_for_every_input_through_two_steps():
+@pytest.mark.parametrize(
+    "fast", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["projected", "every entry"]
+)
+def test_gradcheck_passes_for_every_input_through_two_steps(fast):
     stepper = small_batch()
     layer = pc.PDLayer(stepper, steps=2, tolerance=1e-12)
     young, poisson, density = (m[:, :1].clone() for m in stepper.material)
@@ -91,7 +94,9 @@ def test_gradcheck_passes_for_every_input_through_two_steps():
         return 100 * a, b
 
     everything = (*inputs(stepper), *material)
-    assert torch.autograd.gradcheck(function, everything, eps=1e-5, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        function, everything, eps=1e-5, atol=1e-6, rtol=1e-5, fast_mode=fast
+    )
 
 
 def test_checkpointed_steps_have_the_same_gradients_and_detached_ones_those_of_the_last():
@@ -153,6 +158,32 @@ def test_materials_given_are_the_materials_used():
     other = pc.ProjectiveDynamics(problem.with_material(**values), 1e-10)
     exact = other(problem.rest_state()).state.positions
     np.testing.assert_allclose(after[0].numpy(), exact, atol=1e-10)
+
+
+def test_a_call_does_not_see_the_material_of_another():
+    """Neither forwards nor backwards, in whatever order they come."""
+    stepper = small_batch()
+    layer = pc.PDLayer(stepper, tolerance=1e-10)
+    p, v, f = inputs(stepper)
+    soft = torch.full((2, 1), 5e4, dtype=torch.float64)
+    expected, _ = layer(p, v, f)
+    (exact,) = torch.autograd.grad(expected.square().sum(), f)
+    after, _ = layer(p, v, f)
+    layer(p, v, f, young=soft)
+    (found,) = torch.autograd.grad(after.square().sum(), f)
+    torch.testing.assert_close(found, exact, rtol=1e-8, atol=1e-12)
+    again, _ = layer(p, v, f)
+    torch.testing.assert_close(again, expected, rtol=0, atol=1e-12)
+
+
+def test_steps_that_were_taken_in_parts_have_no_derivative():
+    stepper = small_batch()
+    before = stepper.rest_state()
+    result = stepper(before)
+    result.statuses[1] = pc.Status.SUBSTEPPED
+    g = torch.ones_like(before.positions)
+    found = pc.BatchGradients(stepper, before, result, g)
+    assert found.ok.tolist() == [True, False]
 
 
 @on_every_device

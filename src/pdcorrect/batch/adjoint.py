@@ -11,9 +11,11 @@ from torch import Tensor
 
 from pdcorrect.batch.states import BatchResult, BatchState, Solved
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.batch.threads import one_thread
 from pdcorrect.errors import InputError
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.linear import Linear
+from pdcorrect.state import Status
 
 
 class BatchGradients:
@@ -40,7 +42,7 @@ class BatchGradients:
     x : (B, U, 3)
         The adjoint states; zero in scenes that failed.
     ok : (B,) bool
-        Whether the step had a result and its linear system was solved.
+        Whether the step had a result, not in smaller parts, and its linear system was solved.
     iterations : int
         Of the slowest scene.
     """
@@ -76,8 +78,10 @@ class BatchGradients:
             if name in self._after:
                 self._pull(*rows, self._after[name])
         by_y = self._sums.pop("y")
-        fine = torch.tensor([s.ok for s in result.statuses], device=by_y.device)
-        solver = stepper.solve_adjoint(self._y, stepper.extended(by_y), fine, tolerance)
+        in_one = [s.ok and s is not Status.SUBSTEPPED for s in result.statuses]
+        fine = torch.tensor(in_one, device=by_y.device)
+        with one_thread(stepper.device):
+            solver = stepper.solve_adjoint(self._y, stepper.extended(by_y), fine, tolerance)
         self.ok = fine & solver.converged
         self.iterations = solver.steps
         self.x = torch.where(self.ok[:, None, None], solver.x, 0.0)

@@ -116,8 +116,9 @@ class CellBatch:
         """Configurations (N + B, 3) of the bodies, padded to (B, U, 3)."""
         out = np.zeros((self.sizes.scenes, self.sizes.unknowns, 3))
         for i, (array, nodes) in enumerate(zip(arrays, self.node_counts, strict=True)):
-            out[i, :nodes] = array[:nodes]
-            out[i, self.sizes.nodes : self.sizes.nodes + len(array) - nodes] = array[nodes:]
+            modes = array[nodes:]
+            out[i, : len(array[:nodes])] = array[:nodes]
+            out[i, self.sizes.nodes : self.sizes.nodes + len(modes)] = modes
         return self.tensor(out)
 
     def unpadded(self, x: Tensor) -> list[NDArray[Any]]:

@@ -28,10 +28,14 @@ def check_problems(
             pairs.append(("time.step", scene.time.step, other.time.step))
         if integrator is None:
             pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
-        for name, mine, theirs in pairs:
+        name = other.time.integrator if integrator is None else integrator
+        if name == "generalised-alpha":
+            radii = scene.time.spectral_radius, other.time.spectral_radius
+            pairs.append(("time.spectral_radius", *radii))
+        for key, mine, theirs in pairs:
             if mine != theirs:
                 raise InputError(
-                    f"scene {i} ({scene.name!r}): {name} = {mine!r}, the first one's is "
+                    f"scene {i} ({scene.name!r}): {key} = {mine!r}, the first one's is "
                     f"{theirs!r}: expected the same. Make a batch of each kind."
                 )
         if scene.damping.stiffness:
@@ -39,8 +43,8 @@ def check_problems(
                 f"scene {i} ({scene.name!r}): damping.stiffness is not available in batches: "
                 "expected 0. Use ProjectiveDynamics."
             )
-        if problem.clamps.moving and scene.time.integrator in ("midpoint", "generalised-alpha"):
+        if problem.clamps.moving and name in ("midpoint", "generalised-alpha"):
             raise InputError(
-                f"scene {i} ({scene.name!r}): moving clamps with {scene.time.integrator} are not "
+                f"scene {i} ({scene.name!r}): moving clamps with {name} are not "
                 "available in batches. Use ProjectiveDynamics."
             )

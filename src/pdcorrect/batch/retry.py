@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,7 +26,8 @@ class OneByOne:
     Parameters
     ----------
     cells : CellBatch
-    problems : sequence of Problem
+    problem : callable
+        The problem of a scene, by its number, as it is now.
     tolerance, time_step, integrator
         Of the steps.
     """
@@ -33,12 +35,12 @@ class OneByOne:
     def __init__(
         self,
         cells: CellBatch,
-        problems: Sequence[Problem],
+        problem: Callable[[int], Problem],
         tolerance: float,
         time_step: float,
         integrator: str,
     ) -> None:
-        self._cells, self._problems = cells, problems
+        self._cells, self._problem = cells, problem
         self._settings = (tolerance, time_step, integrator)
         self._steppers: dict[int, ProjectiveDynamics] = {}
 
@@ -72,8 +74,8 @@ class OneByOne:
         )
 
     def _step(self, i: int, state: State, forces: Tensor | None) -> StepResult | None:
-        problem = self._problems[i]
-        if i not in self._steppers:
+        problem = self._problem(i)
+        if i not in self._steppers or self._steppers[i].problem is not problem:
             tolerance, h, integrator = self._settings
             self._steppers[i] = ProjectiveDynamics(
                 problem, tolerance, time_step=h, integrator=integrator
@@ -90,6 +92,7 @@ class OneByOne:
         """The y of a scene that was stepped alone."""
         stepper = self._steppers[i]
         scheme = stepper.integrate.scheme(before, stepper.time_step)
-        every = [p.extended(p.positions) for p in self._problems]
-        every[i] = solution(scheme, before, after, self._problems[i])
+        y = solution(scheme, before, after, stepper.problem)
+        nothing = np.zeros((0, 3))
+        every = [y if k == i else nothing for k in range(self._cells.sizes.scenes)]
         return self._cells.configurations(every)[i]

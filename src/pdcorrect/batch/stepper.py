@@ -20,6 +20,7 @@ from pdcorrect.batch.minimise import HISTORY, BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import OneByOne
 from pdcorrect.batch.states import BatchResult, BatchState, apart, together
+from pdcorrect.batch.threads import one_thread
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene.materials import lame
@@ -72,6 +73,11 @@ class BatchStepper:
     recover : bool
         Whether scenes that do not converge are tried again, one at a time, with
         `ProjectiveDynamics` and its fallbacks.
+
+    Attributes
+    ----------
+    material : tuple of (B, C) tensors
+        Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell, now.
     """
 
     def __init__(
@@ -99,13 +105,17 @@ class BatchStepper:
         self.cells = CellBatch(self.problems, torch.device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
         self.objective = BatchObjective(self.cells, self.problems)
-        self._young, self._poisson = (
+        self._own: tuple[Tensor, ...] = tuple(
             self.cells.tensor(padded(values, (self.cells.sizes.cells,)))
-            for values in (
-                [p.materials.young for p in self.problems],
-                [p.materials.poisson for p in self.problems],
+            for values in zip(
+                *(
+                    (p.materials.young, p.materials.poisson, p.materials.density)
+                    for p in self.problems
+                ),
+                strict=True,
             )
         )
+        self.material = self._own
         self.first_hessian = chosen(first_hessian, self.problems)
         self._storage, self._most, self._recover = storage, max_iterations, recover
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
@@ -113,7 +123,11 @@ class BatchStepper:
         self._minimiser: BatchMinimiser | None = None
         self._inverse: DenseInverse | None = None
         self._one_by_one = OneByOne(
-            self.cells, self.problems, self.tolerance, self.time_step, self.integrator
+            self.cells,
+            self._problems_now,
+            self.tolerance,
+            self.time_step,
+            self.integrator,
         )
 
     # --- states -------------------------------------------------------------------------
@@ -139,36 +153,50 @@ class BatchStepper:
 
     # --- material --------------------------------------------------------------------------
 
-    @property
-    def material(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell, (B, C)."""
-        return self._young, self._poisson, self.objective.mass.density
-
     def set_material(
         self,
         young: Tensor | None = None,
         poisson: Tensor | None = None,
         density: Tensor | None = None,
     ) -> None:
-        """Other material values from now on, each (B, C) or what broadcasts to it.
+        """Material values from now on, each (B, C) or what broadcasts to it.
 
-        First Hessians stay those of the problems: they are only preconditioners.
+        Those that are not given are the problems' own.  First Hessians stay those of the
+        problems: they are only preconditioners.
         """
-        if young is not None:
-            self._young.copy_(young)
-        if poisson is not None:
-            self._poisson.copy_(poisson)
-        if young is not None or poisson is not None:
-            mu, lam = lame(self._young, self._poisson)  # type: ignore[type-var]
-            published = self.problems[0].scene.material.volume_weight == "published"
-            self.cells.set_weights(mu, lam if published else 3.0 * lam)
-        if density is not None:
-            self.objective.mass.set_density(density + torch.zeros_like(self._young))
+        given = (young, poisson, density)
+        if all(m is None for m in given) and self.material is self._own:
+            return
+        values = tuple(
+            own if m is None else m.detach().expand(own.shape).clone()
+            for m, own in zip(given, self._own, strict=True)
+        )
+        mu, lam = lame(values[0], values[1])  # type: ignore[type-var]
+        published = self.problems[0].scene.material.volume_weight == "published"
+        self.cells.set_weights(mu, lam if published else 3.0 * lam)
+        self.objective.mass.set_density(values[2])
+        self.material = self._own if all(m is None for m in given) else values
+
+    def _problems_now(self, i: int) -> Problem:
+        """A scene with the material that it has now."""
+        problem = self.problems[i]
+        if self.material is self._own:
+            return problem
+        count = len(problem.cells)
+        young, poisson, density = (
+            m[i, :count].to("cpu", torch.float64).numpy() for m in self.material
+        )
+        return problem.with_material(young, poisson, density)
 
     # --- a step ---------------------------------------------------------------------------
 
     def __call__(self, state: BatchState, forces: Tensor | None = None) -> BatchResult:
         """Advance all scenes by one step, with extra nodal forces (B, N, 3), N."""
+        with one_thread(self.device):
+            result = self._step(state, forces)
+        return self._one_by_one(state, forces, result) if self._recover else result
+
+    def _step(self, state: BatchState, forces: Tensor | None) -> BatchResult:
         scheme, known = self.prepare(state, forces)
         minimiser = self._minimiser
         assert minimiser is not None
@@ -177,7 +205,7 @@ class BatchStepper:
         minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
         y = minimiser.y.clone()  # the next step overwrites it
         phases = minimiser.phase.tolist()
-        result = BatchResult(
+        return BatchResult(
             y,
             [_STATUSES[Phase(p)] for p in phases],
             self._finish(scheme, known, y, state),
@@ -185,7 +213,6 @@ class BatchStepper:
             minimiser.evaluations.cpu().numpy(),
             minimiser.estimate.to("cpu", torch.float64).numpy() * scheme.gain,
         )
-        return self._one_by_one(state, forces, result) if self._recover else result
 
     def prepare(
         self, state: BatchState, forces: Tensor | None = None
