@@ -14,6 +14,9 @@ from pdcorrect.fem.tangent_kernels import stiffness
 Array = NDArray[np.float64]
 
 _BACKTRACKS = 30
+_NEAR = 1e9
+"""Last step, in tolerances, from which on the exact tangent is used: farther from equilibrium it
+can lead to another one, and magnifies rounding where modes have hardly any stiffness."""
 
 
 @njit(**PARALLEL)
@@ -22,10 +25,10 @@ def relax(  # type: ignore[no-untyped-def]
 ):
     """Bring the internal modes in u (N + B, 3) to equilibrium with the nodes, in place.
 
-    Newton's method in each cell, with the projected tangent where the exact one is not
-    positive definite, at most ``steps``
-    times or until no mode changes by more than ``tolerance`` (m).  ``nodes`` is
-    the number of nodes a cell; its other local shape functions are modes.
+    Newton's method in each cell, with the projected tangent far from equilibrium and where the
+    exact one is not positive definite, at most ``steps`` times or until no
+    mode changes by more than ``tolerance`` (m).  ``nodes`` is the number of nodes a cell;
+    its other local shape functions are modes.
     Other arguments as `kernels.energy_and_forces`.
     """
     count, lanes = cells.shape[0], weights.shape[2]
@@ -62,10 +65,11 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                for project in (False, True):
-                    principal_tangent_lanes(model, s, v, k, shear, volume, start, project, T)
+                project = tried == 1 or _largest(step) > _NEAR * tolerance
+                for cautious in (project, True):
+                    principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
                     stiffness(here, U, V, T, A, P, K)
-                    if _solve(K, forces, step):
+                    if _solve(K, forces, step) or cautious:
                         break
                 for m in range(width):
                     old[m] = u[modes[m]]
