@@ -102,7 +102,6 @@ def measure(
     }
     if device == "cuda":
         row["memory_bytes"] = torch.cuda.max_memory_allocated()
-        row["memory_by_formula"] = stepper.expected_bytes
     print(json.dumps(row), flush=True)
     return row
 

@@ -1,5 +1,8 @@
 """Many scenes in one batch are many scenes one by one."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +10,8 @@ import torch
 import pdcorrect as pc
 from conftest import beam
 from pdcorrect.batch import decomposition
+from pdcorrect.batch.cells import Sizes
+from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.points import Points
 from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
@@ -270,6 +275,21 @@ def test_single_precision_reaches_a_loose_tolerance(device):
     for problem, after in zip(problems, found, strict=True):
         exact = alone(problem, problem.rest_state(), 2)
         assert furthest(exact, after) < 5e-3 * problem.cell_size
+
+
+def test_the_memory_formula_fits_what_was_measured_on_a_gpu():
+    """Where it matters: batches that take more than half a gigabyte."""
+    results = Path(__file__).parents[1] / "benchmarks" / "results"
+    record = json.loads((results / "nvidia-h200.json").read_text())
+    checked = 0
+    for row in record["coarse"] + record["fine"]:
+        sizes = Sizes(row["scenes"], row["nodes"], 0, row["cells"], 8, 8)
+        width = 3 if row["first_hessian"] == "rest" else 1
+        if row["memory_bytes"] > 1e9:
+            found = expected_bytes(sizes, row["scenes"], width)
+            assert found == pytest.approx(row["memory_bytes"], rel=1 / 3)
+            checked += 1
+    assert checked >= 6
 
 
 def test_extra_forces_and_moving_clamps_act_as_on_one_scene():

@@ -83,6 +83,7 @@ ORDER = [
     "batch.linear_solver",
     "batch.history",
     "batch.minimise",
+    "batch.memory",
     "batch.loads",
     "batch.threads",
     "batch.checks",

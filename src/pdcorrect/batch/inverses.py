@@ -78,6 +78,8 @@ class DenseInverse:
     ----------
     bytes : int
         Of all inverses.
+    count : int
+        Distinct ones.
     """
 
     def __init__(
@@ -92,6 +94,7 @@ class DenseInverse:
         self._width = 3 if kind == "rest" else 1
         self._sharing = Sharing(problems, cells.device)
         distinct, owners = self._sharing.distinct, self._sharing.owners
+        self.count = len(distinct)
         self._axes = 1
         if kind != "rest" and any((p.free != p.free[:, :1]).any() for p in problems):
             self._axes = 3

@@ -16,7 +16,8 @@ from pdcorrect.batch.checks import check_problems
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
-from pdcorrect.batch.minimise import HISTORY, BatchMinimiser, Phase
+from pdcorrect.batch.memory import expected_bytes
+from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import OneByOne
 from pdcorrect.batch.states import BatchResult, BatchState, apart, together
@@ -33,8 +34,6 @@ Array = NDArray[np.float64]
 
 _ADJOINT_STEPS = 400
 """Of conjugate gradients."""
-_VECTORS, _NUMBERS_A_POINT = 40, 150
-"""Of working memory."""
 _STATUSES = {
     Phase.CONVERGED: Status.CONVERGED,
     Phase.LINE_SEARCH: Status.LINE_SEARCH,
@@ -333,13 +332,6 @@ class BatchStepper:
 
     @property
     def expected_bytes(self) -> int:
-        """Expected peak memory of steps and derivatives on the device.
-
-        The inverses, 4 (w N)^2 bytes for each distinct one of N nodes with w = 3 for "rest"
-        and 1 otherwise; what is known of each node and mode (24 vectors of L-BFGS and about
-        40 others); and of each quadrature point (about 150 numbers).
-        """
-        n, size = self.cells.sizes, torch.finfo(self.dtype).bits // 8
-        nodal = n.scenes * n.unknowns * 3 * (2 * HISTORY + _VECTORS)
-        points = n.scenes * n.cells * n.points * _NUMBERS_A_POINT
-        return self.inverse_bytes + size * (nodal + points)
+        """Expected peak memory on the device, see `expected_bytes`; after the first step."""
+        kinds = 0 if self._inverse is None else self._inverse.count
+        return expected_bytes(self.cells.sizes, kinds, 3 if self.first_hessian == "rest" else 1)
