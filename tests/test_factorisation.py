@@ -185,6 +185,12 @@ def test_newton_by_conjugate_gradients_takes_no_saddle_for_a_minimum():
         assert exact == minimum
 
 
+def test_nearly_incompressible_tangents_are_factorised_where_others_are_not():
+    usual, hard = (pc.discretise(beam((14, 14, 14), poisson=nu)) for nu in (0.45, 0.4999))
+    assert pc.Newton(usual).linear_solver == "cg"
+    assert pc.Newton(hard).linear_solver == "direct"
+
+
 def test_the_linear_solver_follows_size_and_back_end():
     problem = pc.discretise(beam((3, 2, 2)))
     assert pc.Newton(problem).linear_solver == "direct"

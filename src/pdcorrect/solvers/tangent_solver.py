@@ -29,6 +29,14 @@ Array = NDArray[np.float64]
 
 _CG_SECONDS = 7e-8
 """Of a Newton step by conjugate gradients, for each entry of the cells' tangents (case newton)."""
+_USUAL_VOLUME = 27.0
+"""Volume weight by shear modulus at Poisson's ratio 0.45, up to which that holds.
+
+Beyond, conjugate gradients take steps about as the root of it: on Cook's membrane of 32 x 32
+hex27 cells at 0.4999 a band took 4 s, they had not ended after 280 s.
+"""
+_NO_SHEAR = 1e-300
+"""Pa, in place of the shear modulus of an energy that has none."""
 _CYCLE_SECONDS = 1.7e-8
 """Worth of a band's solve against a multigrid cycle, for each such entry (case growth).
 
@@ -75,8 +83,11 @@ class TangentFactory:
     @property
     def direct_pays(self) -> bool:
         """Whether a band factor in each iteration beats conjugate gradients with multigrid."""
+        materials = self.problem.materials
+        hardest = float((materials.volume_weight / np.maximum(materials.mu, _NO_SHEAR)).max())
+        steps = max(1.0, hardest / _USUAL_VOLUME) ** 0.5
         return self.backend == "band" and (
-            self._factor_seconds + self._solve_seconds < _CG_SECONDS * self._entries
+            self._factor_seconds + self._solve_seconds < _CG_SECONDS * steps * self._entries
         )
 
     @property
