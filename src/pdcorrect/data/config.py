@@ -1,0 +1,235 @@
+"""`DatasetConfig`: everything that determines a data set, as TOML."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomli_w
+from pydantic import Field, ValidationError, model_validator
+
+from pdcorrect.errors import InputError
+from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
+
+FamilyName = Literal["beam", "cross", "weight"]
+MotionName = Literal["torsion", "impulse", "stretch"]
+Range = tuple[Positive, Positive]
+Share = Annotated[float, Field(strict=True, ge=0, lt=1)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9.-]*$", max_length=80)]
+
+TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
+"""The splits that every data set has."""
+
+
+class MaterialRange(Strict):
+    """From what the material of a mesh is drawn; all its simulations share it.
+
+    Attributes
+    ----------
+    young
+        Pa, log-uniform.
+    poisson
+        Uniform.
+    density
+        kg/m3, uniform.
+    """
+
+    young: Range
+    poisson: tuple[NonNegative, NonNegative]
+    density: Range
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MaterialRange:
+        for name in ("young", "poisson", "density"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"expected {name} = [low, high] with low <= high")
+        if self.poisson[1] >= 0.5:
+            raise ValueError("expected poisson below 0.5")
+        return self
+
+
+class MotionRange(Strict):
+    """From what a simulation's load is drawn.
+
+    Attributes
+    ----------
+    kind
+        "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in
+        time.  "impulse": a force on one side of the body's inflated part during the first
+        ``duration`` seconds.  "stretch": a force on that part along the axis away from the
+        clamps, with a transverse share, that rises during ``duration`` seconds and stays.
+    strength
+        Uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over
+        the mass of the loaded part, m/s2.  Impulse: momentum over that mass, m/s.
+    duration
+        s; not used by torsion.
+    attraction
+        k of eq. 6-1, uniform.
+    stretch
+        alpha of eq. 6-1 over the cell size, uniform.
+    transverse
+        Of stretch: transverse over axial force, uniform.
+    """
+
+    kind: MotionName
+    strength: Range
+    duration: Positive = 0.01
+    attraction: tuple[NonNegative, NonNegative] = (0.0, 0.5)
+    stretch: tuple[NonNegative, NonNegative] = (0.5, 1.5)
+    transverse: tuple[NonNegative, NonNegative] = (0.0, 0.3)
+
+
+class Reference(Strict):
+    """What the data set takes for the truth.
+
+    Attributes
+    ----------
+    solver
+        "pd" or "newton".
+    refine
+        Cells into which each coarse cell is cut, along each axis.
+    """
+
+    solver: Literal["pd", "newton"] = "pd"
+    refine: Annotated[int, Field(strict=True, ge=2, le=16)] = 4
+
+
+class Split(Strict):
+    """How many simulations on how many meshes; each mesh gets about as many."""
+
+    meshes: PositiveCount
+    simulations: PositiveCount
+
+    @model_validator(mode="after")
+    def _enough(self) -> Split:
+        if self.simulations < self.meshes:
+            raise ValueError("expected at least one simulation a mesh")
+        return self
+
+
+class ExtraSplit(Split):
+    """An evaluation split that leaves the training distribution in the named respects.
+
+    Attributes
+    ----------
+    family, young, poisson
+        In place of the data set's.
+    strength_factor, step_factor, frames_factor
+        On its loads, its time step and its number of frames.
+    refine
+        Of the reference.
+    """
+
+    name: Name
+    family: FamilyName | None = None
+    young: Range | None = None
+    poisson: tuple[NonNegative, NonNegative] | None = None
+    strength_factor: Positive = 1.0
+    step_factor: Positive = 1.0
+    frames_factor: PositiveCount = 1
+    refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None
+
+
+class DatasetConfig(Strict):
+    """A data set, up to the machine that computes it.
+
+    Attributes
+    ----------
+    family
+        Bodies, see `pdcorrect.data.families`.
+    setting
+        "as-published": nodal masses rho times cell volume, the published volume weight,
+        forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
+        sum to rho V, the volume weight of the material asked for, loads integrated on each
+        mesh, the best coarse model beside the plain one, its element in the reference.
+    coarsest_nodes
+        Fewest and most nodes of a coarse mesh; the family's own by default.
+    cell_size, step
+        m and s.
+    tolerance
+        Of each time step, of the coarse cell size.
+    validation_share
+        Of the training meshes.
+    converged_steps
+        Steps by which the time-converged reference of the evaluation split divides
+        ``step``; 0 leaves it out.
+    """
+
+    name: Name
+    seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]
+    family: FamilyName
+    setting: Literal["as-published", "exact"]
+    coarse_nodes: tuple[PositiveCount, PositiveCount] | None = None
+    cell_size: Positive = 0.05
+    step: Positive = 0.01
+    frames: PositiveCount
+    tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
+    material: MaterialRange
+    motion: MotionRange
+    reference: Reference = Reference()
+    converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
+    training: Split
+    evaluation: Split
+    validation_share: Share = 0.1
+    extra: tuple[ExtraSplit, ...] = ()
+
+    @model_validator(mode="after")
+    def _names(self) -> DatasetConfig:
+        names = [split.name for split in self.extra]
+        if len(set(names)) != len(names) or set(names) & {TRAINING, VALIDATION, EVALUATION}:
+            raise ValueError("expected each extra split to have a name of its own")
+        return self
+
+    @classmethod
+    def load(cls, path: str | Path) -> DatasetConfig:
+        """Read a configuration from a TOML file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, is not TOML, or a key is wrong.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
+            raise InputError(f"{path}: cannot be read ({reason}).") from None
+        return cls.from_toml(text, str(path))
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "configuration") -> DatasetConfig:
+        """Read a configuration from TOML text; ``source`` names it in messages."""
+        try:
+            return cls(**tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{source}: not valid TOML: {error}.") from None
+        except ValidationError as error:
+            raise InputError(f"{source}: {_explain(error)}") from None
+
+    def to_toml(self) -> str:
+        """The configuration as TOML, with every default written out."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+    def hash(self) -> str:
+        """SHA-256 of the configuration's content."""
+        content: Any = self.model_dump(mode="json")
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _explain(error: ValidationError) -> str:
+    sentences = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"]) or "the configuration"
+        if item["type"] == "extra_forbidden":
+            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
+        elif item["type"] == "missing":
+            sentences.append(f"{key}: missing; a value is required.")
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            sentences.append(f"{key} = {item['input']!r:.80}: {message}.")
+    return " ".join(sentences)

@@ -1,0 +1,295 @@
+"""What a data set consists of: its meshes and, one by one, its simulations.
+
+Everything is drawn from streams of random numbers that are named by the configuration's
+seed, the split, the mesh, the simulation and the attempt, so that any part can be
+generated alone, in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pdcorrect.data.config import (
+    EVALUATION,
+    TRAINING,
+    VALIDATION,
+    DatasetConfig,
+    ExtraSplit,
+    FamilyName,
+    MaterialRange,
+    MotionRange,
+    Split,
+)
+from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
+from pdcorrect.errors import InputError
+from pdcorrect.scene import Scene
+
+_DRAWS = 10_000
+"""Bodies that are drawn for a mesh before giving up on one that is not there yet."""
+
+
+@dataclass(frozen=True)
+class MeshPlan:
+    """One mesh with its material: the unit of generation, and one file of the data set.
+
+    Attributes
+    ----------
+    split : str
+    number : int
+        Of the mesh in its split.
+    design : Design
+        In cells.
+    young, poisson, density : float
+        Pa, dimensionless, kg/m3.
+    simulations : int
+    step, frames
+        Seconds and number of time steps.
+    refine : int
+        Of the reference.
+    strength_factor : float
+    stream : tuple of int
+        Name of the mesh's stream of random numbers.
+    """
+
+    split: str
+    number: int
+    design: Design
+    young: float
+    poisson: float
+    density: float
+    simulations: int
+    step: float
+    frames: int
+    refine: int
+    strength_factor: float
+    stream: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Of its file, without suffix, relative to the data set's folder."""
+        return f"{self.split}/mesh-{self.number:04d}"
+
+
+def make_plan(config: DatasetConfig) -> list[MeshPlan]:
+    """All meshes of a data set, no body twice.
+
+    In the training and the evaluation split the first mesh has the fewest and the second one
+    the most nodes of the family's range, where there are two or more.
+
+    Raises
+    ------
+    InputError
+        If the family has fewer bodies than the data set wants.
+    """
+    plans: list[MeshPlan] = []
+    known: set[str] = set()
+    splits: list[tuple[str, Split]] = [(TRAINING, config.training), (EVALUATION, config.evaluation)]
+    splits += [(extra.name, extra) for extra in config.extra]
+    for number, (name, split) in enumerate(splits):
+        found = list(_split(config, name, split, number, known))
+        if name == TRAINING:
+            found = _with_validation(found, config.validation_share)
+        plans += found
+    return plans
+
+
+def _split(
+    config: DatasetConfig, name: str, split: Split, number: int, known: set[str]
+) -> Iterator[MeshPlan]:
+    extra = split if isinstance(split, ExtraSplit) else ExtraSplit(name=name, **dict(split))
+    family = extra.family or config.family
+    own = config.coarse_nodes if family == config.family else None
+    nodes = own or (config.coarse_nodes if config.coarse_nodes else PUBLISHED[family].coarse)
+    for i in range(split.meshes):
+        stream = (config.seed, number, i)
+        rng = np.random.default_rng(stream)
+        published = number < 2 and split.meshes > 1
+        design = _new_design(family, nodes, i if published else 2, rng, known)
+        young, poisson, density = _material(config.material, extra, rng)
+        first, last = (split.simulations * k // split.meshes for k in (i, i + 1))
+        yield MeshPlan(
+            split=name,
+            number=i,
+            design=design,
+            young=young,
+            poisson=poisson,
+            density=density,
+            simulations=last - first,
+            step=config.step * extra.step_factor,
+            frames=config.frames * extra.frames_factor,
+            refine=extra.refine or config.reference.refine,
+            strength_factor=extra.strength_factor,
+            stream=stream,
+        )
+
+
+def _new_design(
+    family: FamilyName, nodes: tuple[int, int], i: int, rng: np.random.Generator, known: set[str]
+) -> Design:
+    for _ in range(_DRAWS):
+        design = extreme(family, nodes, i == 1, rng) if i < 2 else draw(family, nodes, rng)
+        if design.key() not in known:
+            known.add(design.key())
+            return design
+    raise InputError(
+        f"family {family!r} with {nodes[0]} to {nodes[1]} nodes: expected more than the "
+        f"{len(known)} different bodies that were found. Ask for fewer meshes or a wider range."
+    )
+
+
+def _material(
+    material: MaterialRange, extra: ExtraSplit, rng: np.random.Generator
+) -> tuple[float, float, float]:
+    low, high = extra.young or material.young
+    young = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+    poisson = float(rng.uniform(*(extra.poisson or material.poisson)))
+    return young, poisson, float(rng.uniform(*material.density))
+
+
+def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
+    """The same with the last ``share`` of the training meshes as validation split."""
+    count = round(share * len(meshes))
+    kept = len(meshes) - count
+    moved = [
+        MeshPlan(**{**vars(mesh), "split": VALIDATION, "number": i})
+        for i, mesh in enumerate(meshes[kept:])
+    ]
+    return meshes[:kept] + moved
+
+
+def draw_scene(config: DatasetConfig, mesh: MeshPlan, simulation: int, attempt: int = 0) -> Scene:
+    """A simulation's scene, for the plain coarse model.
+
+    Parameters
+    ----------
+    config : DatasetConfig
+    mesh : MeshPlan
+    simulation : int
+        Its number on the mesh.
+    attempt : int
+        Counts the draws of this simulation's load: those before were rejected.
+    """
+    rng = np.random.default_rng((*mesh.stream, 1 + simulation, attempt))
+    published = config.setting == "as-published"
+    cell = config.cell_size
+    return Scene(
+        name=f"{config.name}/{mesh.name}/{simulation}",
+        body={**mesh.design.shape, "cell_size": cell},
+        material={
+            "young": mesh.young, "poisson": mesh.poisson, "density": mesh.density,
+            "volume_weight": "published" if published else "lame",
+        },
+        time={"step": mesh.step, "frames": mesh.frames},
+        clamps=[{"region": _region(box, cell)} for box in mesh.design.clamps],
+        loads=[_LOADS[config.motion.kind](config, mesh, rng)],
+        solver={
+            "mass": "per-node" if published else "lumped", "element": "hex8",
+            "tolerance": config.tolerance,
+        },
+    )  # fmt: skip
+
+
+def _region(box: Box, cell: float) -> dict[str, Any]:
+    return {"box": [[cell * c for c in corner] for corner in box]}
+
+
+def _strength(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> float:
+    return mesh.strength_factor * float(rng.uniform(*config.motion.strength))
+
+
+def _torsion(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+    """Eq. 6-1 to 6-3 about the central beam's axis.
+
+    Published: sigma is a force on each coarse node.  Exact: the density that gives an
+    inner node of the coarse mesh that force, sigma over the cell's volume.
+    """
+    motion, cell = config.motion, config.cell_size
+    density = mesh.density * _strength(config, mesh, rng)
+    published = config.setting == "as-published"
+    attraction, stretch = rng.uniform(*motion.attraction), rng.uniform(*motion.stretch)
+    turn = 1.0 if rng.random() < 0.5 else -1.0
+    return {
+        "kind": "torsion",
+        "strength": turn * density * (cell**3 if published else 1.0),
+        "attraction": turn * attraction,
+        "stretch": turn * stretch * cell,
+        "centre": [0.0, cell, cell],
+        "distribution": "nodal" if published else "consistent",
+    }
+
+
+def _impulse(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+    """A force on one side of the loaded part, in a random direction."""
+    motion = config.motion
+    force = _part_mass(config, mesh) * _strength(config, mesh, rng) / motion.duration
+    direction = rng.normal(size=3)
+    direction *= force / np.linalg.norm(direction)
+    side = _sides(mesh.design)[int(rng.integers(4))]
+    return {
+        **_side_load(config, side, direction),
+        "window": [0.0, motion.duration],
+    }
+
+
+def _stretch(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+    """A force on all sides of the loaded part, mostly along its axis."""
+    motion = config.motion
+    force = _part_mass(config, mesh) * _strength(config, mesh, rng)
+    axis = np.array(mesh.design.axis)
+    across = rng.normal(size=3)
+    across -= axis * (across @ axis)
+    across *= rng.uniform(*motion.transverse) / np.linalg.norm(across)
+    return {
+        **_part_load(config, mesh.design.loaded, force * (axis + across)),
+        "ramp": motion.duration,
+    }
+
+
+_LOADS = {"torsion": _torsion, "impulse": _impulse, "stretch": _stretch}
+
+
+def _part_mass(config: DatasetConfig, mesh: MeshPlan) -> float:
+    """Density times the volume of the loaded part, kg."""
+    low, high = np.array(mesh.design.loaded)
+    return float(mesh.density * np.prod(config.cell_size * (high - low)))
+
+
+def _sides(design: Design) -> list[Box]:
+    """The four faces of the loaded part along its axis, as flat boxes."""
+    low, high = (np.array(corner) for corner in design.loaded)
+    along = int(np.argmax(np.abs(design.axis)))
+    faces: list[Box] = []
+    for axis in {0, 1, 2} - {along}:
+        for at in (low, high):
+            first, last = low.copy(), high.copy()
+            first[axis] = last[axis] = at[axis]
+            faces.append((tuple(first.tolist()), tuple(last.tolist())))
+    return faces
+
+
+def _side_load(config: DatasetConfig, side: Box, force: np.ndarray) -> dict[str, Any]:
+    """A force (N) spread over a face: its coarse nodes, or its area."""
+    if config.setting == "as-published":
+        return {
+            "kind": "force", "force": force.tolist(), "region": _region(side, config.cell_size),
+            "distribution": "nodal",
+        }  # fmt: skip
+    extent = np.subtract(side[1], side[0]) * config.cell_size
+    area = np.prod(extent[extent > 0])
+    return {
+        "kind": "traction", "traction": (force / area).tolist(),
+        "region": _region(side, config.cell_size),
+    }  # fmt: skip
+
+
+def _part_load(config: DatasetConfig, part: Box, force: np.ndarray) -> dict[str, Any]:
+    """A force (N) spread over a block: its coarse nodes, or its volume."""
+    nodal = config.setting == "as-published"
+    return {
+        "kind": "force", "force": force.tolist(), "region": _region(part, config.cell_size),
+        "distribution": "nodal" if nodal else "consistent",
+    }  # fmt: skip

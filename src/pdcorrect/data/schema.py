@@ -1,0 +1,260 @@
+"""What a file of a data set holds: one mesh with its material, and its simulations.
+
+The layout of the HDF5 file, version 1 (``docs/data_format.md``)::
+
+    /                     attributes: format, version, dataset, split, number, setting,
+                          config_hash, time_step, tolerance, content_hash
+    mesh/points           (N, 3) float64   rest positions of the coarse mesh, m
+    mesh/cells            (C, 8) int32     nodes of each cell, VTK order
+    mesh/free             (N, 3) bool      components that may move
+    mesh/mass             (N,) float64     lumped masses of the plain coarse model, kg
+    material/young        (C,) float64     Pa
+    material/poisson      (C,) float64
+    material/density      (C,) float64     kg/m3
+    simulations/KKKK/     attributes: attempt, scene (TOML), rejected (list of str)
+      forces              (T, N, 3)        nodal forces of the plain coarse model, N, step by step
+      runs/NAME/          attributes: what the run is (solver, refine, element, mass, ...)
+        positions         (T+1, N, 3)      on the coarse nodes, m; frame 0 is the rest shape
+        predictions       (T, N, 3)        one step from each frame of the reference, m
+        iterations, error_estimates (m), smallest_volume_ratios   (T,)
+    provenance/           attributes: code version, hardware, date; not part of the hash
+    cost/KKKK             attributes: seconds by run; not part of the hash
+
+Arrays without a type are float32 or, by choice, float64.  A run has positions,
+predictions or both.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import FileFormatError, OutputError
+from pdcorrect.replacement import replacing
+
+FORMAT = "pdcorrect-dataset"
+VERSION = 1
+REFERENCE = "reference"
+SUFFIX = ".h5"
+_UNHASHED = ("provenance", "cost")
+_HASH = "content_hash"
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One model's answer, on the coarse nodes.
+
+    Attributes
+    ----------
+    positions : (T+1, N, 3) or None
+        Free rollout from rest, m.
+    predictions : (T, N, 3) or None
+        Positions after one step from each frame of the reference but the last, m.
+    statistics : mapping of str to (T,) arrays
+        Of the rollout, or of the predictions where there is none: ``iterations``,
+        ``error_estimates`` (m) and ``smallest_volume_ratios`` (det F at quadrature points).
+    attributes : mapping of str to str, int or float
+        Solver, refine, element, mass, time_step, ...
+    """
+
+    positions: Array | None = None
+    predictions: Array | None = None
+    statistics: Mapping[str, Array] = field(default_factory=dict)
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """One load on a mesh and what the models make of it.
+
+    Attributes
+    ----------
+    forces : (T, N, 3)
+        Nodal forces of the plain coarse model, N.
+    runs : mapping of str to Run
+        "reference" and others.
+    scene_toml : str
+        Of the plain coarse model; empty for imported data.
+    attempt : int
+        How many draws were rejected before.
+    rejected : tuple of str
+        Why, one each.
+    seconds : mapping of str to float
+        Cost by run.
+    """
+
+    forces: Array
+    runs: Mapping[str, Run]
+    scene_toml: str = ""
+    attempt: int = 0
+    rejected: tuple[str, ...] = ()
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.forces)
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """One file: a mesh, its material, its simulations.
+
+    Attributes
+    ----------
+    attributes : mapping
+        dataset, split, number, setting, config_hash, time_step (s), tolerance (of the
+        cell size).
+    points, cells, free, mass, young, poisson, density
+        See the layout.
+    simulations : tuple of Simulation
+    provenance : mapping of str to str
+    """
+
+    attributes: Mapping[str, str | int | float]
+    points: Array
+    cells: Array
+    free: Array
+    mass: Array
+    young: Array
+    poisson: Array
+    density: Array
+    simulations: tuple[Simulation, ...]
+    provenance: Mapping[str, str] = field(default_factory=dict)
+
+
+MESH = {
+    "points": ("mesh/points", np.float64, ("N", 3)),
+    "cells": ("mesh/cells", np.int32, ("C", 8)),
+    "free": ("mesh/free", np.bool_, ("N", 3)),
+    "mass": ("mesh/mass", np.float64, ("N",)),
+    "young": ("material/young", np.float64, ("C",)),
+    "poisson": ("material/poisson", np.float64, ("C",)),
+    "density": ("material/density", np.float64, ("C",)),
+}
+"""Arrays of a `Shard`: place, type and shape."""
+STATISTICS = {
+    "iterations": np.int32,
+    "error_estimates": np.float32,
+    "smallest_volume_ratios": np.float32,
+}
+ATTRIBUTES = {
+    "dataset": str, "split": str, "number": int, "setting": str, "config_hash": str,
+    "time_step": float, "tolerance": float,
+}  # fmt: skip
+"""Attributes of a `Shard` and their types."""
+
+
+def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
+    """Write a file whole or not at all; returns the hash of its content.
+
+    Parameters
+    ----------
+    path : Path
+        In a folder that need not exist.
+    shard : Shard
+    dtype : {"float32", "float64"}
+        Of forces and positions.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=("v110", "v110"), track_order=False) as file:
+        _fill(file, shard, np.dtype(dtype))
+        found = content_hash(file)
+        file.attrs[_HASH] = found
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part, open(part, "wb") as stream:
+            stream.write(image.getbuffer())
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+    return found
+
+
+def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
+    file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+    file.attrs.update(dict(shard.attributes))
+    for name, (place, kind, _) in MESH.items():
+        file[place] = np.asarray(getattr(shard, name), dtype=kind)
+    for k, simulation in enumerate(shard.simulations):
+        group = file.create_group(f"simulations/{k:04d}")
+        group.attrs["attempt"] = simulation.attempt
+        group.attrs["scene"] = simulation.scene_toml
+        group.attrs["rejected"] = np.array(simulation.rejected, dtype=h5py.string_dtype())
+        _array(group, "forces", simulation.forces, dtype)
+        for name, run in simulation.runs.items():
+            _fill_run(group.create_group(f"runs/{name}"), run, dtype)
+        cost = file.create_group(f"cost/{k:04d}")
+        cost.attrs.update(dict(simulation.seconds))
+    file.create_group("provenance").attrs.update(dict(shard.provenance))
+
+
+def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
+    group.attrs.update(dict(run.attributes))
+    for name in ("positions", "predictions"):
+        if getattr(run, name) is not None:
+            _array(group, name, getattr(run, name), dtype)
+    for name, values in run.statistics.items():
+        group[name] = np.asarray(values, dtype=STATISTICS[name])
+
+
+def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) -> None:
+    group.create_dataset(
+        name, data=np.asarray(values, dtype=dtype), chunks=values.shape, compression="gzip",
+        shuffle=True, fletcher32=True,
+    )  # fmt: skip
+
+
+def content_hash(file: h5py.File) -> str:
+    """SHA-256 of all datasets and attributes but those of provenance and cost."""
+    digest = hashlib.sha256()
+    for name, item in _items(file):
+        digest.update(name.encode())
+        for key in sorted(item.attrs):
+            if key != _HASH:
+                digest.update(f"{key}={np.asarray(item.attrs[key]).tolist()!r};".encode())
+        if isinstance(item, h5py.Dataset):
+            values = item[()]
+            digest.update(f"{values.dtype.str}{values.shape}".encode())
+            digest.update(np.ascontiguousarray(values).tobytes())
+    return digest.hexdigest()
+
+
+def _items(group: h5py.Group, prefix: str = "/") -> Iterator[tuple[str, Any]]:
+    yield prefix, group
+    for name in sorted(group):
+        if prefix == "/" and name in _UNHASHED:
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            yield from _items(item, f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", item
+
+
+def read_shard(path: Path) -> Shard:
+    """Read a file of a data set.
+
+    Raises
+    ------
+    FileFormatError
+        If it is damaged or is something else; the message names the file and the reason.
+    """
+    raise NotImplementedError(f"{path}: {FileFormatError}")
