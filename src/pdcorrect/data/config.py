@@ -12,7 +12,7 @@ import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
 from pdcorrect.errors import InputError
-from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
+from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
@@ -146,7 +146,7 @@ class DatasetConfig(Strict):
         forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
         sum to rho V, the volume weight of the material asked for, loads integrated on each
         mesh, the best coarse model beside the plain one, its element in the reference.
-    coarsest_nodes
+    coarse_nodes
         Fewest and most nodes of a coarse mesh; the family's own by default.
     cell_size, step
         m and s.
@@ -157,6 +157,9 @@ class DatasetConfig(Strict):
     converged_steps
         Steps by which the time-converged reference of the evaluation split divides
         ``step``; 0 leaves it out.
+    finest_meshes
+        On so many meshes of the evaluation split, a run with cells half as long as the
+        reference's tells how exact it is.
     """
 
     name: Name
@@ -172,6 +175,7 @@ class DatasetConfig(Strict):
     motion: MotionRange
     reference: Reference = Reference()
     converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
+    finest_meshes: Count = 0
     training: Split
     evaluation: Split
     validation_share: Share = 0.1

@@ -21,7 +21,6 @@ from pdcorrect.data.config import (
     ExtraSplit,
     FamilyName,
     MaterialRange,
-    MotionRange,
     Split,
 )
 from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
