@@ -232,7 +232,9 @@ class _Reader:
                     f"{_words(place)} has no {name!r}: expected one of {', '.join(names)}"
                 )
         self._noted(group, place)
-        return {name: self._run(group, place, name) for name in (wanted or names)}
+        return {
+            name: self._run(group, place, name) for name in (names if wanted is None else wanted)
+        }
 
     def _run(self, runs: h5py.Group, place: str, name: str) -> Run:
         group, place = self._group(runs, place, name), f"{place}/{name}"
