@@ -1,0 +1,90 @@
+"""The commands ``pdcorrect dataset ...``.  Each imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Check, summarise and convert data sets.")
+
+Folder = Annotated[Path, typer.Argument(help="Folder of the data set.", show_default=False)]
+
+_UNFIT = 1
+"""Exit status of `check` if it finds errors."""
+
+
+@app.command()
+def check(folder: Folder) -> None:
+    """Read every file, compare it with config.toml and the others, print what is wrong.
+
+    The exit status is 1 if there are errors; warnings do not count.
+    """
+    from pdcorrect.data.check import check_dataset, shard_paths
+
+    count = len(shard_paths(folder))
+    with _progress("checking", count) as advance:
+        findings = check_dataset(folder, on_file=advance)
+    for finding in findings:
+        typer.echo(str(finding))
+    errors = sum(finding.severity == "error" for finding in findings)
+    typer.echo(f"{count} files, {errors} errors, {len(findings) - errors} warnings")
+    if errors:
+        raise typer.Exit(_UNFIT)
+
+
+@app.command()
+def info(
+    folder: Folder,
+    json: Annotated[
+        Optional[Path], typer.Option(help="Also write all numbers to this file.")
+    ] = None,
+    figures: Annotated[
+        Optional[Path],
+        typer.Option(help="Also draw histograms and samples into this folder (extra 'view')."),
+    ] = None,
+) -> None:
+    """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
+    from rich.console import Console
+
+    from pdcorrect.data.info import dataset_files, measure_dataset, summarise
+
+    with _progress("reading", len(dataset_files(folder))) as advance:
+        meshes = measure_dataset(folder, on_file=advance)
+    found = summarise(folder.resolve().name, meshes)
+    Console().print(found.tables())
+    if json:
+        _write(json, found.to_json() + "\n")
+    if figures:
+        from pdcorrect.data.pictures import histograms, thumbnails
+        from pdcorrect.report import make_folder
+
+        make_folder(figures)
+        typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
+        typer.echo(f"wrote {thumbnails(folder, figures / 'samples.png')}")
+
+
+def _write(path: Path, text: str) -> None:
+    from pdcorrect.errors import OutputError
+    from pdcorrect.replacement import replacing
+
+    try:
+        with replacing(path) as part:
+            part.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    typer.echo(f"wrote {path}")
+
+
+@contextlib.contextmanager
+def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
+    """A bar on the terminal; gives what to call after each of ``count`` files."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(title, total=count)
+        yield lambda path: progress.advance(task)
