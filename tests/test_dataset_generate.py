@@ -135,7 +135,7 @@ def test_batches_agree_with_one_by_one():
     batched = Batched("cpu", config.tolerance, most=4)
     alone = OneByOne("pd", config.tolerance)
     found = [
-        simulate(config, plans, Engines(engine, engine)) for engine in (batched, alone)
+        simulate(config, plans, Engines(engine, engine, engine)) for engine in (batched, alone)
     ]  # fmt: skip
     for one, other in zip(*found, strict=True):
         for a, b in zip(one.simulations, other.simulations, strict=True):
@@ -170,7 +170,7 @@ def test_a_rejected_load_is_noted_and_drawn_again():
     config = small(frames=1, training={"meshes": 1, "simulations": 2})
     plan = make_plan(config)[0]
     engine = Failing(2)
-    (shard,) = simulate(config, [plan], Engines(engine, engine))
+    (shard,) = simulate(config, [plan], Engines(engine, engine, engine))
     first, second = shard.simulations
     assert (first.attempt, second.attempt) == (2, 0)
     assert first.rejected == ("reference, step 1: broke",) * 2
@@ -181,7 +181,7 @@ def test_loads_that_are_never_accepted_are_an_error():
     config = small(frames=1, training={"meshes": 1, "simulations": 1})
     engine = Failing(1000)
     with pytest.raises(ConvergenceError, match="20 loads were drawn and all rejected"):
-        simulate(config, make_plan(config)[:1], Engines(engine, engine))
+        simulate(config, make_plan(config)[:1], Engines(engine, engine, engine))
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):

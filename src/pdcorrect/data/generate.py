@@ -18,7 +18,7 @@ from typing import Any
 import numba
 
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.engines import Engine, OneByOne
+from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import CONFIG, MANIFEST, SUFFIX, write_shard
 from pdcorrect.data.shard_reader import read_shard, stored_hash
@@ -27,6 +27,7 @@ from pdcorrect.environment import environment
 from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
 from pdcorrect.replacement import part_of, replacing
 
+LARGEST_BATCHED = 40_000
 OnFile = Callable[[str, int, int], None]
 """Called with a finished file's name, and how many simulations of how many are there now."""
 
@@ -180,17 +181,21 @@ def produce(
 
 
 def make_engines(config: DatasetConfig, device: str) -> Engines:
-    """The engines for a device; Newton steps one problem after the other on the CPU."""
+    """The engines for a device.
+
+    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, whose dense inverses
+    would not fit, step one problem after the other on the CPU.
+    """
+    alone = OneByOne("pd", config.tolerance)
     newton = config.reference.solver == "newton"
     truth = OneByOne("newton", config.tolerance) if newton else None
     if device == "cpu":
-        own: Engine = OneByOne("pd", config.tolerance)
-        return Engines(own, truth or own)
+        return Engines(alone, truth or alone, truth or alone)
     require_extra("torch", "learn")
     from pdcorrect.data.batch_engine import Batched
 
-    own = Batched(device, config.tolerance)
-    return Engines(own, truth or own)
+    batched = Batched(device, config.tolerance)
+    return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
 
 
 def _compute(
