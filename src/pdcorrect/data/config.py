@@ -59,7 +59,7 @@ class MotionRange(Strict):
     ----------
     kind
         "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in
-        time.  "impulse": a force on one side of the body's inflated part during the first
+        time.  "impulse": a force on the body's inflated part (or free end) during the first
         ``duration`` seconds.  "stretch": a force on that part along the axis away from the
         clamps, with a transverse share, that rises during ``duration`` seconds and stays.
     strength
@@ -152,6 +152,8 @@ class DatasetConfig(Strict):
         m and s.
     tolerance
         Of each time step, of the coarse cell size.
+    dtype
+        In which positions and forces are stored.
     validation_share
         Of the training meshes.
     converged_steps
@@ -171,6 +173,7 @@ class DatasetConfig(Strict):
     step: Positive = 0.01
     frames: PositiveCount
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
+    dtype: Literal["float32", "float64"] = "float32"
     material: MaterialRange
     motion: MotionRange
     reference: Reference = Reference()

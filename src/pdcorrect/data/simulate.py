@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -21,8 +21,6 @@ PLAIN = "plain"
 MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
 
-OnDone = Callable[[int], None]
-
 
 @dataclass(frozen=True)
 class Model:
@@ -39,6 +37,8 @@ class Model:
         Parts of each time step.
     heavy : bool
         Density scaled so that the mass is the reference's.
+    truth : bool
+        Stepped by the reference's solver.
     sample : bool
         For the first simulation of the mesh only.
     """
@@ -48,14 +48,27 @@ class Model:
     predict: bool = False
     divisor: int = 1
     heavy: bool = False
+    truth: bool = False
     sample: bool = False
+
+
+@dataclass(frozen=True)
+class Engines:
+    """What steps the models, and what steps the reference."""
+
+    models: Engine
+    truth: Engine
+
+    def of(self, model: Model) -> Engine:
+        """The engine for a run."""
+        return self.truth if model.truth else self.models
 
 
 def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     """The runs of a mesh by name, the reference first."""
     exact = config.setting == "exact"
     found = {
-        REFERENCE: Model(mesh.refine, best=exact),
+        REFERENCE: Model(mesh.refine, best=exact, truth=True),
         PLAIN: Model(1, predict=True),
     }
     if exact:
@@ -68,9 +81,11 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
         found["total-mass"] = Model(1, heavy=True)
     if mesh.split == EVALUATION:
         if config.converged_steps:
-            found["time-converged"] = Model(mesh.refine, best=exact, divisor=config.converged_steps)
+            found["time-converged"] = Model(
+                mesh.refine, best=exact, divisor=config.converged_steps, truth=True
+            )
         if mesh.number < config.finest_meshes:
-            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True)
+            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
     return found
 
 
@@ -167,9 +182,7 @@ class _Draft:
         return _Draft(self.meshed, self.number, scene, attempt, self.rejected)
 
 
-def simulate(
-    config: DatasetConfig, plans: Sequence[MeshPlan], engine: Engine, on_done: OnDone | None = None
-) -> list[Shard]:
+def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines) -> list[Shard]:
     """All simulations of some meshes of one split, computed together.
 
     A drawn load under which a run fails or inverts a cell is rejected and drawn again.
@@ -179,9 +192,7 @@ def simulate(
     config : DatasetConfig
     plans : sequence of MeshPlan
         Of one split.
-    engine : Engine
-    on_done : callable, optional
-        Called with the number of simulations that are finished, each time some are.
+    engines : Engines
 
     Raises
     ------
@@ -196,24 +207,22 @@ def simulate(
     ]
     finished: dict[tuple[str, int], _Draft] = {}
     while waiting:
-        _attempt(waiting, engine)
+        _attempt(waiting, engines)
         fine = [draft for draft in waiting if draft.alive]
         finished |= {(draft.meshed.plan.name, draft.number): draft for draft in fine}
-        if on_done and fine:
-            on_done(len(fine))
         waiting = [draft.again(config) for draft in waiting if not draft.alive]
     return [
         _shard(
             config,
             mesh,
             [finished[mesh.plan.name, k] for k in range(mesh.plan.simulations)],
-            engine,
+            engines,
         )
         for mesh in meshes
     ]
 
 
-def _attempt(drafts: Sequence[_Draft], engine: Engine) -> None:
+def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
     """Compute all runs, the cheapest first; a draft that fails takes no further part."""
     plan = drafts[0].meshed.plan
     names = {name: model for d in drafts for name, model in d.meshed.models.items()}
@@ -221,7 +230,8 @@ def _attempt(drafts: Sequence[_Draft], engine: Engine) -> None:
         chosen = [d for d in drafts if d.alive and d.wants(name)]
         if not chosen:
             continue
-        found = engine.rollouts([d.job(name) for d in chosen], plan.frames, names[name].divisor)
+        jobs, model = [d.job(name) for d in chosen], names[name]
+        found = engines.of(model).rollouts(jobs, plan.frames, model.divisor)
         for draft, steps in zip(chosen, found, strict=True):
             draft.keep(draft.steps, name, steps)
     for name in (n for n, model in names.items() if model.predict):
@@ -229,7 +239,7 @@ def _attempt(drafts: Sequence[_Draft], engine: Engine) -> None:
         if not chosen:
             continue
         states = [_states(d.steps[REFERENCE], d.meshed, plan.step) for d in chosen]
-        found = engine.predictions([d.job(name) for d in chosen], states)
+        found = engines.models.predictions([d.job(name) for d in chosen], states)
         for draft, steps in zip(chosen, found, strict=True):
             draft.keep(draft.predictions, name, steps)
 
@@ -242,7 +252,7 @@ def _states(reference: Steps, meshed: _Meshed, step: float) -> list[State]:
 
 
 def _shard(
-    config: DatasetConfig, meshed: _Meshed, drafts: Sequence[_Draft], engine: Engine
+    config: DatasetConfig, meshed: _Meshed, drafts: Sequence[_Draft], engines: Engines
 ) -> Shard:
     plan, plain = meshed.plan, meshed.problems[PLAIN]
     return Shard(
@@ -262,17 +272,17 @@ def _shard(
         young=plain.materials.young,
         poisson=plain.materials.poisson,
         density=plain.materials.density,
-        simulations=tuple(_simulation(draft, engine) for draft in drafts),
+        simulations=tuple(_simulation(draft, engines) for draft in drafts),
     )
 
 
-def _simulation(draft: _Draft, engine: Engine) -> Simulation:
+def _simulation(draft: _Draft, engines: Engines) -> Simulation:
     plan, plain = draft.meshed.plan, draft.job(PLAIN).problem
     times = plan.step * np.arange(plan.frames + 1)
     every = [*draft.steps.items(), *((n + " steps", s) for n, s in draft.predictions.items())]
     return Simulation(
         forces=np.stack([plain.external_forces(*span) for span in pairwise(times)]),
-        runs={name: _run(draft, name, engine) for name in draft.steps},
+        runs={name: _run(draft, name, engines) for name in draft.steps},
         scene_toml=draft.scene.to_toml(),
         attempt=draft.attempt,
         rejected=draft.rejected,
@@ -280,7 +290,7 @@ def _simulation(draft: _Draft, engine: Engine) -> Simulation:
     )
 
 
-def _run(draft: _Draft, name: str, engine: Engine) -> Run:
+def _run(draft: _Draft, name: str, engines: Engines) -> Run:
     steps, predictions = draft.steps[name], draft.predictions.get(name)
     problem, model = draft.meshed.problems[name], draft.meshed.models[name]
     rest = problem.positions[problem.mesh.coarse_nodes]
@@ -293,7 +303,7 @@ def _run(draft: _Draft, name: str, engine: Engine) -> Run:
             "smallest_volume_ratios": steps.smallest_volume_ratios,
         },
         attributes={
-            **engine.describe(),
+            **engines.of(model).describe(),
             "refine": model.refine,
             "nodes": len(problem.positions),
             "element": problem.element,
