@@ -9,22 +9,21 @@ import time
 
 import numpy as np
 import pytest
-from dataset_configs import small
 
 import pdcorrect as pc
+from dataset_configs import small
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
-from pdcorrect.data.generate import MANIFEST, Workers, generate, make_engines
+from pdcorrect.data.generate import Workers, generate, make_engines
 from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import ConvergenceError, InputError
 
 
 def all_shards(folder):
-    return {
-        str(p.relative_to(folder).with_suffix("")): read_shard(p) for p in folder.rglob("*.h5")
-    }
+    return {str(p.relative_to(folder).with_suffix("")): read_shard(p) for p in folder.rglob("*.h5")}
 
 
 def hashes(folder):
@@ -37,7 +36,8 @@ def generated(tmp_path_factory):
     seen = []
     config = small()
     assert generate(config, folder, on_file=lambda *row: seen.append(row))
-    assert seen == [(plan.name, plan.simulations) for plan in make_plan(config)]
+    names = [plan.name for plan in make_plan(config)]
+    assert seen == [(name, done, 4) for name, done in zip(names, (1, 3, 4), strict=True)]
     return config, folder
 
 
@@ -48,7 +48,7 @@ def test_a_generated_data_set_passes_its_check(generated):
 
 def test_its_runs_are_what_a_user_gets_from_the_scene(generated):
     config, folder = generated
-    plan = make_plan(config)[0]
+    plan = make_plan(config)[1]
     simulation = read_shard(folder / f"{plan.name}.h5").simulations[1]
     scene = pc.Scene.from_toml(simulation.scene_toml)
     assert scene == draw_scene(config, plan, 1, simulation.attempt)
@@ -70,7 +70,9 @@ def test_predictions_are_single_steps_from_the_reference(generated, name):
     config, folder = generated
     simulation = read_shard(folder / "training/mesh-0001.h5").simulations[0]
     scene = pc.Scene.from_toml(simulation.scene_toml)
-    stepper = pc.ProjectiveDynamics(pc.discretise(pc.best_coarse(scene) if name == "best" else scene))
+    stepper = pc.ProjectiveDynamics(
+        pc.discretise(pc.best_coarse(scene) if name == "best" else scene)
+    )
     truth = simulation.runs["reference"].positions.astype(float)
     before = np.concatenate([truth[:1], truth])[:-1]
     for t, prediction in enumerate(simulation.runs[name].predictions):
@@ -133,7 +135,7 @@ def test_batches_agree_with_one_by_one():
     batched = Batched("cpu", config.tolerance, most=4)
     alone = OneByOne("pd", config.tolerance)
     found = [
-        simulate(config, plans, Engines(engine, engine)) for engine in (batched, alone)
+        simulate(config, plans, Engines(engine, engine, engine)) for engine in (batched, alone)
     ]  # fmt: skip
     for one, other in zip(*found, strict=True):
         for a, b in zip(one.simulations, other.simulations, strict=True):
@@ -168,7 +170,7 @@ def test_a_rejected_load_is_noted_and_drawn_again():
     config = small(frames=1, training={"meshes": 1, "simulations": 2})
     plan = make_plan(config)[0]
     engine = Failing(2)
-    (shard,) = simulate(config, [plan], Engines(engine, engine))
+    (shard,) = simulate(config, [plan], Engines(engine, engine, engine))
     first, second = shard.simulations
     assert (first.attempt, second.attempt) == (2, 0)
     assert first.rejected == ("reference, step 1: broke",) * 2
@@ -179,7 +181,7 @@ def test_loads_that_are_never_accepted_are_an_error():
     config = small(frames=1, training={"meshes": 1, "simulations": 1})
     engine = Failing(1000)
     with pytest.raises(ConvergenceError, match="20 loads were drawn and all rejected"):
-        simulate(config, make_plan(config)[:1], Engines(engine, engine))
+        simulate(config, make_plan(config)[:1], Engines(engine, engine, engine))
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):
@@ -206,7 +208,7 @@ def test_a_damaged_file_is_made_again_and_a_whole_one_is_not(generated, tmp_path
     data[len(data) // 2] ^= 1
     target.write_bytes(data)
     done = []
-    assert generate(config, tmp_path, on_file=lambda name, _: done.append(name))
+    assert generate(config, tmp_path, on_file=lambda name, *_: done.append(name))
     assert done == ["training/mesh-0001"]
     assert hashes(tmp_path) == hashes(folder)
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dataset_configs import small
 
 import pdcorrect as pc
+from dataset_configs import small
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.families import PUBLISHED, draw, extreme, node_levels
 from pdcorrect.data.plan import draw_scene, make_plan

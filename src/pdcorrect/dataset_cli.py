@@ -18,6 +18,41 @@ _UNFIT = 1
 
 
 @app.command()
+def generate(
+    config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the data set.")],
+    workers: Annotated[
+        int, typer.Option(help="Processes on this machine (extra 'cluster' if several).", min=1)
+    ] = 1,
+    scheduler: Annotated[
+        Optional[str], typer.Option(help="Address of a Dask scheduler, to use its workers.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu, or cuda (extra 'learn').")] = "cpu",
+    batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
+    split: Annotated[Optional[list[str]], typer.Option(help="Only these splits.")] = None,
+    seconds: Annotated[
+        Optional[float], typer.Option(help="Begin nothing new after so many seconds.")
+    ] = None,
+) -> None:
+    """Compute a data set, or what is not there yet of one that was interrupted.
+
+    The files do not depend on the number of workers.  Exit status 1 if some are still missing.
+    """
+    from pdcorrect.data.config import DatasetConfig
+    from pdcorrect.data.generate import Workers
+    from pdcorrect.data.generate import generate as run
+
+    with _simulations() as on_file:
+        done = run(
+            DatasetConfig.load(config), output, Workers(workers, scheduler, device, batch),
+            splits=split, seconds=seconds, on_file=on_file,
+        )  # fmt: skip
+    typer.echo(f"{output}: {'complete' if done else 'files are still missing; start again'}")
+    if not done:
+        raise typer.Exit(_UNFIT)
+
+
+@app.command()
 def check(folder: Folder) -> None:
     """Read every file, compare it with config.toml and the others, print what is wrong.
 
@@ -65,6 +100,33 @@ def info(
         make_folder(figures)
         typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
         typer.echo(f"wrote {thumbnails(folder, figures / 'samples.png')}")
+
+
+@contextlib.contextmanager
+def _simulations() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with the time that is left, on a terminal or in a log."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TextColumn("simulations"), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("generating", total=None)
+
+        def on_file(name: str, done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total, description=name)
+
+        yield on_file
 
 
 def _write(path: Path, text: str) -> None:

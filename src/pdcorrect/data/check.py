@@ -13,14 +13,24 @@ import numpy as np
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import REFERENCE, SUFFIX, Array, Run, Shard, Simulation
+from pdcorrect.data.schema import (
+    CONFIG,
+    MANIFEST,
+    NORMALISATION,
+    REFERENCE,
+    SUFFIX,
+    Array,
+    Run,
+    Shard,
+    Simulation,
+)
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import HexMesh
 
 Severity = Literal["error", "warning"]
-CONFIG = "config.toml"
+_OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
 _NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
 _DIGITS = 6
 """Decimals, in cells, to which meshes are compared."""
@@ -147,7 +157,7 @@ class _Check:
             if path.suffix == ".part":
                 text = "left over from a write that was interrupted; it may be deleted"
                 self.findings.append(Finding(path, "warning", text))
-            elif path not in paths and path != self.folder / CONFIG:
+            elif path not in paths and path not in [self.folder / name for name in _OTHERS]:
                 self.findings.append(Finding(path, "warning", "not part of the data set"))
 
     def _gaps(self, paths: list[Path]) -> None:

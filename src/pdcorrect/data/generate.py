@@ -18,19 +18,18 @@ from typing import Any
 import numba
 
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.engines import Engine, OneByOne
+from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import SUFFIX, write_shard
-from pdcorrect.data.shard_reader import read_hash
+from pdcorrect.data.schema import CONFIG, MANIFEST, SUFFIX, write_shard
+from pdcorrect.data.shard_reader import read_shard, stored_hash
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.environment import environment
-from pdcorrect.errors import InputError, OutputError, require_extra
+from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
 from pdcorrect.replacement import part_of, replacing
 
-CONFIG, MANIFEST = "config.toml", "manifest.json"
-
-OnFile = Callable[[str, int], None]
-"""Called with a finished file's name and its number of simulations."""
+LARGEST_BATCHED = 40_000
+OnFile = Callable[[str, int, int], None]
+"""Called with a finished file's name, and how many simulations of how many are there now."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +100,12 @@ def generate(
     missing = [plan for plan in chosen if not is_done(config, folder, plan)]
     units = _units(missing, workers)
     deadline = None if seconds is None else time.monotonic() + seconds
-    for names, counts in _compute(config, folder, units, workers, deadline):
-        for name, count in zip(names, counts, strict=True):
+    total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
+    for unit in _compute(config, folder, units, workers, deadline):
+        for plan in unit:
+            left -= plan.simulations
             if on_file:
-                on_file(name, count)
+                on_file(plan.name, total - left, total)
     return _write_manifest(config, folder, plans)
 
 
@@ -114,7 +115,11 @@ def is_done(config: DatasetConfig, folder: Path, plan: MeshPlan) -> bool:
     part_of(path).unlink(missing_ok=True)  # of a writer that was killed
     if not path.exists():
         return False
-    return bool(shard_header(path)["config_hash"] == config.hash())
+    try:
+        found = read_shard(path, simulations=())
+    except FileFormatError:  # made again
+        return False
+    return found.attributes["config_hash"] == config.hash()
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:
@@ -162,9 +167,9 @@ def _units(plans: Sequence[MeshPlan], workers: Workers) -> list[list[MeshPlan]]:
 
 
 def produce(
-    config: DatasetConfig, folder: Path, plans: Sequence[MeshPlan], device: str
-) -> tuple[list[str], list[int]]:
-    """Compute and write some meshes' files; their names and numbers of simulations."""
+    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
+) -> list[MeshPlan]:
+    """Compute and write some meshes' files."""
     engines = make_engines(config, device)
     with one_thread():
         shards = simulate(config, plans, engines)
@@ -172,21 +177,25 @@ def produce(
     for plan, shard in zip(plans, shards, strict=True):
         path = folder / f"{plan.name}{SUFFIX}"
         write_shard(path, replace(shard, provenance=provenance), config.dtype)
-    return [plan.name for plan in plans], [plan.simulations for plan in plans]
+    return plans
 
 
 def make_engines(config: DatasetConfig, device: str) -> Engines:
-    """The engines for a device; Newton steps one problem after the other on the CPU."""
+    """The engines for a device.
+
+    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, whose dense inverses
+    would not fit, step one problem after the other on the CPU.
+    """
+    alone = OneByOne("pd", config.tolerance)
     newton = config.reference.solver == "newton"
     truth = OneByOne("newton", config.tolerance) if newton else None
     if device == "cpu":
-        own: Engine = OneByOne("pd", config.tolerance)
-        return Engines(own, truth or own)
+        return Engines(alone, truth or alone, truth or alone)
     require_extra("torch", "learn")
     from pdcorrect.data.batch_engine import Batched
 
-    own = Batched(device, config.tolerance)
-    return Engines(own, truth or own)
+    batched = Batched(device, config.tolerance)
+    return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
 
 
 def _compute(
@@ -195,7 +204,7 @@ def _compute(
     units: Sequence[list[MeshPlan]],
     workers: Workers,
     deadline: float | None,
-) -> Iterator[tuple[list[str], list[int]]]:
+) -> Iterator[list[MeshPlan]]:
     """Units in order of completion."""
     if workers.scheduler is None and min(workers.count, len(units)) < 2:
         for unit in units:
@@ -216,11 +225,11 @@ def _distributed(
     units: Sequence[list[MeshPlan]],
     workers: Workers,
     deadline: float | None,
-) -> Iterator[tuple[list[str], list[int]]]:
+) -> Iterator[list[MeshPlan]]:
     """The same on Dask workers: a unit is handed out when a worker is free."""
     distributed = require_extra("distributed", "cluster")
     folder = folder.resolve()
-    with _client(distributed, workers) as client:
+    with _client(distributed, workers) as client, client.as_current():
         threads = client.nthreads()
         if not threads:
             raise InputError(f"the scheduler at {workers.scheduler} has no workers: start some.")
@@ -245,13 +254,13 @@ def _client(distributed: Any, workers: Workers) -> Any:
     if workers.scheduler is not None:
         return distributed.Client(workers.scheduler, set_as_default=False)
     names = {"n_workers": workers.count, "threads_per_worker": 1, "processes": True}
-    cluster = distributed.LocalCluster(**names, dashboard_address=None, memory_limit=0)
+    cluster = distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
     return distributed.Client(cluster, set_as_default=False)
 
 
 def _work(
-    config: DatasetConfig, folder: Path, plans: Sequence[MeshPlan], device: str
-) -> tuple[list[str], list[int]]:
+    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
+) -> list[MeshPlan]:
     """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
     if device == "cuda":
         import torch
@@ -291,7 +300,7 @@ def _write_manifest(config: DatasetConfig, folder: Path, plans: Sequence[MeshPla
     """List the files' hashes if all are there."""
     if not all(is_done(config, folder, plan) for plan in plans):
         return False
-    hashes = {p.name: read_hash(folder / f"{p.name}{SUFFIX}") for p in plans}
+    hashes = {p.name: stored_hash(folder / f"{p.name}{SUFFIX}") for p in plans}
     whole = hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
     content = {
         "dataset": config.name,

@@ -101,8 +101,7 @@ def _split(
 ) -> Iterator[MeshPlan]:
     extra = split if isinstance(split, ExtraSplit) else ExtraSplit(name=name, **dict(split))
     family = extra.family or config.family
-    own = config.coarse_nodes if family == config.family else None
-    nodes = own or (config.coarse_nodes if config.coarse_nodes else PUBLISHED[family].coarse)
+    nodes = config.coarse_nodes or PUBLISHED[family].coarse
     for i in range(split.meshes):
         stream = (config.seed, number, i)
         rng = np.random.default_rng(stream)

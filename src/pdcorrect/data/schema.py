@@ -45,6 +45,8 @@ from pdcorrect.replacement import replacing
 
 REFERENCE = "reference"
 SUFFIX = ".h5"
+CONFIG, MANIFEST, NORMALISATION = "config.toml", "manifest.json", "statistics.json"
+"""Files of a data set besides those of its meshes."""
 HASH = "content_hash"
 """Attribute of the file."""
 _UNHASHED = ("provenance", "cost")

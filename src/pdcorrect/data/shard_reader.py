@@ -97,6 +97,18 @@ def read_shard(
         raise FileFormatError(f"{path}: damaged, HDF5 cannot read it ({reason}).") from error
 
 
+def stored_hash(path: Path) -> str:
+    """The hash of its content that a file holds, after comparing the file with its seal.
+
+    Raises
+    ------
+    FileFormatError
+        As `read_shard`.
+    """
+    with _opened(path, verify=True) as file:
+        return str(file.attrs[HASH])
+
+
 @contextlib.contextmanager
 def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
     if verify:

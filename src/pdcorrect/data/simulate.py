@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -54,13 +55,24 @@ class Model:
 
 @dataclass(frozen=True)
 class Engines:
-    """What steps the models, and what steps the reference."""
+    """What steps the models, the reference, and meshes that are too large for either.
+
+    Attributes
+    ----------
+    models, truth, large : Engine
+    largest : int
+        Nodes beyond which a mesh is ``large``'s.
+    """
 
     models: Engine
     truth: Engine
+    large: Engine
+    largest: int = sys.maxsize
 
-    def of(self, model: Model) -> Engine:
+    def of(self, model: Model, problem: Problem) -> Engine:
         """The engine for a run."""
+        if len(problem.positions) > self.largest:
+            return self.large
         return self.truth if model.truth else self.models
 
 
@@ -224,31 +236,43 @@ def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines)
 
 def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
     """Compute all runs, the cheapest first; a draft that fails takes no further part."""
-    plan = drafts[0].meshed.plan
     names = {name: model for d in drafts for name, model in d.meshed.models.items()}
     for name in sorted(names, key=lambda n: (names[n].refine, names[n].divisor)):
         chosen = [d for d in drafts if d.alive and d.wants(name)]
         if not chosen:
             continue
-        jobs, model = [d.job(name) for d in chosen], names[name]
-        found = engines.of(model).rollouts(jobs, plan.frames, model.divisor)
-        for draft, steps in zip(chosen, found, strict=True):
+        for draft, steps in zip(chosen, _rollouts(chosen, name, engines), strict=True):
             draft.keep(draft.steps, name, steps)
     for name in (n for n, model in names.items() if model.predict):
         chosen = [d for d in drafts if d.alive]
         if not chosen:
             continue
-        states = [_states(d.steps[REFERENCE], d.meshed, plan.step) for d in chosen]
+        states = [_states(d.steps[REFERENCE], d.meshed) for d in chosen]
         found = engines.models.predictions([d.job(name) for d in chosen], states)
         for draft, steps in zip(chosen, found, strict=True):
             draft.keep(draft.predictions, name, steps)
 
 
-def _states(reference: Steps, meshed: _Meshed, step: float) -> list[State]:
+def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Steps]:
+    """One run of some drafts; each by the engine that its mesh needs."""
+    jobs = [draft.job(name) for draft in drafts]
+    model, frames = drafts[0].meshed.models[name], drafts[0].meshed.plan.frames
+    by_engine: dict[int, list[int]] = {}
+    for i, job in enumerate(jobs):
+        by_engine.setdefault(id(engines.of(model, job.problem)), []).append(i)
+    out: dict[int, Steps] = {}
+    for chosen in by_engine.values():
+        engine = engines.of(model, jobs[chosen[0]].problem)
+        found = engine.rollouts([jobs[i] for i in chosen], frames, model.divisor)
+        out |= dict(zip(chosen, found, strict=True))
+    return [out[i] for i in range(len(jobs))]
+
+
+def _states(reference: Steps, meshed: _Meshed) -> list[State]:
     """The reference's frames but the last, on the coarse nodes (Algorithms 1 and 2)."""
     rest = meshed.problems[PLAIN].rest_state()
     later = zip(reference.positions[:-1], reference.velocities[:-1], strict=True)
-    return [rest, *(State(p, v, (t + 1) * step) for t, (p, v) in enumerate(later))]
+    return [rest, *(State(p, v, (t + 1) * meshed.plan.step) for t, (p, v) in enumerate(later))]
 
 
 def _shard(
@@ -303,7 +327,7 @@ def _run(draft: _Draft, name: str, engines: Engines) -> Run:
             "smallest_volume_ratios": steps.smallest_volume_ratios,
         },
         attributes={
-            **engines.of(model).describe(),
+            **engines.of(model, problem).describe(),
             "refine": model.refine,
             "nodes": len(problem.positions),
             "element": problem.element,
