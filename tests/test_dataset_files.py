@@ -27,7 +27,7 @@ from pdcorrect.data.schema import (
     content_of,
     write_shard,
 )
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.shard_reader import read_shard, stored_hash
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.io.trajectory import save_trajectory
 
@@ -742,6 +742,18 @@ def test_a_short_simulation_is_found(dataset):
 
     changed(dataset / FIRST, spoil)
     assert one(dataset) == "simulation 0001 has 3 frames: expected 5"
+
+
+def test_a_content_other_than_the_manifest_has_is_found(dataset):
+    names = [plan.name for plan in make_plan(sample_config())]
+    hashes = {name: stored_hash(dataset / f"{name}.h5") for name in names}
+    (dataset / "manifest.json").write_text(json.dumps({"files": hashes}))
+    assert findings(dataset) == []
+    changed(dataset / FIRST, lambda s: with_simulation(s, 1, scene_toml="another"))
+    assert one(dataset) == "its content is not that of which manifest.json has the hash"
+    for text in ('{"files": 3}', "[]", "{}", "{", "[" * 100000):
+        (dataset / "manifest.json").write_text(text)
+        assert "expected the hashes of all files" in one(dataset, "manifest.json")
 
 
 def test_reasons_and_attempts_that_differ_are_found(dataset):
