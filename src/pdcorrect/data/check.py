@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from pdcorrect.data.schema import (
     Shard,
     Simulation,
 )
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.shard_reader import read_shard, stored_hash
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import HexMesh
@@ -99,6 +100,7 @@ def check_dataset(
         raise InputError(f"{folder}: not a folder: expected that of a data set.")
     check = _Check(folder)
     check.load_config()
+    check.load_manifest()
     paths = shard_paths(folder)
     check.files(paths)
     for path in paths:
@@ -118,6 +120,8 @@ class _Check:
         If it could be read.
     plans : dict of Path to MeshPlan, or None
         Of the files that should be there.
+    hashes : dict of str to str, or None
+        Hashes of the files' contents by the manifest, if there is one.
     meshes, bodies : dict of str to Path
         First file with a mesh, and with a mesh and its material, by their digests.
     forces : dict of str to str
@@ -128,6 +132,7 @@ class _Check:
     findings: list[Finding] = field(default_factory=list)
     config: DatasetConfig | None = None
     plans: dict[Path, MeshPlan] | None = None
+    hashes: dict[str, Any] | None = None
     meshes: dict[str, Path] = field(default_factory=dict)
     bodies: dict[str, Path] = field(default_factory=dict)
     forces: dict[str, str] = field(default_factory=dict)
@@ -146,6 +151,16 @@ class _Check:
             self.error(path, _reason(path, error))
             return
         self.plans = {self.folder / f"{plan.name}{SUFFIX}": plan for plan in plans}
+
+    def load_manifest(self) -> None:
+        """Read the hashes that the manifest lists; unfinished data sets have none."""
+        path = self.folder / MANIFEST
+        if not path.exists():
+            return
+        try:
+            self.hashes = dict(json.loads(path.read_text(encoding="utf-8"))["files"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            self.error(path, "cannot be read: expected the hashes of all files, as JSON")
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""
@@ -199,6 +214,9 @@ class _Check:
         for name, value in wanted.items():
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
+        name = self._short(path).removesuffix(SUFFIX)
+        if self.hashes is not None and self.hashes.get(name) != stored_hash(path):
+            yield f"its content is not that of which {MANIFEST} has the hash"
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"
         if plan is not None:

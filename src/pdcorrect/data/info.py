@@ -458,7 +458,8 @@ def _cost_table(info: DatasetInfo) -> Any:
     table = _table("cost", "split", "run", "s", "s a simulation")
     for split_name, split in _rows(info):
         for number, (name, seconds) in enumerate(split.seconds.items()):
-            each = _text(seconds / split.simulations)
+            run = split.runs.get(name.removesuffix(" steps"))
+            each = _text(seconds / (run.simulations if run else split.simulations))
             table.add_row("" if number else split_name, name, _text(seconds), each)
     return table
 
