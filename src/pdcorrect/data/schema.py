@@ -38,7 +38,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import FileFormatError, OutputError
+from pdcorrect.errors import OutputError
 from pdcorrect.replacement import replacing
 
 FORMAT = "pdcorrect-dataset"
@@ -247,14 +247,3 @@ def _items(group: h5py.Group, prefix: str = "/") -> Iterator[tuple[str, Any]]:
             yield from _items(item, f"{prefix}{name}/")
         else:
             yield f"{prefix}{name}", item
-
-
-def read_shard(path: Path) -> Shard:
-    """Read a file of a data set.
-
-    Raises
-    ------
-    FileFormatError
-        If it is damaged or is something else; the message names the file and the reason.
-    """
-    raise NotImplementedError(f"{path}: {FileFormatError}")
