@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from pdcorrect import dataset_cli
 from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
 from pdcorrect.interruption import Terminated, terminable
 
@@ -23,6 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
 )
+
+app.add_typer(dataset_cli.app, name="dataset")
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 

@@ -81,7 +81,7 @@ def export_meshgraphnet(
         splits.insert(0, splits.pop(splits.index(TRAINING)))
     common: dict[str, Any] | None = None
     for split in splits:
-        name = _SPLITS.get(split, split)
+        name = _SPLITS.get(split, f"extra-{split}" if split in _SPLITS.values() else split)
         path = target / f"{name}.h5"
         meta = _write_split(path, folder, split, base)
         written.append(path)
@@ -242,13 +242,12 @@ def _positions(simulation: Simulation, name: str) -> Array:
 
 def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path) -> Path:
     step = float(shard.attributes["time_step"])
-    positions = _positions(simulation, name).astype(np.float64)
-    # A run of other frames than the reference's ends with the shorter of the two.
-    reference = _positions(simulation, REFERENCE)[: len(positions)].astype(np.float64)
-    positions = positions[: len(reference)]
+    positions, reference = (
+        np.asarray(_positions(simulation, each), dtype=np.float64) for each in (name, REFERENCE)
+    )
     forces = np.concatenate([np.zeros((1, *shard.points.shape)), simulation.forces])
     trajectory = Trajectory(
-        positions, velocities(positions, step), step * np.arange(len(positions)), {},
+        positions, velocities(positions, step), np.arange(len(positions), dtype=np.float64) * step, {},
         shard.points, shard.cells.astype(np.int64),
     )  # fmt: skip
 

@@ -252,7 +252,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     def _load(self, number: int) -> _Shard:
         path = self.headers[number].path
         mesh, motions = read_arrays(path, (self.base,) if self.base else (), self.runs)
-        return _tensors(mesh, motions, self.dtype)
+        return _tensors(mesh, motions, self.base, self.dtype)
 
 
 class TrajectoryLoader(DataLoader[Any]):
@@ -291,7 +291,7 @@ class TrajectoryLoader(DataLoader[Any]):
             **options,
         )
 
-    def __iter__(self) -> Iterator[Batch]:
+    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
         """One epoch, or what is left of it."""
         done = 0 if self.shuffle is None else self.shuffle.start
         for found in super().__iter__():
@@ -353,7 +353,9 @@ def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> N
             )
 
 
-def _tensors(mesh: MeshArrays, motions: Sequence[MotionArrays], dtype: torch.dtype) -> _Shard:
+def _tensors(
+    mesh: MeshArrays, motions: Sequence[MotionArrays], base: str | None, dtype: torch.dtype
+) -> _Shard:
     def tensor(values: NDArray[Any]) -> Tensor:
         found = torch.from_numpy(values)
         return found.to(dtype) if found.is_floating_point() else found
@@ -368,8 +370,8 @@ def _tensors(mesh: MeshArrays, motions: Sequence[MotionArrays], dtype: torch.dty
                 positions=tensor(motion.positions),
                 velocities=tensor(motion.velocities),
                 steps={
-                    **{"predictions": tensor(x) for x in motion.predictions.values()},
                     "forces": tensor(motion.forces),
+                    **({"predictions": tensor(motion.predictions[base])} if base else {}),
                 },
                 rollouts={f"run_{name}": tensor(x) for name, x in motion.rollouts.items()},
             )
@@ -467,7 +469,7 @@ class _Packed:
             start = -(-end // _ALIGNMENT) * _ALIGNMENT
             end = start + math.prod(shape) * first.element_size()
             layout[name] = (start, end, first.dtype, shape)
-        storage = torch.UntypedStorage._new_shared(end)
+        storage = torch.UntypedStorage._new_shared(end)  # type: ignore[no-untyped-call]
         packed = cls(torch.empty(0, dtype=torch.uint8).set_(storage), layout, sizes)
         for name, tensors in parts.items():
             torch.cat(tensors, _joined_along(name), out=packed.field(name))
