@@ -37,5 +37,5 @@ $(VENV)/view.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	@touch $@
 
 $(VENV)/dev.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(INSTALL) -e ".[view,learn,dev]"
+	$(INSTALL) -e ".[view,learn,cluster,dev]"
 	@touch $(VENV)/view.stamp $@

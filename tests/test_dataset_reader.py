@@ -452,7 +452,9 @@ def test_statistics_are_those_of_all_values_of_the_training_split(folder):
         found = statistics[name]
         assert found.count.tolist() == np.isfinite(values).sum(axis=0).tolist()
         np.testing.assert_allclose(found.mean, np.nanmean(values, axis=0), rtol=1e-9, atol=1e-13)
-        np.testing.assert_allclose(found.deviation, np.nanstd(values, axis=0), rtol=1e-9)
+        np.testing.assert_allclose(
+            found.deviation, np.nanstd(values, axis=0), rtol=1e-9, atol=1e-13
+        )
         np.testing.assert_allclose(found.minimum, np.nanmin(values, axis=0), rtol=1e-12)
         np.testing.assert_allclose(found.maximum, np.nanmax(values, axis=0), rtol=1e-12)
 

@@ -1,7 +1,9 @@
-"""The program's commands for data sets, ``pdcorrect dataset``."""
+"""The commands ``pdcorrect dataset ...``.  Each imports what it needs when it runs."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Optional
@@ -10,9 +12,12 @@ import typer
 
 from pdcorrect.errors import InputError
 
-app = typer.Typer(no_args_is_help=True, help="Data sets for networks that correct coarse runs.")
+app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
 
 Folder = Annotated[Path, typer.Argument(help="Folder of the data set.", show_default=False)]
+
+_UNFIT = 1
+"""Exit status of `check` if it finds errors."""
 
 
 class Layout(StrEnum):
@@ -20,6 +25,92 @@ class Layout(StrEnum):
 
     meshgraphnet = "meshgraphnet"
     vtu = "vtu"
+
+
+@app.command()
+def generate(
+    config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the data set.")],
+    workers: Annotated[
+        int, typer.Option(help="Processes on this machine (extra 'cluster' if several).", min=1)
+    ] = 1,
+    scheduler: Annotated[
+        Optional[str], typer.Option(help="Address of a Dask scheduler, to use its workers.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="cpu, or cuda (extra 'learn').")] = "cpu",
+    batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
+    split: Annotated[Optional[list[str]], typer.Option(help="Only these splits.")] = None,
+    seconds: Annotated[
+        Optional[float], typer.Option(help="Begin nothing new after so many seconds.")
+    ] = None,
+) -> None:
+    """Compute a data set, or what is not there yet of one that was interrupted.
+
+    The files do not depend on the number of workers.  Exit status 1 if some are still missing.
+    """
+    from pdcorrect.data.config import DatasetConfig
+    from pdcorrect.data.generate import Workers
+    from pdcorrect.data.generate import generate as run
+
+    with _simulations() as on_file:
+        done = run(
+            DatasetConfig.load(config), output, Workers(workers, scheduler, device, batch),
+            splits=split, seconds=seconds, on_file=on_file,
+        )  # fmt: skip
+    typer.echo(f"{output}: {'complete' if done else 'files are still missing; start again'}")
+    if not done:
+        raise typer.Exit(_UNFIT)
+
+
+@app.command()
+def check(folder: Folder) -> None:
+    """Read every file, compare it with config.toml and the others, print what is wrong.
+
+    The exit status is 1 if there are errors; warnings do not count.
+    """
+    from pdcorrect.data.check import check_dataset
+    from pdcorrect.data.folder import all_shards
+
+    count = len(all_shards(folder))
+    with _progress("checking", count) as advance:
+        findings = check_dataset(folder, on_file=advance)
+    for finding in findings:
+        typer.echo(str(finding))
+    errors = sum(finding.severity == "error" for finding in findings)
+    typer.echo(f"{count} files, {errors} errors, {len(findings) - errors} warnings")
+    if errors:
+        raise typer.Exit(_UNFIT)
+
+
+@app.command()
+def info(
+    folder: Folder,
+    json: Annotated[
+        Optional[Path], typer.Option(help="Also write all numbers to this file.")
+    ] = None,
+    figures: Annotated[
+        Optional[Path],
+        typer.Option(help="Also draw histograms and samples into this folder (extra 'view')."),
+    ] = None,
+) -> None:
+    """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
+    from rich.console import Console
+
+    from pdcorrect.data.info import dataset_files, measure_dataset, summarise
+
+    with _progress("reading", len(dataset_files(folder))) as advance:
+        meshes = measure_dataset(folder, on_file=advance)
+    found = summarise(folder.resolve().name, meshes)
+    Console().print(found.tables())
+    if json:
+        _write(json, found.to_json() + "\n")
+    if figures:
+        from pdcorrect.data.pictures import histograms, thumbnails
+        from pdcorrect.report import make_folder
+
+        make_folder(figures)
+        typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
+        typer.echo(f"wrote {thumbnails(folder, figures / 'samples.png')}")
 
 
 @app.command("export")
@@ -75,3 +166,53 @@ def import_(
         sources, output, coarse=coarse or (), split=split, number=number, starts_at_rest=not moved
     )
     typer.echo(f"wrote {path}")
+
+
+@contextlib.contextmanager
+def _simulations() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar with the time that is left, on a terminal or in a log."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TextColumn("simulations"), TimeElapsedColumn(), TextColumn("left"),
+        TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("generating", total=None)
+
+        def on_file(name: str, done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total, description=name)
+
+        yield on_file
+
+
+def _write(path: Path, text: str) -> None:
+    from pdcorrect.errors import OutputError
+    from pdcorrect.replacement import replacing
+
+    try:
+        with replacing(path) as part:
+            part.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    typer.echo(f"wrote {path}")
+
+
+@contextlib.contextmanager
+def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
+    """A bar on the terminal; gives what to call after each of ``count`` files."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(title, total=count)
+        yield lambda path: progress.advance(task)

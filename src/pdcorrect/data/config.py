@@ -12,7 +12,7 @@ import tomli_w
 from pydantic import Field, ValidationError, model_validator
 
 from pdcorrect.errors import InputError
-from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
+from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
@@ -59,7 +59,7 @@ class MotionRange(Strict):
     ----------
     kind
         "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in
-        time.  "impulse": a force on one side of the body's inflated part during the first
+        time.  "impulse": a force on the body's inflated part (or free end) during the first
         ``duration`` seconds.  "stretch": a force on that part along the axis away from the
         clamps, with a transverse share, that rises during ``duration`` seconds and stays.
     strength
@@ -146,17 +146,22 @@ class DatasetConfig(Strict):
         forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
         sum to rho V, the volume weight of the material asked for, loads integrated on each
         mesh, the best coarse model beside the plain one, its element in the reference.
-    coarsest_nodes
+    coarse_nodes
         Fewest and most nodes of a coarse mesh; the family's own by default.
     cell_size, step
         m and s.
     tolerance
         Of each time step, of the coarse cell size.
+    dtype
+        In which positions and forces are stored.
     validation_share
         Of the training meshes.
     converged_steps
         Steps by which the time-converged reference of the evaluation split divides
         ``step``; 0 leaves it out.
+    finest_meshes
+        On so many meshes of the evaluation split, a run with cells half as long as the
+        reference's tells how exact it is.
     """
 
     name: Name
@@ -168,10 +173,12 @@ class DatasetConfig(Strict):
     step: Positive = 0.01
     frames: PositiveCount
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
+    dtype: Literal["float32", "float64"] = "float32"
     material: MaterialRange
     motion: MotionRange
     reference: Reference = Reference()
     converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
+    finest_meshes: Count = 0
     training: Split
     evaluation: Split
     validation_share: Share = 0.1

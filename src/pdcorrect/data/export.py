@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.graph import node_means, tetrahedra, velocities
 from pdcorrect.data.schema import REFERENCE, SUFFIX, Shard, Simulation
-from pdcorrect.data.shard_arrays import shard_paths, splits_of
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
@@ -246,8 +246,9 @@ def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path)
         np.asarray(_positions(simulation, each), dtype=np.float64) for each in (name, REFERENCE)
     )
     forces = np.concatenate([np.zeros((1, *shard.points.shape)), simulation.forces])
+    times: NDArray[np.float64] = np.arange(len(positions), dtype=np.float64) * step
     trajectory = Trajectory(
-        positions, velocities(positions, step), np.arange(len(positions), dtype=np.float64) * step, {},
+        positions, velocities(positions, step), times, {},
         shard.points, shard.cells.astype(np.int64),
     )  # fmt: skip
 

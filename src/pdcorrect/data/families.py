@@ -143,9 +143,7 @@ def _count(family: FamilyName, size: Size, k: int) -> int:
     return section * layers + ((k * wide + 1) ** 2 - section) * (k * high + 1)
 
 
-def _place(
-    family: FamilyName, sizes: tuple[Size, ...], rng: np.random.Generator
-) -> Design:
+def _place(family: FamilyName, sizes: tuple[Size, ...], rng: np.random.Generator) -> Design:
     size = sizes[int(rng.integers(len(sizes)))]
     return _PLACES[family](size, rng)
 
@@ -189,4 +187,3 @@ def _weight(size: Size, rng: np.random.Generator) -> Design:
 
 
 _PLACES = {"beam": _beam, "cross": _cross, "weight": _weight}
-

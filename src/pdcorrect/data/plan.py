@@ -21,7 +21,6 @@ from pdcorrect.data.config import (
     ExtraSplit,
     FamilyName,
     MaterialRange,
-    MotionRange,
     Split,
 )
 from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
@@ -77,8 +76,8 @@ class MeshPlan:
 def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     """All meshes of a data set, no body twice.
 
-    In the training and the evaluation split the first mesh has the fewest and the second one
-    the most nodes of the family's range, where there are two or more.
+    The first mesh of the training split has the fewest and the second one the most nodes of
+    the family's range, where there are two or more.
 
     Raises
     ------
@@ -102,13 +101,12 @@ def _split(
 ) -> Iterator[MeshPlan]:
     extra = split if isinstance(split, ExtraSplit) else ExtraSplit(name=name, **dict(split))
     family = extra.family or config.family
-    own = config.coarse_nodes if family == config.family else None
-    nodes = own or (config.coarse_nodes if config.coarse_nodes else PUBLISHED[family].coarse)
+    nodes = config.coarse_nodes or PUBLISHED[family].coarse
     for i in range(split.meshes):
         stream = (config.seed, number, i)
         rng = np.random.default_rng(stream)
-        published = number < 2 and split.meshes > 1
-        design = _new_design(family, nodes, i if published else 2, rng, known)
+        ends = name == TRAINING and split.meshes > 1
+        design = _new_design(family, nodes, i if ends else 2, rng, known)
         young, poisson, density = _material(config.material, extra, rng)
         first, last = (split.simulations * k // split.meshes for k in (i, i + 1))
         yield MeshPlan(
@@ -223,26 +221,25 @@ def _torsion(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) ->
 
 
 def _impulse(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
-    """A force on one side of the loaded part, in a random direction."""
+    """A force on the loaded part in a random direction, for a short time."""
     motion = config.motion
-    force = _part_mass(config, mesh) * _strength(config, mesh, rng) / motion.duration
     direction = rng.normal(size=3)
-    direction *= force / np.linalg.norm(direction)
-    side = _sides(mesh.design)[int(rng.integers(4))]
+    direction /= np.linalg.norm(direction)
+    force = _part_mass(config, mesh) * _strength(config, mesh, rng) / motion.duration
     return {
-        **_side_load(config, side, direction),
+        **_part_load(config, mesh.design.loaded, force * direction),
         "window": [0.0, motion.duration],
     }
 
 
 def _stretch(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
-    """A force on all sides of the loaded part, mostly along its axis."""
+    """A force on the loaded part, mostly along its axis, that rises and stays."""
     motion = config.motion
-    force = _part_mass(config, mesh) * _strength(config, mesh, rng)
     axis = np.array(mesh.design.axis)
     across = rng.normal(size=3)
     across -= axis * (across @ axis)
     across *= rng.uniform(*motion.transverse) / np.linalg.norm(across)
+    force = _part_mass(config, mesh) * _strength(config, mesh, rng)
     return {
         **_part_load(config, mesh.design.loaded, force * (axis + across)),
         "ramp": motion.duration,
@@ -258,36 +255,8 @@ def _part_mass(config: DatasetConfig, mesh: MeshPlan) -> float:
     return float(mesh.density * np.prod(config.cell_size * (high - low)))
 
 
-def _sides(design: Design) -> list[Box]:
-    """The four faces of the loaded part along its axis, as flat boxes."""
-    low, high = (np.array(corner) for corner in design.loaded)
-    along = int(np.argmax(np.abs(design.axis)))
-    faces: list[Box] = []
-    for axis in {0, 1, 2} - {along}:
-        for at in (low, high):
-            first, last = low.copy(), high.copy()
-            first[axis] = last[axis] = at[axis]
-            faces.append((tuple(first.tolist()), tuple(last.tolist())))
-    return faces
-
-
-def _side_load(config: DatasetConfig, side: Box, force: np.ndarray) -> dict[str, Any]:
-    """A force (N) spread over a face: its coarse nodes, or its area."""
-    if config.setting == "as-published":
-        return {
-            "kind": "force", "force": force.tolist(), "region": _region(side, config.cell_size),
-            "distribution": "nodal",
-        }  # fmt: skip
-    extent = np.subtract(side[1], side[0]) * config.cell_size
-    area = np.prod(extent[extent > 0])
-    return {
-        "kind": "traction", "traction": (force / area).tolist(),
-        "region": _region(side, config.cell_size),
-    }  # fmt: skip
-
-
 def _part_load(config: DatasetConfig, part: Box, force: np.ndarray) -> dict[str, Any]:
-    """A force (N) spread over a block: its coarse nodes, or its volume."""
+    """A force (N) spread over a block: equally over its coarse nodes, or over its volume."""
     nodal = config.setting == "as-published"
     return {
         "kind": "force", "force": force.tolist(), "region": _region(part, config.cell_size),

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.cache import RecentlyUsed
+from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.sampling import ShardShuffle
 from pdcorrect.data.shard_arrays import (
     MeshArrays,
@@ -19,7 +20,6 @@ from pdcorrect.data.shard_arrays import (
     ShardHeader,
     read_arrays,
     read_header,
-    shard_paths,
 )
 from pdcorrect.errors import InputError, require_extra
 
@@ -83,14 +83,14 @@ class _Shard:
     edge_index: Tensor
     motions: list[_Motion]
 
-    @property
-    def bytes(self) -> int:
-        """What the tensors take."""
-        found = [self.cells, self.edge_index, *self.nodal.values(), *self.cellwise.values()]
-        for motion in self.motions:
-            found += [motion.positions, motion.velocities]
-            found += [*motion.steps.values(), *motion.rollouts.values()]
-        return sum(tensor.numel() * tensor.element_size() for tensor in found)
+
+def _bytes(shard: _Shard) -> int:
+    """What a file's tensors take."""
+    found = [shard.cells, shard.edge_index, *shard.nodal.values(), *shard.cellwise.values()]
+    for motion in shard.motions:
+        found += [motion.positions, motion.velocities]
+        found += [*motion.steps.values(), *motion.rollouts.values()]
+    return sum(tensor.numel() * tensor.element_size() for tensor in found)
 
 
 class _Place(NamedTuple):
@@ -188,7 +188,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
                 f"{self.folder}, {split}: no simulation has {window} steps, the longest "
                 f"{longest}: expected a smaller window."
             )
-        self._shards = RecentlyUsed(self._load, lambda shard: shard.bytes, cache_bytes)
+        self._shards = RecentlyUsed(self._load, _bytes, cache_bytes)
 
     def len(self) -> int:
         """Number of windows."""

@@ -1,6 +1,7 @@
 """What a file of a data set holds: one mesh with its material, and its simulations.
 
-The layout of the HDF5 file, version 1 (``docs/data_format.md``)::
+The layout of the HDF5 file, version 1 (``docs/data_format.md``), after its seal
+(`pdcorrect.data.seal`)::
 
     /                     attributes: format, version, dataset, split, number, setting,
                           config_hash, time_step, tolerance, content_hash
@@ -29,7 +30,7 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,17 +39,21 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import OutputError
 from pdcorrect.replacement import replacing
 
-FORMAT = "pdcorrect-dataset"
-VERSION = 1
 REFERENCE = "reference"
 SUFFIX = ".h5"
+CONFIG, MANIFEST, NORMALISATION = "config.toml", "manifest.json", "statistics.json"
+"""Files of a data set besides those of its meshes."""
+HASH = "content_hash"
+"""Attribute of the file."""
 _UNHASHED = ("provenance", "cost")
-_HASH = "content_hash"
 
 Array = NDArray[Any]
+Content = Mapping[str, Array | Mapping[str, Any]]
+"""Arrays of datasets and attributes of groups, by their places in a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +178,11 @@ def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
         If it cannot be written.
     """
     image = io.BytesIO()
-    with h5py.File(image, "w", libver=("v110", "v110"), track_order=False) as file:
+    with h5py.File(image, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK) as file:
         _fill(file, shard, np.dtype(dtype))
-        found = content_hash(file)
-        file.attrs[_HASH] = found
+        found = content_hash(content_of(file))
+        file.attrs[HASH] = found
+    seal(image.getbuffer())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as part, open(part, "wb") as stream:
@@ -191,6 +197,8 @@ def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
 def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     file.attrs.update(dict(shard.attributes))
+    for name, wanted in ATTRIBUTES.items():
+        file.attrs[name] = wanted(shard.attributes[name])
     for name, (place, kind, _) in MESH.items():
         file[place] = np.asarray(getattr(shard, name), dtype=kind)
     for k, simulation in enumerate(shard.simulations):
@@ -222,28 +230,29 @@ def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) ->
     )  # fmt: skip
 
 
-def content_hash(file: h5py.File) -> str:
-    """SHA-256 of all datasets and attributes but those of provenance and cost."""
+def content_hash(content: Content) -> str:
+    """SHA-256 of a file's content; see `content_of`."""
     digest = hashlib.sha256()
-    for name, item in _items(file):
-        digest.update(name.encode())
-        for key in sorted(item.attrs):
-            if key != _HASH:
-                digest.update(f"{key}={np.asarray(item.attrs[key]).tolist()!r};".encode())
-        if isinstance(item, h5py.Dataset):
-            values = item[()]
-            digest.update(f"{values.dtype.str}{values.shape}".encode())
-            digest.update(np.ascontiguousarray(values).tobytes())
+    for name in sorted(content, key=lambda place: place.split("/")):
+        item = content[name]
+        digest.update(f"{name}\n".encode())
+        if isinstance(item, np.ndarray):
+            digest.update(f"{item.dtype.str}{item.shape}\n".encode())
+            digest.update(np.ascontiguousarray(item).data)
+            continue
+        for key in sorted(item):
+            if key != HASH:
+                digest.update(f"{key}={np.asarray(item[key]).tolist()!r}\n".encode())
     return digest.hexdigest()
 
 
-def _items(group: h5py.Group, prefix: str = "/") -> Iterator[tuple[str, Any]]:
-    yield prefix, group
-    for name in sorted(group):
-        if prefix == "/" and name in _UNHASHED:
-            continue
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            yield from _items(item, f"{prefix}{name}/")
-        else:
-            yield f"{prefix}{name}", item
+def content_of(file: h5py.File) -> Content:
+    """Datasets, and attributes of groups, by place: all but provenance and cost."""
+    found: dict[str, Array | dict[str, Any]] = {"": dict(file.attrs)}
+
+    def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if name.split("/")[0] not in _UNHASHED:
+            found[name] = item[()] if isinstance(item, h5py.Dataset) else dict(item.attrs)
+
+    file.visititems(note)
+    return found

@@ -5,8 +5,7 @@ Files are opened, read and closed at once: nothing here keeps a handle.
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.graph import mesh_edges, node_means, velocities
-from pdcorrect.data.schema import _HASH, FORMAT, MESH, REFERENCE, SUFFIX, VERSION
-from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.data.schema import HASH, MESH, REFERENCE
+from pdcorrect.data.shard_reader import opened
 
 Array = NDArray[Any]
 
@@ -110,58 +109,6 @@ class MotionArrays:
     rollouts: dict[str, Array]
 
 
-def splits_of(folder: str | Path) -> list[str]:
-    """Names of the splits that a data set's folder has files of.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
-    folder = Path(folder)
-    found = sorted({path.parent.name for path in folder.glob(f"*/mesh-*{SUFFIX}")})
-    if not found:
-        raise InputError(
-            f"{folder}: no data set: expected folders of splits with files mesh-0000{SUFFIX}."
-        )
-    return found
-
-
-def shard_paths(folder: str | Path, split: str) -> list[Path]:
-    """Files of a split, by number.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
-    paths = sorted((Path(folder) / split).glob(f"mesh-*{SUFFIX}"))
-    if not paths:
-        names = ", ".join(splits_of(folder))
-        raise InputError(f"{folder}: no split {split!r}: expected one of {names}.")
-    return paths
-
-
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[h5py.File]:
-    """A file of a data set, open; everything that fails in it is a `FileFormatError`."""
-    try:
-        with h5py.File(path, "r") as file:
-            found = file.attrs.get("format")
-            if found != FORMAT:
-                raise FileFormatError(f"{path}: format {found!r}: expected {FORMAT!r}.")
-            if file.attrs["version"] != VERSION:
-                raise FileFormatError(
-                    f"{path}: layout version {file.attrs['version']}: expected {VERSION}."
-                )
-            yield file
-    except FileNotFoundError:
-        raise FileFormatError(f"{path}: there is no such file.") from None
-    except (OSError, KeyError) as error:
-        reason = " ".join(str(error).split())
-        raise FileFormatError(f"{path}: damaged or not a file of a data set ({reason}).") from None
-
-
 def read_header(path: Path) -> ShardHeader:
     """Sizes and names of a file of a data set.
 
@@ -170,7 +117,7 @@ def read_header(path: Path) -> ShardHeader:
     FileFormatError
         If it is damaged or something else.
     """
-    with opened(path) as file:
+    with opened(path, verify=False) as file:
         groups = _simulations(file)
         return ShardHeader(
             path=path,
@@ -181,7 +128,7 @@ def read_header(path: Path) -> ShardHeader:
             runs=tuple((_with(g, "positions"), _with(g, "predictions")) for g in groups),
             time_step=float(file.attrs["time_step"]),
             config_hash=str(file.attrs["config_hash"]),
-            content_hash=str(file.attrs[_HASH]),
+            content_hash=str(file.attrs[HASH]),
         )
 
 
@@ -201,7 +148,7 @@ def read_arrays(
     FileFormatError
         If the file is damaged, something else, or does not hold them.
     """
-    with opened(path) as file:
+    with opened(path, verify=False) as file:
         time_step = float(file.attrs["time_step"])
         motions = [_motion(g, time_step, predictions, rollouts) for g in _simulations(file)]
         return _mesh(file), motions

@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.config import TRAINING
+from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.schema import NORMALISATION
 from pdcorrect.data.shard_arrays import (
     MeshArrays,
     MotionArrays,
     ShardHeader,
     read_arrays,
     read_header,
-    shard_paths,
 )
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.replacement import replacing
 
-FILE = "statistics.json"
 VERSION = 1
 
 Array = NDArray[np.float64]
@@ -125,7 +125,7 @@ class Statistics:
         OutputError
             If it cannot be written.
         """
-        path = Path(folder) / FILE
+        path = Path(folder) / NORMALISATION
         content = {
             "version": VERSION,
             "config_hash": self.config_hash,
@@ -170,7 +170,7 @@ def load_statistics(folder: str | Path) -> Statistics:
     InputError
         If it was computed from other files than are there now.
     """
-    path = Path(folder) / FILE
+    path = Path(folder) / NORMALISATION
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = Statistics(
@@ -191,7 +191,8 @@ def load_statistics(folder: str | Path) -> Statistics:
     if (config_hash, shards) == (found.config_hash, dict(found.shards)):
         return found
     names = sorted(n for n in shards.keys() | found.shards if shards.get(n) != found.shards.get(n))
-    changed = f"{names[0]} (and {len(names) - 1} more)" if names else "the configuration"
+    more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
+    changed = f"{names[0]}{more}" if names else "the configuration"
     raise InputError(
         f"{path} is stale: {changed} has changed since: expected "
         "compute_statistics(folder).save(folder)."

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,7 +21,7 @@ from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
 from pdcorrect.fem.selection import Selector
-from pdcorrect.scene import MeshFile, Scene
+from pdcorrect.scene import Load, MeshFile, Scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -161,6 +163,22 @@ class Problem(ElasticBody):
         materials = self.materials.changed(self.scene.material, young, poisson, density)
         changed = ElasticBody(self.mesh, self.space, self.quadrature, materials, self.cell_size)
         return replace(problem_from_body(self.scene, self.refine, changed), material_changed=True)
+
+    def with_loads(self, loads: Sequence[Load | Mapping[str, Any]]) -> Problem:
+        """The same problem under other loads, each as in a scene's ``loads``.
+
+        Mesh, operators and masses are shared, and so are factors of steppers that look at
+        them: the loads only enter on the right-hand side.
+
+        Raises
+        ------
+        SceneError
+            If a load is malformed, selects nothing or acts on held components only.
+        """
+        scene = self.scene.with_changes(loads=list(loads))
+        selector = Selector(self.mesh, self.space.positions, self.cell_size)
+        found = assemble_loads(scene, self.space, selector, self.mass, self.free)
+        return replace(self, scene=scene, loads=found)
 
 
 def discretise(

@@ -39,27 +39,38 @@ class Sheet:
     view : View
         The panels' camera and size.
     labels : sequence of str
-        One for each column, in the first row; may have several lines.
+        One for each column, in the first row; may have several lines.  With ``columns``
+        one for each panel.
     rows : int
     bar : ColourBar or None
     font : float
         Height of the text, pixels.
+    columns : int, optional
+        As many as labels by default.
     """
 
     def __init__(
-        self, view: View, labels: Sequence[str], rows: int, bar: ColourBar | None, font: float
+        self,
+        view: View,
+        labels: Sequence[str],
+        rows: int,
+        bar: ColourBar | None,
+        font: float,
+        columns: int | None = None,
     ) -> None:
         figure = require_extra("matplotlib.figure", "view")
         agg = require_extra("matplotlib.backends.backend_agg", "view")
-        self._view, self._labels, self._rows, self._font = view, list(labels), rows, font
+        self._view, self._labels, self._font = view, list(labels), font
         lines = max(len(label.splitlines()) for label in labels)
+        self._columns = columns or len(labels)
+        self._panels = len(labels) if columns else rows * len(labels)
         self._gap = round(0.5 * font)
-        self._captions = [round((lines + 1) * _LINE * font + 1.2 * self._gap)]
-        self._captions += [round(_LINE * font + 1.2 * self._gap)] * (rows - 1)
+        captions = [lines] + [lines if columns else 0] * (rows - 1)
+        self._captions = [round((n + 1) * _LINE * font + 1.2 * self._gap) for n in captions]
         self._legend = round(4.2 * font)
         width, height = view.size
         total = sum(self._captions) + rows * height + self._legend
-        self.size = (_even(width * len(labels)), _even(total))
+        self.size = (_even(width * self._columns), _even(total))
         self._figure = figure.Figure(figsize=(self.size[0] / 100, self.size[1] / 100), dpi=100)
         self._canvas = agg.FigureCanvasAgg(self._figure)
         self._times: list[Any] = []
@@ -81,7 +92,7 @@ class Sheet:
             self._figure.draw_artist(text)
         page = np.array(self._canvas.buffer_rgba())[:, :, :3]
         for number, image in enumerate(images):
-            left, top = self._corner(*divmod(number, len(self._labels)))
+            left, top = self._corner(*divmod(number, self._columns))
             page[top : top + image.shape[0], left : left + image.shape[1]] = image
         return page
 
@@ -100,22 +111,22 @@ class Sheet:
     def _add_captions(self) -> None:
         pad, room = 2 * self._gap, self._view.size[0] - 3 * self._gap
         texts = []
-        for column, label in enumerate(self._labels):
-            x = self._corner(0, column)[0] + pad
+        for number, label in enumerate(self._labels):
+            left, below = self._corner(*divmod(number, self._columns))
+            x, top = left + pad, below - self._captions[number // self._columns] + self._gap
             for line, words in enumerate(label.splitlines()):
                 style = {"weight": "bold"} if line == 0 else {"color": _GREY}
-                y = self._gap + line * _LINE * self._font
+                y = top + line * _LINE * self._font
                 texts.append(self._text(x, y, words, self._font, **style))
         widest = max((t.get_window_extent().width for t in texts), default=0.0)
         font = self._font * min(1.0, room / max(widest, 1.0))
         for text in texts:
             text.set_fontsize(0.72 * font)
-        for row in range(self._rows):
-            for column in range(len(self._labels)):
-                x, y = self._corner(row, column)
-                y -= round(_LINE * self._font + 0.2 * self._gap)
-                time = self._text(x + pad, y, "", font, color=_GREY, animated=True)
-                self._times.append(time)
+        for number in range(self._panels):
+            x, y = self._corner(*divmod(number, self._columns))
+            y -= round(_LINE * self._font + 0.2 * self._gap)
+            time = self._text(x + pad, y, "", font, color=_GREY, animated=True)
+            self._times.append(time)
 
     def _add_scale(self) -> None:
         """A bar of round length, true in the plane of the picture."""

@@ -1,0 +1,198 @@
+"""Who computes the runs of a data set: `OneByOne` on the CPU; batches on a GPU elsewhere.
+
+An engine takes problems that may share meshes and materials, and gives, for each, a
+rollout or single steps from given states, on chosen nodes only.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.newton import Newton
+from pdcorrect.solvers.projective import ProjectiveDynamics
+from pdcorrect.state import State, StepResult
+
+Array = NDArray[np.float64]
+SolverName = Literal["pd", "newton"]
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """What came of T steps, on K of a problem's nodes.
+
+    Attributes
+    ----------
+    positions, velocities : (T, K, 3)
+        After each step, m and m/s.  Steps after a failure are missing.
+    iterations, error_estimates, smallest_volume_ratios : (T,)
+        Error estimates in m; det F at quadrature points.
+    failure : str
+        Why the run is of no use, with its first bad step; empty if it is fine.
+    seconds : float
+        The share of the wall-clock time.
+    """
+
+    positions: Array
+    velocities: Array
+    iterations: NDArray[np.int64]
+    error_estimates: Array
+    smallest_volume_ratios: Array
+    failure: str
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A problem to be stepped, and the nodes whose motion is wanted."""
+
+    problem: Problem
+    nodes: NDArray[np.int64]
+
+
+class Engine(Protocol):
+    """Computes runs."""
+
+    def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
+        """Each problem from rest, ``steps`` time steps, each cut into ``divisor`` ones."""
+
+    def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
+        """One step from each state of each problem, as long as they all succeed."""
+
+    def describe(self) -> dict[str, str]:
+        """The solver and what it runs on."""
+
+
+class OneByOne:
+    """One problem after the other, on the CPU.
+
+    Parameters
+    ----------
+    solver : {"pd", "newton"}
+    tolerance : float
+        Of the coarse cell size.
+    """
+
+    def __init__(self, solver: SolverName, tolerance: float) -> None:
+        self._solver, self._tolerance = solver, tolerance
+
+    def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
+        """See `Engine`."""
+        out = []
+        steppers: dict[int, Any] = {}
+        for job in jobs:
+            stepper = self._stepper(steppers, job.problem, divisor)
+            state = job.problem.rest_state()
+            log = _Log(job.nodes)
+            for _ in range(steps):
+                started = time.perf_counter()
+                worst = log.begin()
+                for _ in range(divisor):
+                    result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                    worst = worst.with_result(result)
+                    state = result.state
+                log.add(worst, state, time.perf_counter() - started)
+                if log.failure:
+                    break
+            out.append(log.steps())
+        return out
+
+    def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
+        """See `Engine`."""
+        out = []
+        steppers: dict[int, Any] = {}
+        for job, starts in zip(jobs, states, strict=True):
+            stepper = self._stepper(steppers, job.problem, 1)
+            log = _Log(job.nodes)
+            for state in starts:
+                started = time.perf_counter()
+                result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                log.add(
+                    log.begin().with_result(result), result.state, time.perf_counter() - started
+                )
+                if log.failure:
+                    break
+            out.append(log.steps())
+        return out
+
+    def describe(self) -> dict[str, str]:
+        """See `Engine`."""
+        return {"solver": self._solver, "engine": "one by one on the CPU"}
+
+    def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:
+        """One stepper, without loads, for all problems on the same mesh."""
+        key = id(problem.space)
+        if key not in known:
+            kind = {"pd": ProjectiveDynamics, "newton": Newton}[self._solver]
+            known[key] = kind(
+                problem.with_loads([]), self._tolerance, time_step=problem.time_step / divisor
+            )
+        return known[key]
+
+
+def _forces(problem: Problem, state: State, step: float) -> Array:
+    return problem.external_forces(state.time, state.time + step, state.positions)
+
+
+@dataclass(frozen=True)
+class _Worst:
+    """Of the steps inside a frame."""
+
+    iterations: int = 0
+    error_estimate: float = 0.0
+    volume_ratio: float = np.inf
+    failure: str = ""
+
+    def with_result(self, result: StepResult) -> _Worst:
+        ratio = min(self.volume_ratio, result.stats["smallest_volume_ratio"])
+        failure = self.failure
+        if not failure and not result.status.ok:
+            failure = result.status.value
+        if not failure and ratio <= 0.0:
+            failure = "a cell is inverted"
+        return _Worst(
+            self.iterations + result.iterations,
+            max(self.error_estimate, result.error_estimate),
+            ratio,
+            failure,
+        )
+
+
+class _Log:
+    """Rows of a `Steps` in the making."""
+
+    def __init__(self, nodes: NDArray[np.int64]) -> None:
+        self._nodes = nodes
+        self._states: list[tuple[Array, Array]] = []
+        self._rows: list[_Worst] = []
+        self._seconds = 0.0
+        self.failure = ""
+
+    @staticmethod
+    def begin() -> _Worst:
+        return _Worst()
+
+    def add(self, row: _Worst, state: State, seconds: float) -> None:
+        self._seconds += seconds
+        self._rows.append(row)
+        self._states.append((state.positions[self._nodes], state.velocities[self._nodes]))
+        if row.failure and not self.failure:
+            self.failure = f"step {len(self._rows)}: {row.failure}"
+
+    def steps(self) -> Steps:
+        positions, velocities = (np.stack(arrays) for arrays in zip(*self._states, strict=True))
+        return Steps(
+            positions,
+            velocities,
+            np.array([row.iterations for row in self._rows]),
+            np.array([row.error_estimate for row in self._rows]),
+            np.array([row.volume_ratio for row in self._rows]),
+            self.failure,
+            self._seconds,
+        )

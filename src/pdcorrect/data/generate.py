@@ -1,0 +1,313 @@
+"""`generate`: the files of a data set, in any order, by any number of workers.
+
+Each file is computed from the configuration alone and appears under its name only when it
+is whole, so an interrupted generation is continued by starting it again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.engines import OneByOne
+from pdcorrect.data.plan import MeshPlan, make_plan
+from pdcorrect.data.schema import CONFIG, MANIFEST, SUFFIX, write_shard
+from pdcorrect.data.shard_reader import read_shard, stored_hash
+from pdcorrect.data.simulate import Engines, simulate
+from pdcorrect.environment import environment
+from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
+from pdcorrect.replacement import part_of, replacing
+
+LARGEST_BATCHED = 40_000
+OnFile = Callable[[str, int, int], None]
+"""Called with a finished file's name, and how many simulations of how many are there now."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who computes.
+
+    Attributes
+    ----------
+    count : int
+        Processes on this machine, each with one thread.
+    scheduler : str or None
+        Address of a Dask scheduler whose workers are used instead.
+    device : str
+        "cpu": one simulation at a time.  "cuda": batches; with several workers on this
+        machine each takes a GPU of its own.
+    batch : int
+        Simulations that are computed together on a GPU.
+    """
+
+    count: int = 1
+    scheduler: str | None = None
+    device: str = "cpu"
+    batch: int = 32
+
+
+def generate(
+    config: DatasetConfig,
+    folder: str | Path,
+    workers: Workers = Workers(),
+    *,
+    splits: Sequence[str] | None = None,
+    seconds: float | None = None,
+    on_file: OnFile | None = None,
+) -> bool:
+    """Compute what is not there yet of a data set.
+
+    Parameters
+    ----------
+    config : DatasetConfig
+    folder : path
+        New, or of a generation of the same configuration that was interrupted.
+    workers : Workers
+    splits : sequence of str, optional
+        Only these.
+    seconds : float, optional
+        Begin nothing new after so much time.
+    on_file : callable, optional
+        For progress.
+
+    Returns
+    -------
+    bool
+        Whether the data set is complete; then ``manifest.json`` lists the hashes of its files.
+
+    Raises
+    ------
+    InputError
+        If the folder holds another data set, or a split is unknown.
+    ConvergenceError
+        If the loads are so strong that no draw is accepted.
+    OutputError
+        If a file cannot be written.
+    """
+    folder = Path(folder)
+    _claim(config, folder)
+    plans = make_plan(config)
+    chosen = _chosen(plans, splits)
+    missing = [plan for plan in chosen if not is_done(config, folder, plan)]
+    units = _units(missing, workers)
+    deadline = None if seconds is None else time.monotonic() + seconds
+    total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
+    for unit in _compute(config, folder, units, workers, deadline):
+        for plan in unit:
+            left -= plan.simulations
+            if on_file:
+                on_file(plan.name, total - left, total)
+    return _write_manifest(config, folder, plans)
+
+
+def is_done(config: DatasetConfig, folder: Path, plan: MeshPlan) -> bool:
+    """Whether a mesh's file is there, whole, and of this configuration."""
+    path = folder / f"{plan.name}{SUFFIX}"
+    part_of(path).unlink(missing_ok=True)  # of a writer that was killed
+    if not path.exists():
+        return False
+    try:
+        found = read_shard(path, simulations=())
+    except FileFormatError:  # made again
+        return False
+    return found.attributes["config_hash"] == config.hash()
+
+
+def _claim(config: DatasetConfig, folder: Path) -> None:
+    """Make the folder this configuration's, or find that it is."""
+    path = folder / CONFIG
+    if path.exists():
+        if DatasetConfig.load(path).hash() != config.hash():
+            raise InputError(
+                f"{path} is another configuration: expected a new folder, or the one that this "
+                "data set was begun in."
+            )
+        return
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as part:
+            part.write_text(config.to_toml(), encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+
+
+def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[MeshPlan]:
+    if splits is None:
+        return list(plans)
+    known = list(dict.fromkeys(plan.split for plan in plans))
+    unknown = sorted(set(splits) - set(known))
+    if unknown:
+        raise InputError(f"splits {', '.join(unknown)}: expected some of {', '.join(known)}.")
+    return [plan for plan in plans if plan.split in splits]
+
+
+def _units(plans: Sequence[MeshPlan], workers: Workers) -> list[list[MeshPlan]]:
+    """What is computed together: a mesh on a CPU, some meshes of one split on a GPU."""
+    if workers.device == "cpu":
+        return [[plan] for plan in plans]
+    units: list[list[MeshPlan]] = []
+    count = 0
+    for plan in plans:
+        fits = count + plan.simulations <= workers.batch
+        if not units or units[-1][0].split != plan.split or not fits:
+            units.append([])
+            count = 0
+        units[-1].append(plan)
+        count += plan.simulations
+    return units
+
+
+def produce(
+    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
+) -> list[MeshPlan]:
+    """Compute and write some meshes' files."""
+    engines = make_engines(config, device)
+    with one_thread():
+        shards = simulate(config, plans, engines)
+    provenance = _provenance(device)
+    for plan, shard in zip(plans, shards, strict=True):
+        path = folder / f"{plan.name}{SUFFIX}"
+        write_shard(path, replace(shard, provenance=provenance), config.dtype)
+    return plans
+
+
+def make_engines(config: DatasetConfig, device: str) -> Engines:
+    """The engines for a device.
+
+    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, whose dense inverses
+    would not fit, step one problem after the other on the CPU.
+    """
+    alone = OneByOne("pd", config.tolerance)
+    newton = config.reference.solver == "newton"
+    truth = OneByOne("newton", config.tolerance) if newton else None
+    if device == "cpu":
+        return Engines(alone, truth or alone, truth or alone)
+    require_extra("torch", "learn")
+    from pdcorrect.data.batch_engine import Batched
+
+    batched = Batched(device, config.tolerance)
+    return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
+
+
+def _compute(
+    config: DatasetConfig,
+    folder: Path,
+    units: Sequence[list[MeshPlan]],
+    workers: Workers,
+    deadline: float | None,
+) -> Iterator[list[MeshPlan]]:
+    """Units in order of completion."""
+    if workers.scheduler is None and min(workers.count, len(units)) < 2:
+        for unit in units:
+            if _over(deadline):
+                return
+            yield produce(config, folder, unit, workers.device)
+        return
+    yield from _distributed(config, folder, units, workers, deadline)
+
+
+def _over(deadline: float | None) -> bool:
+    return deadline is not None and time.monotonic() > deadline
+
+
+def _distributed(
+    config: DatasetConfig,
+    folder: Path,
+    units: Sequence[list[MeshPlan]],
+    workers: Workers,
+    deadline: float | None,
+) -> Iterator[list[MeshPlan]]:
+    """The same on Dask workers: a unit is handed out when a worker is free."""
+    distributed = require_extra("distributed", "cluster")
+    folder = folder.resolve()
+    with _client(distributed, workers) as client, client.as_current():
+        threads = client.nthreads()
+        if not threads:
+            raise InputError(f"the scheduler at {workers.scheduler} has no workers: start some.")
+        waiting = iter(units)
+        running = distributed.as_completed(raise_errors=True)
+
+        def hand_out() -> None:
+            unit = None if _over(deadline) else next(waiting, None)
+            if unit is not None:
+                call = client.submit(_work, config, folder, unit, workers.device, pure=False)
+                running.add(call)
+
+        for _ in range(sum(threads.values())):
+            hand_out()
+        for future in running:
+            yield future.result()
+            hand_out()
+
+
+def _client(distributed: Any, workers: Workers) -> Any:
+    """A client of the given scheduler, or of new processes on this machine."""
+    if workers.scheduler is not None:
+        return distributed.Client(workers.scheduler, set_as_default=False)
+    names = {"n_workers": workers.count, "threads_per_worker": 1, "processes": True}
+    cluster = distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
+    return distributed.Client(cluster, set_as_default=False)
+
+
+def _work(
+    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
+) -> list[MeshPlan]:
+    """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
+    if device == "cuda":
+        import torch
+        from distributed import get_worker
+
+        name = str(get_worker().name)
+        if name.isdigit():
+            device = f"cuda:{int(name) % torch.cuda.device_count()}"
+    return produce(config, folder, plans, device)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Kernels on one thread, so that the numbers do not depend on how many there are."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+def _provenance(device: str) -> dict[str, str]:
+    date = time.strftime("%Y-%m-%d", time.gmtime())
+    return {**environment(), "threads": "1", "device": _device_name(device), "date": date}
+
+
+def _device_name(device: str) -> str:
+    if not device.startswith("cuda"):
+        return device
+    import torch
+
+    return str(torch.cuda.get_device_name(device))
+
+
+def _write_manifest(config: DatasetConfig, folder: Path, plans: Sequence[MeshPlan]) -> bool:
+    """List the files' hashes if all are there."""
+    if not all(is_done(config, folder, plan) for plan in plans):
+        return False
+    hashes = {p.name: stored_hash(folder / f"{p.name}{SUFFIX}") for p in plans}
+    whole = hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
+    content = {
+        "dataset": config.name,
+        "config_hash": config.hash(),
+        "content_hash": whole,
+        "files": hashes,
+    }
+    with replacing(folder / MANIFEST) as part:
+        part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return True

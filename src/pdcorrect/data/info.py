@@ -1,0 +1,482 @@
+"""What a data set contains, in numbers: sizes, ranges, motions, errors of the runs, cost."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdcorrect.data.folder import all_shards
+from pdcorrect.data.schema import REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.errors import InputError
+from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+PLAIN = "plain"
+"""The run that others are to correct."""
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How a quantity is distributed over simulations."""
+
+    mean: float
+    smallest: float
+    q05: float
+    median: float
+    q95: float
+    largest: float
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Spread:
+        """Of one value or more."""
+        found = np.array(list(values))
+        return cls(float(found.mean()), *np.quantile(found, (0, 0.05, 0.5, 0.95, 1)).tolist())
+
+
+@dataclass(frozen=True)
+class MeasuredRun:
+    """One run of one simulation.
+
+    Attributes
+    ----------
+    iterations : tuple of int
+        Of each step.
+    rms_error : float or None
+        Of its rollout from the reference's, m.
+    step_error : float or None
+        RMS distance from the reference after one step from each of its frames, m.
+    omega : float or None
+        Share of the plain run's squared error that it removes, per cent.
+    """
+
+    iterations: tuple[int, ...]
+    rms_error: float | None
+    step_error: float | None
+    omega: float | None
+
+
+@dataclass(frozen=True)
+class MeasuredSimulation:
+    """One simulation.
+
+    Attributes
+    ----------
+    displacement, speed : float
+        Largest of a node of the reference, m and m/s (from frame to frame).
+    force : float
+        Largest nodal force, N.
+    frames : int
+    rejected : int
+        Draws before it.
+    seconds : mapping of str to float
+        Cost by run.
+    runs : mapping of str to MeasuredRun
+    """
+
+    displacement: float
+    speed: float
+    force: float
+    frames: int
+    rejected: int
+    seconds: Mapping[str, float]
+    runs: Mapping[str, MeasuredRun]
+
+
+@dataclass(frozen=True)
+class MeasuredMesh:
+    """One file: its mesh, material and simulations.
+
+    Attributes
+    ----------
+    split : str
+    bytes, nodes, cells : int
+    young, poisson, density : (smallest, largest)
+        Pa, dimensionless, kg/m3.
+    simulations : tuple of MeasuredSimulation
+    """
+
+    split: str
+    bytes: int
+    nodes: int
+    cells: int
+    young: Range
+    poisson: Range
+    density: Range
+    simulations: tuple[MeasuredSimulation, ...]
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """One run over the simulations that have it.
+
+    Attributes
+    ----------
+    simulations : int
+    iterations : float
+        Mean of a step.
+    most_iterations : int
+    rms_error, step_error : float or None
+        Means over simulations, m; see `MeasuredRun`.
+    omega : Spread or None
+        Per cent; ``smallest`` is the worst.
+    """
+
+    simulations: int
+    iterations: float | None
+    most_iterations: int | None
+    rms_error: float | None
+    step_error: float | None
+    omega: Spread | None
+
+
+@dataclass(frozen=True)
+class SplitInfo:
+    """A split, or the whole data set.
+
+    Attributes
+    ----------
+    meshes, simulations, frames, bytes : int
+        Frames over all simulations, without the rest shape.
+    nodes, cells, young, poisson, density : (smallest, largest)
+        Of its meshes; Pa, dimensionless, kg/m3.
+    displacement, speed, force : Spread
+        Of the simulations' largest values, m, m/s, N; see `MeasuredSimulation`.
+    rejected : int
+        Draws.
+    rejection_rate : float
+        Rejected draws over all draws.
+    runs : mapping of str to RunInfo
+    seconds : mapping of str to float
+        Cost by run, and of all as "total".
+    """
+
+    meshes: int
+    simulations: int
+    frames: int
+    bytes: int
+    nodes: Range
+    cells: Range
+    young: Range
+    poisson: Range
+    density: Range
+    displacement: Spread
+    speed: Spread
+    force: Spread
+    rejected: int
+    rejection_rate: float
+    runs: Mapping[str, RunInfo]
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """A data set in numbers, as a whole and by split."""
+
+    name: str
+    whole: SplitInfo
+    splits: Mapping[str, SplitInfo]
+
+    def to_json(self) -> str:
+        """All numbers, in SI units and per cent."""
+        return json.dumps(asdict(self), indent=2, allow_nan=False)
+
+    def tables(self) -> RenderableType:
+        """For rich's console."""
+        from rich.console import Group
+
+        return Group(*(table(self) for table in _TABLES))
+
+
+def measure_dataset(
+    folder: str | Path, on_file: Callable[[Path], None] | None = None
+) -> list[MeasuredMesh]:
+    """Read a data set and measure each simulation.
+
+    Parameters
+    ----------
+    folder : path
+    on_file : callable, optional
+        Called with each file after it was read.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no files of meshes.
+    FileFormatError
+        If one of them is damaged.
+    """
+    meshes = []
+    for path in dataset_files(folder):
+        meshes.append(_mesh(read_shard(path), path.stat().st_size))
+        if on_file:
+            on_file(path)
+    return meshes
+
+
+def dataset_files(folder: str | Path) -> list[Path]:
+    """Files of the meshes in a folder, at least one.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    found = all_shards(folder)
+    if not found:
+        raise InputError(f"{folder}: holds no files of a data set: expected SPLIT/mesh-0000.h5 ...")
+    return found
+
+
+def dataset_info(folder: str | Path, on_file: Callable[[Path], None] | None = None) -> DatasetInfo:
+    """Read a data set and summarise it; parameters and errors as of `measure_dataset`."""
+    return summarise(Path(folder).resolve().name, measure_dataset(folder, on_file))
+
+
+def summarise(name: str, meshes: Sequence[MeasuredMesh]) -> DatasetInfo:
+    """Summary of measured meshes, by split in their order."""
+    splits = dict.fromkeys(mesh.split for mesh in meshes)
+    parts = {split: _split([m for m in meshes if m.split == split]) for split in splits}
+    return DatasetInfo(name, _split(meshes), parts)
+
+
+# --- measuring ---------------------------------------------------------------------------
+
+
+def _mesh(shard: Shard, size: int) -> MeasuredMesh:
+    step = float(shard.attributes["time_step"])
+    return MeasuredMesh(
+        split=str(shard.attributes["split"]),
+        bytes=size,
+        nodes=len(shard.points),
+        cells=len(shard.cells),
+        young=_range(shard.young),
+        poisson=_range(shard.poisson),
+        density=_range(shard.density),
+        simulations=tuple(_simulation(s, step) for s in shard.simulations),
+    )
+
+
+def _range(values: Any) -> Range:
+    return float(np.min(values)), float(np.max(values))
+
+
+def _simulation(simulation: Simulation, step: float) -> MeasuredSimulation:
+    reference = _rollout(simulation, REFERENCE)
+    velocities = np.diff(reference, axis=0) / step
+    return MeasuredSimulation(
+        displacement=largest_displacement(reference),
+        speed=float(np.linalg.norm(velocities, axis=2).max()),
+        force=float(np.linalg.norm(simulation.forces.astype(np.float64), axis=2).max()),
+        frames=simulation.steps,
+        rejected=simulation.attempt,
+        seconds=simulation.seconds,
+        runs={name: _run(simulation, name, reference) for name in simulation.runs},
+    )
+
+
+def _rollout(simulation: Simulation, name: str) -> Any:
+    """Positions (T+1, N, 3) of a run that must have them, m."""
+    run = simulation.runs.get(name)
+    if run is None or run.positions is None:
+        raise InputError(f"a simulation has no rollout {name!r}: expected one of each.")
+    return run.positions.astype(np.float64)
+
+
+def _run(simulation: Simulation, name: str, reference: Any) -> MeasuredRun:
+    run = simulation.runs[name]
+    steps = run.statistics.get("iterations", np.array([], dtype=np.int32))
+    if name == REFERENCE:
+        return MeasuredRun(tuple(steps.tolist()), None, None, None)
+    rms = None if run.positions is None else rms_error(run.positions, reference)
+    one = None
+    if run.predictions is not None:
+        one = rms_error(np.concatenate([reference[:1], run.predictions]), reference)
+    return MeasuredRun(tuple(steps.tolist()), rms, one, _omega(simulation, name, run, reference))
+
+
+def _omega(simulation: Simulation, name: str, run: Run, reference: Any) -> float | None:
+    """Per cent; None where it means nothing."""
+    plain = simulation.runs.get(PLAIN)
+    if name == PLAIN or run.positions is None or plain is None or plain.positions is None:
+        return None
+    if mean_squared_error(plain.positions, reference) == 0.0:
+        return None
+    return error_corrected(run.positions, plain.positions, reference)
+
+
+# --- summing up --------------------------------------------------------------------------
+
+
+def _split(meshes: Sequence[MeasuredMesh]) -> SplitInfo:
+    simulations = [simulation for mesh in meshes for simulation in mesh.simulations]
+    rejected = sum(simulation.rejected for simulation in simulations)
+    every = {name for simulation in simulations for name in simulation.runs}
+    names = sorted(every, key=lambda name: (name != REFERENCE, name != PLAIN, name))
+    return SplitInfo(
+        meshes=len(meshes),
+        simulations=len(simulations),
+        frames=sum(simulation.frames for simulation in simulations),
+        bytes=sum(mesh.bytes for mesh in meshes),
+        nodes=_range([mesh.nodes for mesh in meshes]),
+        cells=_range([mesh.cells for mesh in meshes]),
+        young=_range([mesh.young for mesh in meshes]),
+        poisson=_range([mesh.poisson for mesh in meshes]),
+        density=_range([mesh.density for mesh in meshes]),
+        displacement=Spread.of(simulation.displacement for simulation in simulations),
+        speed=Spread.of(simulation.speed for simulation in simulations),
+        force=Spread.of(simulation.force for simulation in simulations),
+        rejected=rejected,
+        rejection_rate=rejected / (rejected + len(simulations)),
+        runs={n: _run_info([s.runs[n] for s in simulations if n in s.runs]) for n in names},
+        seconds=_seconds(simulations),
+    )
+
+
+def _run_info(runs: Sequence[MeasuredRun]) -> RunInfo:
+    iterations = [count for run in runs for count in run.iterations]
+    omegas = [run.omega for run in runs if run.omega is not None]
+    return RunInfo(
+        simulations=len(runs),
+        iterations=_mean(iterations),
+        most_iterations=max(iterations, default=None),
+        rms_error=_mean([run.rms_error for run in runs if run.rms_error is not None]),
+        step_error=_mean([run.step_error for run in runs if run.step_error is not None]),
+        omega=Spread.of(omegas) if omegas else None,
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _seconds(simulations: Sequence[MeasuredSimulation]) -> dict[str, float]:
+    names = dict.fromkeys(name for simulation in simulations for name in simulation.seconds)
+    found = {name: sum(s.seconds.get(name, 0.0) for s in simulations) for name in names}
+    return {**found, "total": sum(found.values())}
+
+
+# --- text --------------------------------------------------------------------------------
+
+
+def _table(title: str, *headings: str) -> Any:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        pad_edge=False,
+    )
+    for number, heading in enumerate(headings):
+        left = number == 0 or heading in ("run", "quantity")
+        table.add_column(heading, justify="left" if left else "right", no_wrap=True)
+    return table
+
+
+def _rows(info: DatasetInfo) -> list[tuple[str, SplitInfo]]:
+    """Splits, and the whole where there are several."""
+    return [*info.splits.items(), *([("all", info.whole)] if len(info.splits) > 1 else [])]
+
+
+def _size_table(info: DatasetInfo) -> Any:
+    headings = "split", "meshes", "simulations", "frames", "MB", "nodes", "cells"
+    table = _table(info.name, *headings)
+    for name, split in _rows(info):
+        counts = [str(split.meshes), str(split.simulations), str(split.frames)]
+        size = f"{split.bytes / 1e6:.3g}"
+        table.add_row(name, *counts, size, _between(split.nodes), _between(split.cells))
+    return table
+
+
+def _material_table(info: DatasetInfo) -> Any:
+    table = _table("materials", "split", "E, kPa", "Poisson's ratio", "density, kg/m3")
+    for name, split in _rows(info):
+        others = (_between(values) for values in (split.poisson, split.density))
+        table.add_row(name, _between(split.young, 1e-3), *others)
+    return table
+
+
+def _between(values: Range, factor: float = 1.0) -> str:
+    texts = dict.fromkeys(f"{factor * value:.4g}" for value in values)
+    return " - ".join(texts)
+
+
+def _motion_table(info: DatasetInfo) -> Any:
+    table = _table(
+        "largest values of each simulation", "split", "quantity", "mean", "least", "5 %", "median",
+        "95 %", "most",
+    )  # fmt: skip
+    for name, split in _rows(info):
+        lines = (
+            ("displacement, mm", split.displacement, 1e3),
+            ("speed, m/s", split.speed, 1.0),
+            ("nodal force, N", split.force, 1.0),
+        )
+        for number, (what, spread, factor) in enumerate(lines):
+            values = [f"{factor * value:.3g}" for value in asdict(spread).values()]
+            table.add_row("" if number else name, what, *values)
+    return table
+
+
+def _error_table(info: DatasetInfo) -> Any:
+    table = _table(
+        "mean distance from the reference; Omega, % of the plain run's squared error",
+        "split", "run", "RMS, mm", "one step, mm", "Omega", "median", "5 %", "worst",
+    )  # fmt: skip
+    for split_name, split in _rows(info):
+        runs = {name: run for name, run in split.runs.items() if name != REFERENCE}
+        for number, (name, run) in enumerate(runs.items()):
+            omega = run.omega
+            shares = (omega.mean, omega.median, omega.q05, omega.smallest) if omega else [None] * 4
+            errors = _text(run.rms_error, 1e3), _text(run.step_error, 1e3)
+            table.add_row("" if number else split_name, name, *errors, *map(_text, shares))
+    return table
+
+
+def _iteration_table(info: DatasetInfo) -> Any:
+    table = _table("solver iterations of a step", "split", "run", "simulations", "mean", "most")
+    for split_name, split in _rows(info):
+        for number, (name, run) in enumerate(split.runs.items()):
+            counts = _text(run.iterations), str(run.most_iterations or "")
+            table.add_row("" if number else split_name, name, str(run.simulations), *counts)
+    return table
+
+
+def _cost_table(info: DatasetInfo) -> Any:
+    table = _table("cost", "split", "run", "s", "s a simulation")
+    for split_name, split in _rows(info):
+        for number, (name, seconds) in enumerate(split.seconds.items()):
+            run = split.runs.get(name.removesuffix(" steps"))
+            each = _text(seconds / (run.simulations if run else split.simulations))
+            table.add_row("" if number else split_name, name, _text(seconds), each)
+    return table
+
+
+def _draw_table(info: DatasetInfo) -> Any:
+    table = _table("loads drawn", "split", "kept", "rejected", "rejected, %")
+    for name, split in _rows(info):
+        rate = _text(100 * split.rejection_rate)
+        table.add_row(name, str(split.simulations), str(split.rejected), rate)
+    return table
+
+
+def _text(value: float | None, factor: float = 1.0) -> str:
+    return "" if value is None else f"{factor * value:.3g}"
+
+
+_TABLES = (
+    _size_table, _material_table, _motion_table, _error_table, _iteration_table, _cost_table,
+    _draw_table,
+)  # fmt: skip

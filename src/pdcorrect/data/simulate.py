@@ -1,0 +1,338 @@
+"""The runs of a data set's simulations: reference, coarse models, intermediate mesh."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.engines import Engine, Job, Steps
+from pdcorrect.data.plan import MeshPlan, draw_scene
+from pdcorrect.data.schema import REFERENCE, Run, Shard, Simulation
+from pdcorrect.errors import ConvergenceError
+from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.state import State
+
+PLAIN = "plain"
+MOST_ATTEMPTS = 20
+"""Draws of a simulation's load before the data set is given up."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """How a simulation is discretised and stepped.
+
+    Attributes
+    ----------
+    refine : int
+    best : bool
+        `pdcorrect.best_coarse`'s element and mass.
+    predict : bool
+        Whether to take single steps from the reference, too.
+    divisor : int
+        Parts of each time step.
+    heavy : bool
+        Density scaled so that the mass is the reference's.
+    truth : bool
+        Stepped by the reference's solver.
+    sample : bool
+        For the first simulation of the mesh only.
+    """
+
+    refine: int
+    best: bool = False
+    predict: bool = False
+    divisor: int = 1
+    heavy: bool = False
+    truth: bool = False
+    sample: bool = False
+
+
+@dataclass(frozen=True)
+class Engines:
+    """What steps the models, the reference, and meshes that are too large for either.
+
+    Attributes
+    ----------
+    models, truth, large : Engine
+    largest : int
+        Nodes beyond which a mesh is ``large``'s.
+    """
+
+    models: Engine
+    truth: Engine
+    large: Engine
+    largest: int = sys.maxsize
+
+    def of(self, model: Model, problem: Problem) -> Engine:
+        """The engine for a run."""
+        if len(problem.positions) > self.largest:
+            return self.large
+        return self.truth if model.truth else self.models
+
+
+def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
+    """The runs of a mesh by name, the reference first."""
+    exact = config.setting == "exact"
+    found = {
+        REFERENCE: Model(mesh.refine, best=exact, truth=True),
+        PLAIN: Model(1, predict=True),
+    }
+    if exact:
+        found["best"] = Model(1, best=True, predict=True)
+    if mesh.split in (TRAINING, VALIDATION):
+        return found
+    if mesh.refine > 2:
+        found["intermediate"] = Model(2)
+    if not exact:
+        found["total-mass"] = Model(1, heavy=True)
+    if mesh.split == EVALUATION:
+        if config.converged_steps:
+            found["time-converged"] = Model(
+                mesh.refine, best=exact, divisor=config.converged_steps, truth=True
+            )
+        if mesh.number < config.finest_meshes:
+            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
+    return found
+
+
+@dataclass(eq=False)
+class _Meshed:
+    """A mesh plan with its discretisations, one for each model."""
+
+    plan: MeshPlan
+    models: dict[str, Model]
+    problems: dict[str, Problem]
+
+    @classmethod
+    def create(cls, config: DatasetConfig, plan: MeshPlan) -> _Meshed:
+        scene = draw_scene(config, plan, 0)
+        wanted = models(config, plan)
+        problems: dict[str, Problem] = {}
+        known: dict[tuple[int, bool], Problem] = {}
+        for name, model in wanted.items():
+            key = (model.refine, model.best)
+            if key not in known:
+                known[key] = discretise(best_coarse(scene) if model.best else scene, model.refine)
+            problems[name] = known[key]
+            if model.heavy:
+                problems[name] = _with_mass_of(problems[name], problems[REFERENCE])
+        return cls(plan, wanted, problems)
+
+
+def _with_mass_of(problem: Problem, other: Problem) -> Problem:
+    """The problem with its density scaled so that its total mass is another's."""
+    factor = float(other.mass.sum() / problem.mass.sum())
+    return problem.with_material(density=factor * problem.materials.density)
+
+
+@dataclass(eq=False)
+class _Draft:
+    """A simulation in the making.
+
+    Attributes
+    ----------
+    number : int
+        On its mesh.
+    scene : Scene
+        Of the attempt under way.
+    steps : dict of str to Steps
+        Rollouts of the attempt by run.
+    predictions : dict of str to Steps
+    """
+
+    meshed: _Meshed
+    number: int
+    scene: Scene
+    attempt: int = 0
+    rejected: tuple[str, ...] = ()
+    steps: dict[str, Steps] = field(default_factory=dict)
+    predictions: dict[str, Steps] = field(default_factory=dict)
+
+    @property
+    def alive(self) -> bool:
+        """Whether nothing of this attempt has failed."""
+        return len(self.rejected) == self.attempt
+
+    def wants(self, name: str) -> bool:
+        """Whether a run belongs to this simulation."""
+        model = self.meshed.models.get(name)
+        return model is not None and (not model.sample or self.number == 0)
+
+    def job(self, name: str) -> Job:
+        """A run under this simulation's load."""
+        problem = self.meshed.problems[name].with_loads(self.scene.loads)
+        return Job(problem, problem.mesh.coarse_nodes)
+
+    def keep(self, kept: dict[str, Steps], name: str, steps: Steps) -> None:
+        """Note a run, or why it is of no use."""
+        kept[name] = steps
+        if steps.failure and self.alive:
+            self.rejected = (*self.rejected, f"{name}, {steps.failure}")
+
+    def again(self, config: DatasetConfig) -> _Draft:
+        """The next attempt.
+
+        Raises
+        ------
+        ConvergenceError
+            If there were too many.
+        """
+        plan, attempt = self.meshed.plan, self.attempt + 1
+        if attempt == MOST_ATTEMPTS:
+            raise ConvergenceError(
+                f"{plan.name}, simulation {self.number}: {attempt} loads were drawn and all "
+                f"rejected, the last one by {self.rejected[-1]}. Ask for weaker loads or stiffer "
+                "materials."
+            )
+        scene = draw_scene(config, plan, self.number, attempt)
+        return _Draft(self.meshed, self.number, scene, attempt, self.rejected)
+
+
+def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines) -> list[Shard]:
+    """All simulations of some meshes of one split, computed together.
+
+    A drawn load under which a run fails or inverts a cell is rejected and drawn again.
+
+    Parameters
+    ----------
+    config : DatasetConfig
+    plans : sequence of MeshPlan
+        Of one split.
+    engines : Engines
+
+    Raises
+    ------
+    ConvergenceError
+        If a simulation is rejected `MOST_ATTEMPTS` times.
+    """
+    meshes = [_Meshed.create(config, plan) for plan in plans]
+    waiting = [
+        _Draft(mesh, number, draw_scene(config, mesh.plan, number))
+        for mesh in meshes
+        for number in range(mesh.plan.simulations)
+    ]
+    finished: dict[tuple[str, int], _Draft] = {}
+    while waiting:
+        _attempt(waiting, engines)
+        fine = [draft for draft in waiting if draft.alive]
+        finished |= {(draft.meshed.plan.name, draft.number): draft for draft in fine}
+        waiting = [draft.again(config) for draft in waiting if not draft.alive]
+    return [
+        _shard(
+            config,
+            mesh,
+            [finished[mesh.plan.name, k] for k in range(mesh.plan.simulations)],
+            engines,
+        )
+        for mesh in meshes
+    ]
+
+
+def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
+    """Compute all runs, the cheapest first; a draft that fails takes no further part."""
+    names = {name: model for d in drafts for name, model in d.meshed.models.items()}
+    for name in sorted(names, key=lambda n: (names[n].refine, names[n].divisor)):
+        chosen = [d for d in drafts if d.alive and d.wants(name)]
+        if not chosen:
+            continue
+        for draft, steps in zip(chosen, _rollouts(chosen, name, engines), strict=True):
+            draft.keep(draft.steps, name, steps)
+    for name in (n for n, model in names.items() if model.predict):
+        chosen = [d for d in drafts if d.alive]
+        if not chosen:
+            continue
+        states = [_states(d.steps[REFERENCE], d.meshed) for d in chosen]
+        found = engines.models.predictions([d.job(name) for d in chosen], states)
+        for draft, steps in zip(chosen, found, strict=True):
+            draft.keep(draft.predictions, name, steps)
+
+
+def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Steps]:
+    """One run of some drafts; each by the engine that its mesh needs."""
+    jobs = [draft.job(name) for draft in drafts]
+    model, frames = drafts[0].meshed.models[name], drafts[0].meshed.plan.frames
+    by_engine: dict[int, list[int]] = {}
+    for i, job in enumerate(jobs):
+        by_engine.setdefault(id(engines.of(model, job.problem)), []).append(i)
+    out: dict[int, Steps] = {}
+    for chosen in by_engine.values():
+        engine = engines.of(model, jobs[chosen[0]].problem)
+        found = engine.rollouts([jobs[i] for i in chosen], frames, model.divisor)
+        out |= dict(zip(chosen, found, strict=True))
+    return [out[i] for i in range(len(jobs))]
+
+
+def _states(reference: Steps, meshed: _Meshed) -> list[State]:
+    """The reference's frames but the last, on the coarse nodes (Algorithms 1 and 2)."""
+    rest = meshed.problems[PLAIN].rest_state()
+    later = zip(reference.positions[:-1], reference.velocities[:-1], strict=True)
+    return [rest, *(State(p, v, (t + 1) * meshed.plan.step) for t, (p, v) in enumerate(later))]
+
+
+def _shard(
+    config: DatasetConfig, meshed: _Meshed, drafts: Sequence[_Draft], engines: Engines
+) -> Shard:
+    plan, plain = meshed.plan, meshed.problems[PLAIN]
+    return Shard(
+        attributes={
+            "dataset": config.name,
+            "split": plan.split,
+            "number": plan.number,
+            "setting": config.setting,
+            "config_hash": config.hash(),
+            "time_step": plan.step,
+            "tolerance": config.tolerance,
+        },
+        points=plain.positions,
+        cells=plain.cells,
+        free=plain.free,
+        mass=plain.mass,
+        young=plain.materials.young,
+        poisson=plain.materials.poisson,
+        density=plain.materials.density,
+        simulations=tuple(_simulation(draft, engines) for draft in drafts),
+    )
+
+
+def _simulation(draft: _Draft, engines: Engines) -> Simulation:
+    plan, plain = draft.meshed.plan, draft.job(PLAIN).problem
+    times = plan.step * np.arange(plan.frames + 1)
+    every = [*draft.steps.items(), *((n + " steps", s) for n, s in draft.predictions.items())]
+    return Simulation(
+        forces=np.stack([plain.external_forces(*span) for span in pairwise(times)]),
+        runs={name: _run(draft, name, engines) for name in draft.steps},
+        scene_toml=draft.scene.to_toml(),
+        attempt=draft.attempt,
+        rejected=draft.rejected,
+        seconds={name: steps.seconds for name, steps in every},
+    )
+
+
+def _run(draft: _Draft, name: str, engines: Engines) -> Run:
+    steps, predictions = draft.steps[name], draft.predictions.get(name)
+    problem, model = draft.meshed.problems[name], draft.meshed.models[name]
+    rest = problem.positions[problem.mesh.coarse_nodes]
+    return Run(
+        positions=np.concatenate([rest[None], steps.positions]),
+        predictions=None if predictions is None else predictions.positions,
+        statistics={
+            "iterations": steps.iterations,
+            "error_estimates": steps.error_estimates,
+            "smallest_volume_ratios": steps.smallest_volume_ratios,
+        },
+        attributes={
+            **engines.of(model, problem).describe(),
+            "refine": model.refine,
+            "nodes": len(problem.positions),
+            "element": problem.element,
+            "mass": problem.mass_rule,
+            "total_mass": float(problem.mass.sum()),
+            "time_step": draft.meshed.plan.step / model.divisor,
+        },
+    )

@@ -1,0 +1,252 @@
+"""Generation: what is computed, that it does not depend on who computes, and interruptions."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from dataset_configs import small
+from pdcorrect.data.check import check_dataset
+from pdcorrect.data.engines import OneByOne
+from pdcorrect.data.generate import Workers, generate, make_engines
+from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.data.schema import MANIFEST
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.simulate import Engines, simulate
+from pdcorrect.errors import ConvergenceError, InputError
+
+
+def all_shards(folder):
+    return {str(p.relative_to(folder).with_suffix("")): read_shard(p) for p in folder.rglob("*.h5")}
+
+
+def hashes(folder):
+    return json.loads((folder / MANIFEST).read_text())["files"]
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data") / "set"
+    seen = []
+    config = small()
+    assert generate(config, folder, on_file=lambda *row: seen.append(row))
+    names = [plan.name for plan in make_plan(config)]
+    assert seen == [(name, done, 4) for name, done in zip(names, (1, 3, 4), strict=True)]
+    return config, folder
+
+
+def test_a_generated_data_set_passes_its_check(generated):
+    _, folder = generated
+    assert check_dataset(folder) == []
+
+
+def test_its_runs_are_what_a_user_gets_from_the_scene(generated):
+    config, folder = generated
+    plan = make_plan(config)[1]
+    simulation = read_shard(folder / f"{plan.name}.h5").simulations[1]
+    scene = pc.Scene.from_toml(simulation.scene_toml)
+    assert scene == draw_scene(config, plan, 1, simulation.attempt)
+    coarse = pc.discretise(scene)
+    best = pc.best_coarse(scene)
+    for name, problem in (
+        ("plain", coarse), ("best", pc.discretise(best)), ("reference", pc.discretise(best, 2)),
+    ):  # fmt: skip
+        run = pc.rollout(pc.ProjectiveDynamics(problem))
+        own = pc.restrict(run, to=coarse).positions
+        kept = simulation.runs[name].positions
+        np.testing.assert_allclose(kept, own, atol=3e-6 * config.cell_size + 1e-7)
+    forces = [coarse.external_forces(t * 0.01, (t + 1) * 0.01) for t in range(config.frames)]
+    np.testing.assert_allclose(simulation.forces, forces, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["plain", "best"])
+def test_predictions_are_single_steps_from_the_reference(generated, name):
+    config, folder = generated
+    simulation = read_shard(folder / "training/mesh-0001.h5").simulations[0]
+    scene = pc.Scene.from_toml(simulation.scene_toml)
+    stepper = pc.ProjectiveDynamics(
+        pc.discretise(pc.best_coarse(scene) if name == "best" else scene)
+    )
+    truth = simulation.runs["reference"].positions.astype(float)
+    before = np.concatenate([truth[:1], truth])[:-1]
+    for t, prediction in enumerate(simulation.runs[name].predictions):
+        velocities = (truth[t] - before[t]) / config.step
+        found = stepper(pc.State(truth[t], velocities, t * config.step))
+        # velocities from differences of stored float32 positions
+        np.testing.assert_allclose(prediction, found.state.positions, atol=2e-6)
+
+
+def test_evaluation_has_what_training_leaves_out(generated):
+    _, folder = generated
+    shard = read_shard(folder / "evaluation/mesh-0000.h5")
+    assert set(shard.simulations[0].runs) == {"reference", "plain", "best"}  # refine is 2
+    config = small(
+        setting="as-published",
+        reference={"refine": 3},
+        frames=1,
+    )
+    (shard,) = simulate(config, make_plan(config)[-1:], make_engines(config, "cpu"))
+    runs = shard.simulations[0].runs
+    assert set(runs) == {"reference", "plain", "intermediate", "total-mass"}
+    masses = {name: run.attributes["total_mass"] for name, run in runs.items()}
+    assert masses["plain"] > 1.3 * masses["reference"]
+    assert masses["total-mass"] == pytest.approx(masses["reference"])
+
+
+def test_the_time_converged_and_the_finest_run_are_made_where_asked_for():
+    config = small(converged_steps=4, finest_meshes=1)
+    (shard,) = simulate(config, make_plan(config)[-1:], make_engines(config, "cpu"))
+    runs = shard.simulations[0].runs
+    assert runs["time-converged"].attributes["time_step"] == config.step / 4
+    assert runs["finest"].attributes["refine"] == 4
+    distance = np.abs(runs["time-converged"].positions - runs["reference"].positions).max()
+    assert 1e-5 < distance < 0.01
+
+
+def test_newton_as_reference_agrees_with_pd():
+    config = small(frames=2, training={"meshes": 1, "simulations": 1})
+    plan = make_plan(config)[:1]
+    found = []
+    for solver in ("pd", "newton"):
+        chosen = small(
+            frames=2, training={"meshes": 1, "simulations": 1},
+            reference={"refine": 2, "solver": solver},
+        )  # fmt: skip
+        (shard,) = simulate(chosen, plan, make_engines(chosen, "cpu"))
+        run = shard.simulations[0].runs["reference"]
+        assert run.attributes["solver"] == solver
+        assert shard.simulations[0].runs["plain"].attributes["solver"] == "pd"
+        found.append(run.positions)
+    np.testing.assert_allclose(*found, atol=2e-5 * config.cell_size)
+
+
+def test_batches_agree_with_one_by_one():
+    pytest.importorskip("torch")
+    from pdcorrect.data.batch_engine import Batched
+
+    config = small(frames=2, tolerance=1e-7)
+    plans = make_plan(config)[:2]
+    batched = Batched("cpu", config.tolerance, most=4)
+    alone = OneByOne("pd", config.tolerance)
+    found = [
+        simulate(config, plans, Engines(engine, engine, engine)) for engine in (batched, alone)
+    ]  # fmt: skip
+    for one, other in zip(*found, strict=True):
+        for a, b in zip(one.simulations, other.simulations, strict=True):
+            assert a.runs.keys() == b.runs.keys()
+            for name in a.runs:
+                x, y = a.runs[name], b.runs[name]
+                np.testing.assert_allclose(x.positions, y.positions, atol=1e-8)
+                if y.predictions is not None:
+                    np.testing.assert_allclose(x.predictions, y.predictions, atol=1e-8)
+                ratios = [r.statistics["smallest_volume_ratios"] for r in (x, y)]
+                np.testing.assert_allclose(*ratios, atol=1e-6)
+
+
+class Failing(OneByOne):
+    """Fails the first rollouts of refined meshes."""
+
+    def __init__(self, times):
+        super().__init__("pd", 1e-4)
+        self.times = times
+
+    def rollouts(self, jobs, steps, divisor=1):
+        from dataclasses import replace
+
+        found = super().rollouts(jobs, steps, divisor)
+        if jobs[0].problem.refine == 1 or self.times <= 0:
+            return found
+        self.times -= 1
+        return [replace(found[0], failure="step 1: broke"), *found[1:]]
+
+
+def test_a_rejected_load_is_noted_and_drawn_again():
+    config = small(frames=1, training={"meshes": 1, "simulations": 2})
+    plan = make_plan(config)[0]
+    engine = Failing(2)
+    (shard,) = simulate(config, [plan], Engines(engine, engine, engine))
+    first, second = shard.simulations
+    assert (first.attempt, second.attempt) == (2, 0)
+    assert first.rejected == ("reference, step 1: broke",) * 2
+    assert first.scene_toml == draw_scene(config, plan, 0, attempt=2).to_toml()
+
+
+def test_loads_that_are_never_accepted_are_an_error():
+    config = small(frames=1, training={"meshes": 1, "simulations": 1})
+    engine = Failing(1000)
+    with pytest.raises(ConvergenceError, match="20 loads were drawn and all rejected"):
+        simulate(config, make_plan(config)[:1], Engines(engine, engine, engine))
+
+
+def test_two_workers_write_the_same_as_one(generated, tmp_path):
+    pytest.importorskip("distributed")
+    config, folder = generated
+    assert generate(config, tmp_path / "two", Workers(2))
+    assert hashes(tmp_path / "two") == hashes(folder)
+
+
+def test_a_part_can_be_generated_first_and_the_rest_later(generated, tmp_path):
+    config, folder = generated
+    assert not generate(config, tmp_path, splits=["evaluation"])
+    assert sorted(all_shards(tmp_path)) == ["evaluation/mesh-0000"]
+    assert not generate(config, tmp_path, seconds=0.0)
+    assert generate(config, tmp_path)
+    assert hashes(tmp_path) == hashes(folder)
+
+
+def test_a_damaged_file_is_made_again_and_a_whole_one_is_not(generated, tmp_path):
+    config, folder = generated
+    generate(config, tmp_path)
+    target = tmp_path / "training/mesh-0001.h5"
+    data = bytearray(target.read_bytes())
+    data[len(data) // 2] ^= 1
+    target.write_bytes(data)
+    done = []
+    assert generate(config, tmp_path, on_file=lambda name, *_: done.append(name))
+    assert done == ["training/mesh-0001"]
+    assert hashes(tmp_path) == hashes(folder)
+
+
+def test_another_configuration_may_not_use_the_folder(generated):
+    _, folder = generated
+    with pytest.raises(InputError, match="is another configuration"):
+        generate(small(seed=99), folder)
+    with pytest.raises(InputError, match="splits nonsense: expected some of training, evaluation"):
+        generate(small(), folder, splits=["nonsense"])
+
+
+def interrupted(config, folder, delay):
+    """Start the generation in a process of its own and kill it."""
+    folder.mkdir(exist_ok=True)
+    path = folder.parent / "set.toml"
+    path.write_text(config.to_toml())
+    command = [sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", path, "-o", folder]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        process.wait(timeout=delay)
+    except subprocess.TimeoutExpired:
+        os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@pytest.mark.slow
+def test_killed_twenty_times_it_ends_with_the_same_files(generated, tmp_path):
+    config, folder = generated
+    rng = np.random.default_rng(0)
+    target = tmp_path / "killed"
+    started = time.perf_counter()
+    interrupted(config, tmp_path / "whole", 600)
+    whole = time.perf_counter() - started
+    for _ in range(20):
+        interrupted(config, target, rng.uniform(0.3, 1.0) * whole)
+        for path in target.rglob("*.h5"):
+            read_shard(path)
+    assert generate(config, target)
+    assert not list(target.rglob("*.part"))
+    assert hashes(target) == hashes(folder)

@@ -1,0 +1,178 @@
+"""Families of bodies, and what a data set's configuration makes of them."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from dataset_configs import small
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.families import PUBLISHED, draw, extreme, node_levels
+from pdcorrect.data.plan import draw_scene, make_plan
+
+RNG = np.random.default_rng
+
+
+def mesh_nodes(design, refine):
+    scene = pc.Scene(
+        body={**design.shape, "cell_size": 1.0},
+        material={"young": 1e5, "poisson": 0.3, "density": 1e3},
+        time={"step": 0.01, "frames": 1},
+    )
+    return len(pc.discretise(scene, refine=refine).positions)
+
+
+@pytest.mark.parametrize("family", ["beam", "cross", "weight"])
+def test_the_published_ranges_of_nodes_are_kept_and_their_ends_reached(family):
+    coarse, fine = PUBLISHED[family]
+    for largest in (False, True):
+        design = extreme(family, coarse, largest, RNG(1))
+        assert mesh_nodes(design, 1) == coarse[largest]
+        assert mesh_nodes(design, 4) == fine[largest]
+    rng = RNG(2)
+    for _ in range(6):
+        design = draw(family, coarse, rng)
+        assert coarse[0] <= mesh_nodes(design, 1) <= coarse[1]
+        assert fine[0] <= mesh_nodes(design, 4) <= fine[1]
+
+
+def test_the_published_ranges_are_the_theses():
+    assert PUBLISHED["cross"] == ((225, 513), (7857, 18225))
+    assert PUBLISHED["weight"] == ((237, 471), (8433, 16857))
+
+
+def test_a_range_without_bodies_is_refused():
+    with pytest.raises(pc.errors.InputError, match="no body of family 'cross' has between 10"):
+        node_levels("cross", (10, 11))
+
+
+@pytest.mark.parametrize("family", ["beam", "cross", "weight"])
+def test_bodies_are_held_where_they_should_be_and_loads_find_their_part(family):
+    rng = RNG(3)
+    for motion in ("torsion", "impulse", "stretch"):
+        for setting in ("exact", "as-published"):
+            config = small(motion, setting, family=family)
+            (plan, *_) = make_plan(config)
+            problem = pc.discretise(draw_scene(config, plan, 0))
+            held = ~problem.free
+            assert held.all(axis=1).any()
+            assert (held.all(axis=1) == held.any(axis=1)).all()
+            force = problem.external_forces(0.0, 0.01)
+            assert np.abs(force).sum() > 0
+            design = draw(family, config.coarse_nodes, rng)
+            low, high = np.array(design.loaded)
+            assert (high > low).all()
+
+
+def test_both_settings_pull_a_part_with_the_same_total_force():
+    for motion in ("impulse", "stretch"):
+        totals = []
+        for setting in ("exact", "as-published"):
+            config = small(motion, setting)
+            problem = pc.discretise(draw_scene(config, make_plan(config)[0], 0))
+            totals.append(problem.external_forces(0.0, 0.01).sum(axis=0))
+        np.testing.assert_allclose(totals[0], totals[1], rtol=1e-12)
+
+
+def test_the_torsion_fields_of_both_settings_agree_at_inner_nodes():
+    fields = []
+    for setting in ("exact", "as-published"):
+        config = small("torsion", setting, family="beam")
+        problem = pc.discretise(draw_scene(config, make_plan(config)[0], 0))
+        fields.append(problem.external_forces(0.0, 0.01))
+    inner = np.flatnonzero(np.abs(problem.positions[:, 1:] - 0.05).max(axis=1) < 1e-9)[2:-2]
+    lengths = [np.linalg.norm(f[inner], axis=1) for f in fields]
+    # by Gauss points the field averages out around the axis; what is left is the pull along x
+    assert (lengths[0] < lengths[1]).all()
+    total = [np.abs(f).sum() for f in fields]
+    assert 0.2 < total[0] / total[1] < 1.0
+
+
+def test_plans_and_loads_depend_on_nothing_but_the_configuration():
+    config = small()
+    again = DatasetConfig.from_toml(config.to_toml())
+    assert again == config
+    assert again.hash() == config.hash()
+    assert make_plan(again) == make_plan(config)
+    plan = make_plan(config)[1]
+    assert draw_scene(config, plan, 0) == draw_scene(again, plan, 0)
+    assert draw_scene(config, plan, 0) != draw_scene(config, plan, 0, attempt=1)
+    other = small(seed=8)
+    assert other.hash() != config.hash()
+    assert make_plan(other) != make_plan(config)
+
+
+def test_splits_are_by_mesh_and_have_the_sizes_asked_for():
+    config = small(
+        coarse_nodes=[72, 200],
+        training={"meshes": 20, "simulations": 50},
+        evaluation={"meshes": 4, "simulations": 10},
+        validation_share=0.1,
+    )
+    plans = make_plan(config)
+    by_split = {name: [p for p in plans if p.split == name] for name in dict.fromkeys(
+        p.split for p in plans)}  # fmt: skip
+    assert {n: len(p) for n, p in by_split.items()} == {TRAINING: 18, VALIDATION: 2, EVALUATION: 4}
+    counts = {n: sum(p.simulations for p in ps) for n, ps in by_split.items()}
+    assert counts[TRAINING] + counts[VALIDATION] == 50
+    assert counts[EVALUATION] == 10
+    keys = [p.design.key() for p in plans]
+    assert len(set(keys)) == len(keys)
+
+
+def test_extra_splits_leave_the_training_distribution_as_told():
+    config = small(
+        extra=[
+            {"name": "stiff", "meshes": 1, "simulations": 1, "young": [1e6, 1e6]},
+            {"name": "fast", "meshes": 1, "simulations": 1, "step_factor": 0.5, "frames_factor": 2},
+            {"name": "beams", "meshes": 1, "simulations": 1, "family": "beam", "refine": 3},
+            {"name": "strong", "meshes": 1, "simulations": 1, "strength_factor": 1.5},
+        ]
+    )
+    found = {p.split: p for p in make_plan(config)}
+    assert found["stiff"].young == pytest.approx(1e6)
+    assert (found["fast"].step, found["fast"].frames) == (0.005, 6)
+    assert found["beams"].design.shape["shape"] == "beam"
+    assert found["beams"].refine == 3
+    own = draw_scene(config, found["strong"], 0).loads[0].strength
+    plain = replace(found["strong"], strength_factor=1.0)
+    assert own == pytest.approx(1.5 * draw_scene(config, plain, 0).loads[0].strength)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frames": 0}, "frames"),
+        ({"surprise": 1}, "surprise: unknown key"),
+        ({"training": {"meshes": 3, "simulations": 2}}, "at least one simulation a mesh"),
+        ({"material": {"young": [2.0, 1.0], "poisson": [0.3, 0.3], "density": [1.0, 1.0]}},
+         "low <= high"),
+        ({"material": {"young": [1.0, 2.0], "poisson": [0.3, 0.5], "density": [1.0, 1.0]}},
+         "poisson below 0.5"),
+        ({"extra": [{"name": "training", "meshes": 1, "simulations": 1}]}, "a name of its own"),
+        ({"name": "../up"}, "name"),
+        ({"setting": "nearly"}, "setting"),
+    ],
+)  # fmt: skip
+def test_wrong_configurations_are_refused_by_name(change, message):
+    import tomli_w
+
+    data = {**small().model_dump(mode="json", exclude_none=True), **change}
+    with pytest.raises(pc.errors.InputError, match=re.escape(message)):
+        DatasetConfig.from_toml(tomli_w.dumps(data))
+
+
+def test_more_meshes_than_a_family_has_bodies_are_refused():
+    config = small(family="beam", training={"meshes": 50, "simulations": 50})
+    with pytest.raises(pc.errors.InputError, match="Ask for fewer meshes or a wider range"):
+        make_plan(config)
+
+
+def test_a_file_that_is_no_configuration_is_named(tmp_path):
+    with pytest.raises(pc.errors.InputError, match="cannot be read"):
+        DatasetConfig.load(tmp_path / "none.toml")
+    (tmp_path / "bad.toml").write_text("a = [")
+    with pytest.raises(pc.errors.InputError, match=r"bad.toml: not valid TOML"):
+        DatasetConfig.load(tmp_path / "bad.toml")
