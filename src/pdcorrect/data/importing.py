@@ -397,8 +397,8 @@ def _loads(problem: Problem, reference: Array, time_step: float) -> Array:
 
 
 def _tolerance(scene: Scene | None) -> float:
-    """Of the coarse model's steps, of the cell size; NaN where unknown."""
-    return float("nan") if scene is None else float(scene.solver.tolerance)
+    """Of the coarse model's steps, of the cell size; 0 where it is not known."""
+    return 0.0 if scene is None else float(scene.solver.tolerance)
 
 
 def _array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
