@@ -4,17 +4,27 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
-app = typer.Typer(no_args_is_help=True, help="Check, summarise and convert data sets.")
+from pdcorrect.errors import InputError
+
+app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
 
 Folder = Annotated[Path, typer.Argument(help="Folder of the data set.", show_default=False)]
 
 _UNFIT = 1
 """Exit status of `check` if it finds errors."""
+
+
+class Layout(StrEnum):
+    """Choices of --to."""
+
+    meshgraphnet = "meshgraphnet"
+    vtu = "vtu"
 
 
 @app.command()
@@ -58,9 +68,10 @@ def check(folder: Folder) -> None:
 
     The exit status is 1 if there are errors; warnings do not count.
     """
-    from pdcorrect.data.check import check_dataset, shard_paths
+    from pdcorrect.data.check import check_dataset
+    from pdcorrect.data.folder import all_shards
 
-    count = len(shard_paths(folder))
+    count = len(all_shards(folder))
     with _progress("checking", count) as advance:
         findings = check_dataset(folder, on_file=advance)
     for finding in findings:
@@ -100,6 +111,61 @@ def info(
         make_folder(figures)
         typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
         typer.echo(f"wrote {thumbnails(folder, figures / 'samples.png')}")
+
+
+@app.command("export")
+def export(
+    folder: Folder,
+    target: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
+    to: Annotated[Layout, typer.Option(help="Layout.")] = Layout.meshgraphnet,
+    base: Annotated[
+        str, typer.Option(help="meshgraphnet: run whose predictions are given as base_pos.")
+    ] = "plain",
+    split: Annotated[str, typer.Option(help="vtu: split.")] = "evaluation",
+    mesh: Annotated[int, typer.Option(help="vtu: number of the mesh.", min=0)] = 0,
+    simulation: Annotated[int, typer.Option(help="vtu: number of the simulation.", min=0)] = 0,
+    run: Annotated[
+        Optional[list[str]], typer.Option(help="vtu: run beside the reference; repeatable.")
+    ] = None,
+) -> None:
+    """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
+    from pdcorrect.data import export as exports
+
+    if to is Layout.meshgraphnet:
+        written = exports.export_meshgraphnet(folder, target, base=base)
+    else:
+        runs = ("plain",) if run is None else tuple(run)
+        written = exports.export_vtu(folder, target, split, mesh, simulation, runs)
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+@app.command("import")
+def import_(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Reference trajectories on one body (HDF5), or one .npz.", show_default=False
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the data set.")],
+    coarse: Annotated[
+        Optional[list[Path]],
+        typer.Option(help="Coarse trajectory; one for each reference, in order."),
+    ] = None,
+    split: Annotated[str, typer.Option(help="Split.")] = "training",
+    number: Annotated[int, typer.Option(help="Number of the mesh in the split.", min=0)] = 0,
+    moved: Annotated[bool, typer.Option(help=".npz: frame 0 need not be the rest shape.")] = False,
+) -> None:
+    """Add a mesh and its simulations, computed elsewhere, to a data set."""
+    from pdcorrect.data.importing import import_trajectories
+
+    if "/" in split or split in ("", ".", ".."):
+        raise InputError(f"--split {split!r}: expected a name.")
+    path = import_trajectories(
+        sources, output, coarse=coarse or (), split=split, number=number, starts_at_rest=not moved
+    )
+    typer.echo(f"wrote {path}")
 
 
 @contextlib.contextmanager

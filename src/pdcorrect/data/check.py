@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.folder import all_shards, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import (
     CONFIG,
@@ -32,7 +32,6 @@ from pdcorrect.fem.mesh import HexMesh
 
 Severity = Literal["error", "warning"]
 _OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
-_NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
 _DIGITS = 6
 """Decimals, in cells, to which meshes are compared."""
 _SLACK = 1e-6
@@ -58,18 +57,6 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.path}: {self.message}"
-
-
-def shard_paths(folder: Path) -> list[Path]:
-    """Files of meshes in a data set's folder, by split and number; only their names count."""
-    found = [path for path in folder.glob(f"*/mesh-*{SUFFIX}") if _NAME.fullmatch(path.name)]
-    first = TRAINING, VALIDATION, EVALUATION
-
-    def order(path: Path) -> tuple[int, str, int]:
-        split = path.parent.name
-        return first.index(split) if split in first else len(first), split, _number(path)
-
-    return sorted(found, key=order)
 
 
 def check_dataset(
@@ -101,7 +88,7 @@ def check_dataset(
     check = _Check(folder)
     check.load_config()
     check.load_manifest()
-    paths = shard_paths(folder)
+    paths = all_shards(folder)
     check.files(paths)
     for path in paths:
         check.shard(path)
@@ -178,7 +165,7 @@ class _Check:
     def _gaps(self, paths: list[Path]) -> None:
         """Numbers left out in a split, where no configuration tells how many there are."""
         for split in sorted({path.parent for path in paths}):
-            numbers = {_number(path) for path in paths if path.parent == split}
+            numbers = {shard_number(path) for path in paths if path.parent == split}
             for number in sorted(set(range(max(numbers))) - numbers):
                 self.error(split / f"mesh-{number:04d}{SUFFIX}", "missing: later numbers are there")
 
@@ -202,7 +189,7 @@ class _Check:
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
         """Where a file is not what the configuration asks for."""
-        wanted = {"split": path.parent.name, "number": _number(path)}
+        wanted = {"split": path.parent.name, "number": shard_number(path)}
         plan = self.plans.get(path) if self.plans is not None else None
         if self.config is not None:
             wanted |= {
@@ -239,10 +226,6 @@ class _Check:
 
     def _short(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
-
-
-def _number(path: Path) -> int:
-    return int(path.stem.removeprefix("mesh-"))
 
 
 def _reason(path: Path, error: InputError) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdcorrect.data.check import shard_paths
+from pdcorrect.data.folder import all_shards
 from pdcorrect.data.schema import REFERENCE, Run, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
@@ -230,7 +230,7 @@ def dataset_files(folder: str | Path) -> list[Path]:
     InputError
         If there are none.
     """
-    found = shard_paths(Path(folder))
+    found = all_shards(folder)
     if not found:
         raise InputError(f"{folder}: holds no files of a data set: expected SPLIT/mesh-0000.h5 ...")
     return found

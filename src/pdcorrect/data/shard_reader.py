@@ -80,13 +80,23 @@ def read_shard(
         for; the message names the file and the reason.
     """
     path = Path(path)
+    with opened(path, verify) as file:
+        reader = _Reader(file, file.id.get_filesize())
+        shard = reader.shard(simulations, runs)
+        if verify and simulations is None and runs is None:
+            reader.check_hash()
+        return shard
+
+
+@contextlib.contextmanager
+def opened(path: Path, verify: bool) -> Iterator[h5py.File]:
+    """A file of a data set, open; whatever fails in it is a `FileFormatError`.
+
+    ``verify`` compares the file with its checksum first, see `read_shard`.
+    """
     try:
-        with _opened(path, verify) as file:
-            reader = _Reader(file, file.id.get_filesize())
-            shard = reader.shard(simulations, runs)
-            if verify and simulations is None and runs is None:
-                reader.check_hash()
-            return shard
+        with _unsealed(path, verify) as file:
+            yield file
     except FileFormatError:
         raise
     except _RefusalError as refusal:
@@ -105,12 +115,12 @@ def stored_hash(path: Path) -> str:
     FileFormatError
         As `read_shard`.
     """
-    with _opened(path, verify=True) as file:
+    with opened(path, verify=True) as file:
         return str(file.attrs[HASH])
 
 
 @contextlib.contextmanager
-def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
+def _unsealed(path: Path, verify: bool) -> Iterator[h5py.File]:
     if verify:
         with h5py.File(io.BytesIO(read_sealed(path)), "r") as file:
             yield file

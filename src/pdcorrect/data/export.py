@@ -1,0 +1,277 @@
+"""Data sets for other programs: MeshGraphNet tools and ParaView."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.folder import shard_paths, splits_of
+from pdcorrect.data.graph import node_means, tetrahedra, velocities
+from pdcorrect.data.schema import REFERENCE, SUFFIX, Shard, Simulation
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.errors import InputError, OutputError
+from pdcorrect.io.vtk import write_vtu_series
+from pdcorrect.replacement import replacing
+from pdcorrect.state import Trajectory
+
+NORMAL, HANDLE = 0, 3
+"""Types of nodes, ``NodeType`` in google-deepmind/deepmind-research, meshgraphnets/common.py."""
+
+_SPLITS = {TRAINING: "train", VALIDATION: "valid", EVALUATION: "test"}
+_DYNAMIC = ("world_pos", "base_pos", "forces")
+
+Array = NDArray[Any]
+
+
+def export_meshgraphnet(
+    folder: str | Path, target: str | Path, *, base: str = "plain"
+) -> list[Path]:
+    """Write a data set in the layout of DeepMind's MeshGraphNet data sets, as HDF5.
+
+    ``target`` gets ``meta.json`` and one file a split: ``train.h5``, ``valid.h5``,
+    ``test.h5`` and ``NAME.h5`` of extra splits, with ``meta-NAME.json`` where trajectories have
+    another length than those of ``meta.json``.  A file holds a group "0", "1", … for each
+    trajectory.  As in the converted TFRecords that PyTorch ports read, each field is
+    (frames, rows, width), also the static ones:
+
+    ================  ============  =======================================================
+    ``cells``         (F, 6C, 4)    int32, tetrahedra, as in ``deforming_plate``: six for each
+                                    hexahedron, whose edges include diagonals
+    ``hexahedra``     (F, C, 8)     int32, VTK order
+    ``node_type``     (F, N, 1)     int32, 3 (handle) where all components are held, else 0
+    ``free``          (F, N, 3)     int32, 1 where a component may move
+    ``mesh_pos``      (F, N, 3)     rest positions, m
+    ``world_pos``     (F, N, 3)     the reference, m
+    ``base_pos``      (F, N, 3)     one step of the base model from this frame of the
+                                    reference, m; in the last frame ``world_pos``
+    ``forces``        (F, N, 3)     of the step from this frame, N; in the last frame 0
+    ``young``, …      (F, N, 1)     and ``poisson``, ``density``: means over a node's cells
+    ================  ============  =======================================================
+
+    Parameters
+    ----------
+    folder, target : path
+    base : str
+        Run whose predictions become ``base_pos``.
+
+    Returns
+    -------
+    list of Path
+        What was written.
+
+    Raises
+    ------
+    InputError
+        If there is no data set, the base model's predictions are missing, or a split has
+        trajectories of different lengths.
+    OutputError
+        If ``target`` cannot be written.
+    """
+    target, written = Path(target), []
+    _make(target)
+    splits = sorted(splits_of(folder), key=lambda name: (name not in _SPLITS, name))
+    if TRAINING in splits:
+        splits.insert(0, splits.pop(splits.index(TRAINING)))
+    common: dict[str, Any] | None = None
+    for split in splits:
+        name = _SPLITS.get(split, f"extra-{split}" if split in _SPLITS.values() else split)
+        path = target / f"{name}.h5"
+        meta = _write_split(path, folder, split, base)
+        written.append(path)
+        if meta == common:
+            continue
+        path = target / ("meta.json" if common is None else f"meta-{name}.json")
+        _write_text(path, json.dumps(meta, indent=1) + "\n")
+        written.append(path)
+        common = common or meta
+    return written
+
+
+def export_vtu(
+    folder: str | Path,
+    target: str | Path,
+    split: str,
+    mesh: int,
+    simulation: int,
+    runs: Sequence[str] = ("plain",),
+) -> list[Path]:
+    """Write a simulation's reference and runs as VTU series for ParaView.
+
+    Points are the current positions on the coarse mesh.  Point data: ``displacement`` (m),
+    ``velocity`` (m/s), ``error`` (to the reference, m; of runs only) and ``force`` (of the step
+    that ends in the frame, N).  Cell data: ``young`` (Pa), ``poisson``, ``density`` (kg/m3).
+
+    Parameters
+    ----------
+    folder, target : path
+    split : str
+    mesh, simulation : int
+        Number of the mesh in the split, and of the simulation on it.
+    runs : sequence of str
+        With rollouts.
+
+    Returns
+    -------
+    list of Path
+        PVD files, ``reference.pvd`` first.
+
+    Raises
+    ------
+    InputError
+        If there is no such simulation or run.
+    OutputError
+        If ``target`` cannot be written.
+    """
+    shard = read_shard(_shard_path(folder, split, mesh))
+    if not 0 <= simulation < len(shard.simulations):
+        raise InputError(
+            f"simulation = {simulation}: mesh {mesh} of {split} has {len(shard.simulations)}: "
+            f"expected 0 to {len(shard.simulations) - 1}."
+        )
+    found = shard.simulations[simulation]
+    names = [REFERENCE, *(name for name in runs if name != REFERENCE)]
+    for name in names:
+        _positions(found, name)
+    return [_write_series(shard, found, name, Path(target)) for name in names]
+
+
+def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
+    """One file of the MeshGraphNet layout; returns its description."""
+    metas: list[dict[str, Any]] = []
+    try:
+        with replacing(path) as part, h5py.File(part, "w") as file:
+            for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
+                fields = _fields(where, shard, simulation, base)
+                metas.append(_meta(fields, float(shard.attributes["time_step"])))
+                if metas[-1] != metas[0]:
+                    raise InputError(
+                        f"{where}: {simulation.steps} steps of {shard.attributes['time_step']} s, "
+                        f"unlike the first simulation of {split}: expected the same in a split."
+                    )
+                _write_group(file.create_group(str(number)), fields, simulation.steps + 1)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    return metas[0]
+
+
+def _simulations(folder: str | Path, split: str) -> Iterator[tuple[str, Shard, Simulation]]:
+    for path in shard_paths(folder, split):
+        shard = read_shard(path)
+        for k, simulation in enumerate(shard.simulations):
+            yield f"{path}, simulation {k}", shard, simulation
+
+
+def _fields(where: str, shard: Shard, simulation: Simulation, base: str) -> dict[str, Array]:
+    run = simulation.runs.get(base)
+    if run is None or run.predictions is None:
+        names = [name for name, each in simulation.runs.items() if each.predictions is not None]
+        raise InputError(
+            f"{where}: no predictions of run {base!r}: expected one of {', '.join(names)}."
+        )
+    world, nodes = _positions(simulation, REFERENCE), len(shard.points)
+    handles = np.where(shard.free.any(axis=1), NORMAL, HANDLE)
+    moduli = {name: getattr(shard, name) for name in ("young", "poisson", "density")}
+    fields = {
+        "cells": tetrahedra(shard.cells),
+        "hexahedra": shard.cells,
+        "node_type": handles[:, None],
+        "free": shard.free,
+        "mesh_pos": shard.points,
+        "world_pos": world,
+        "base_pos": np.concatenate([run.predictions, world[-1:]]),
+        "forces": np.concatenate([simulation.forces, np.zeros_like(simulation.forces[:1])]),
+        **{name: node_means(x, shard.cells, nodes)[:, None] for name, x in moduli.items()},
+    }
+    whole = ("cells", "hexahedra", "node_type", "free")
+    return {
+        name: np.asarray(x, dtype=np.int32 if name in whole else np.float32)
+        for name, x in fields.items()
+    }
+
+
+def _meta(fields: dict[str, Array], time_step: float) -> dict[str, Any]:
+    """As ``meta.json`` there: rows, which differ between meshes, are -1."""
+    frames = len(fields["world_pos"])
+    features = {
+        name: {
+            "type": "dynamic" if name in _DYNAMIC else "static",
+            "shape": [frames if name in _DYNAMIC else 1, -1, values.shape[-1]],
+            "dtype": str(values.dtype),
+        }
+        for name, values in fields.items()
+    }
+    return {
+        "simulator": "pdcorrect",
+        "dt": time_step,
+        "trajectory_length": frames,
+        "field_names": list(fields),
+        "features": features,
+    }
+
+
+def _write_group(group: h5py.Group, fields: dict[str, Array], frames: int) -> None:
+    for name, values in fields.items():
+        every = values if name in _DYNAMIC else np.broadcast_to(values, (frames, *values.shape))
+        group.create_dataset(
+            name, data=every, chunks=(1, *every.shape[1:]), compression="gzip", shuffle=True
+        )
+
+
+def _shard_path(folder: str | Path, split: str, mesh: int) -> Path:
+    paths = {path.stem: path for path in shard_paths(folder, split)}
+    name = f"mesh-{mesh:04d}"
+    if name not in paths:
+        raise InputError(f"{folder}: {split} has no {name}{SUFFIX}: expected {', '.join(paths)}.")
+    return paths[name]
+
+
+def _positions(simulation: Simulation, name: str) -> Array:
+    run = simulation.runs.get(name)
+    if run is None or run.positions is None:
+        names = [key for key, each in simulation.runs.items() if each.positions is not None]
+        raise InputError(f"no positions of run {name!r}: expected one of {', '.join(names)}.")
+    return run.positions
+
+
+def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path) -> Path:
+    step = float(shard.attributes["time_step"])
+    positions, reference = (
+        np.asarray(_positions(simulation, each), dtype=np.float64) for each in (name, REFERENCE)
+    )
+    forces = np.concatenate([np.zeros((1, *shard.points.shape)), simulation.forces])
+    times: NDArray[np.float64] = np.arange(len(positions), dtype=np.float64) * step
+    trajectory = Trajectory(
+        positions, velocities(positions, step), times, {},
+        shard.points, shard.cells.astype(np.int64),
+    )  # fmt: skip
+
+    def points(frame: int) -> dict[str, NDArray[np.float64]]:
+        error = {} if name == REFERENCE else {"error": positions[frame] - reference[frame]}
+        return {**error, "force": forces[frame].astype(np.float64)}
+
+    moduli = {"young": shard.young, "poisson": shard.poisson, "density": shard.density}
+    return write_vtu_series(
+        trajectory, target, name=name, point_data=points, cell_data=lambda frame: moduli
+    )
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from None
+
+
+def _write_text(path: Path, text: str) -> None:
+    try:
+        with replacing(path) as part:
+            part.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None

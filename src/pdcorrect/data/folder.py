@@ -1,0 +1,59 @@
+"""Which files a data set's folder holds: ``<split>/mesh-0000.h5`` and so on."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.schema import SUFFIX
+from pdcorrect.errors import InputError
+
+_NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
+_FIRST = (TRAINING, VALIDATION, EVALUATION)
+
+
+def all_shards(folder: str | Path) -> list[Path]:
+    """Files of meshes, by split and number; only their names count."""
+    found = (path for path in Path(folder).glob(f"*/mesh-*{SUFFIX}") if _NAME.fullmatch(path.name))
+    return sorted(found, key=lambda path: (*_rank(path.parent.name), shard_number(path)))
+
+
+def shard_number(path: Path) -> int:
+    """Number of a mesh, from its file's name."""
+    return int(path.stem.removeprefix("mesh-"))
+
+
+def splits_of(folder: str | Path) -> list[str]:
+    """Names of the splits that there are files of: the usual ones first.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    found = list(dict.fromkeys(path.parent.name for path in all_shards(folder)))
+    if not found:
+        raise InputError(
+            f"{folder}: no data set: expected folders of splits with files mesh-0000{SUFFIX}."
+        )
+    return found
+
+
+def shard_paths(folder: str | Path, split: str) -> list[Path]:
+    """Files of a split, by number.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    paths = [path for path in all_shards(folder) if path.parent.name == split]
+    if not paths:
+        names = ", ".join(splits_of(folder))
+        raise InputError(f"{folder}: no split {split!r}: expected one of {names}.")
+    return paths
+
+
+def _rank(split: str) -> tuple[int, str]:
+    return (_FIRST.index(split) if split in _FIRST else len(_FIRST)), split

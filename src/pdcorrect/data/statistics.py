@@ -1,0 +1,259 @@
+"""Means, deviations and ranges of what a network sees, over the training split."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.data.config import TRAINING
+from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.schema import NORMALISATION
+from pdcorrect.data.shard_arrays import (
+    MeshArrays,
+    MotionArrays,
+    ShardHeader,
+    read_arrays,
+    read_header,
+)
+from pdcorrect.errors import FileFormatError, InputError, OutputError
+from pdcorrect.replacement import replacing
+
+VERSION = 1
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Of values with d components.
+
+    Attributes
+    ----------
+    count : (d,) float64
+        Values of each component.
+    mean, deviation, minimum, maximum : (d,) float64
+        ``deviation`` is the root of the mean squared distance from the mean.
+    """
+
+    count: Array
+    mean: Array
+    deviation: Array
+    minimum: Array
+    maximum: Array
+
+    @classmethod
+    def of(cls, values: NDArray[Any], chosen: NDArray[np.bool_] | None = None) -> Moments:
+        """Of values (n, d), those ``chosen`` (n, d) where given."""
+        if chosen is None:
+            chosen = np.ones(values.shape, dtype=bool)
+        values = np.asarray(values, dtype=np.float64)
+        count = chosen.sum(axis=0).astype(np.float64)
+        sums = values.sum(axis=0, where=chosen)
+        mean = np.divide(sums, count, out=np.zeros_like(sums), where=count > 0)
+        squares = ((values - mean) ** 2).sum(axis=0, where=chosen)
+        return cls(
+            count, mean, np.sqrt(squares / np.maximum(count, 1)),
+            values.min(axis=0, where=chosen, initial=np.inf),
+            values.max(axis=0, where=chosen, initial=-np.inf),
+        )  # fmt: skip
+
+    def repeated(self, times: int) -> Moments:
+        """As if every value came so many times."""
+        return Moments(times * self.count, self.mean, self.deviation, self.minimum, self.maximum)
+
+    def merged(self, other: Moments) -> Moments:
+        """Of both sets of values together (Chan, Golub and LeVeque 1979)."""
+        count = self.count + other.count
+        share = np.divide(other.count, count, out=np.zeros_like(count), where=count > 0)
+        away = other.mean - self.mean
+        variance = (1 - share) * self.deviation**2 + share * other.deviation**2
+        variance += share * (1 - share) * away**2
+        return Moments(
+            count, self.mean + share * away, np.sqrt(variance),
+            np.minimum(self.minimum, other.minimum), np.maximum(self.maximum, other.maximum),
+        )  # fmt: skip
+
+    def to_json(self) -> dict[str, list[float]]:
+        """Lists of numbers."""
+        return {name: getattr(self, name).tolist() for name in _MOMENTS}
+
+
+_MOMENTS = ("count", "mean", "deviation", "minimum", "maximum")
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """Of the training split, each window of one step counted once.
+
+    Attributes
+    ----------
+    quantities : mapping of str to Moments
+        By node: ``velocity`` (m/s), ``force`` (N), ``displacement`` (distance from rest, m),
+        ``log_young`` (log Pa), ``poisson``, ``density`` (kg/m3).  By directed edge:
+        ``rest_edge``, ``edge`` (vector from the first to the second node, at rest and in the
+        window's first frame, m), ``rest_edge_length``, ``edge_length`` (m).  By free component:
+        ``correction/NAME``, the reference minus the prediction of that run, m.
+    config_hash : str
+        Of the data set.
+    shards : mapping of str to str
+        Content hash of each file of the split, by its name.
+    """
+
+    quantities: Mapping[str, Moments]
+    config_hash: str
+    shards: Mapping[str, str]
+
+    def __getitem__(self, name: str) -> Moments:
+        if name not in self.quantities:
+            raise InputError(
+                f"no statistics of {name!r}: expected one of {', '.join(self.quantities)}."
+            )
+        return self.quantities[name]
+
+    def save(self, folder: str | Path) -> Path:
+        """Write ``statistics.json`` into the data set's folder.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written.
+        """
+        path = Path(folder) / NORMALISATION
+        content = {
+            "version": VERSION,
+            "config_hash": self.config_hash,
+            "shards": dict(self.shards),
+            "quantities": {name: m.to_json() for name, m in self.quantities.items()},
+        }
+        try:
+            with replacing(path) as part:
+                part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+        return path
+
+
+def compute_statistics(folder: str | Path) -> Statistics:
+    """Statistics of a data set's training split.
+
+    Corrections are those of every run that has predictions in all its simulations.
+
+    Raises
+    ------
+    InputError
+        If there is no training split, or its files come from different configurations.
+    FileFormatError
+        If a file is damaged.
+    """
+    headers = [read_header(path) for path in shard_paths(folder, TRAINING)]
+    config_hash, shards = _identity(headers)
+    bases = frozenset.intersection(*(names for h in headers for _, names in h.runs))
+    parts = (part for h in headers for part in _parts(h, sorted(bases)))
+    merged: dict[str, Moments] = reduce(_merged, parts)
+    return Statistics(merged, config_hash, shards)
+
+
+def load_statistics(folder: str | Path) -> Statistics:
+    """The statistics that lie in a data set's folder.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing or damaged.
+    InputError
+        If it was computed from other files than are there now.
+    """
+    path = Path(folder) / NORMALISATION
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        found = Statistics(
+            {
+                name: Moments(**{part: np.array(values[part]) for part in _MOMENTS})
+                for name, values in content["quantities"].items()
+            },
+            content["config_hash"],
+            content["shards"],
+        )
+    except FileNotFoundError:
+        raise FileFormatError(
+            f"{path}: there is no such file: expected compute_statistics(folder).save(folder)."
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"{path}: damaged or something else ({error}).") from None
+    config_hash, shards = _identity([read_header(p) for p in shard_paths(folder, TRAINING)])
+    if (config_hash, shards) == (found.config_hash, dict(found.shards)):
+        return found
+    names = sorted(n for n in shards.keys() | found.shards if shards.get(n) != found.shards.get(n))
+    more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
+    changed = f"{names[0]}{more}" if names else "the configuration"
+    raise InputError(
+        f"{path} is stale: {changed} has changed since: expected "
+        "compute_statistics(folder).save(folder)."
+    )
+
+
+def _identity(headers: list[ShardHeader]) -> tuple[str, dict[str, str]]:
+    """The configuration's hash and the content hashes of all files."""
+    configs = {header.config_hash for header in headers}
+    if len(configs) > 1:
+        raise InputError(
+            f"{headers[0].path.parent}: files of {len(configs)} configurations: expected one."
+        )
+    return configs.pop(), {header.path.name: header.content_hash for header in headers}
+
+
+def _parts(header: ShardHeader, bases: list[str]) -> Iterator[dict[str, Moments]]:
+    """Moments of the mesh, then of each of its simulations."""
+    mesh, motions = read_arrays(header.path, bases)
+    steps = sum(len(motion.forces) for motion in motions)
+    yield {name: moments.repeated(steps) for name, moments in _of_mesh(mesh).items()}
+    for motion in motions:
+        yield _of_motion(mesh, motion)
+
+
+def _of_mesh(mesh: MeshArrays) -> dict[str, Moments]:
+    first, second = mesh.edge_index
+    edges = mesh.rest[second] - mesh.rest[first]
+    return {
+        "log_young": Moments.of(np.log(mesh.young)[:, None]),
+        "poisson": Moments.of(mesh.poisson[:, None]),
+        "density": Moments.of(mesh.density[:, None]),
+        "rest_edge": Moments.of(edges),
+        "rest_edge_length": Moments.of(_lengths(edges)),
+    }
+
+
+def _of_motion(mesh: MeshArrays, motion: MotionArrays) -> dict[str, Moments]:
+    first, second = mesh.edge_index
+    starts = motion.positions[:-1].astype(np.float64)
+    edges = (starts[:, second] - starts[:, first]).reshape(-1, 3)
+    free = np.broadcast_to(mesh.free, starts.shape).reshape(-1, 3)
+    targets = motion.positions[1:].astype(np.float64)
+    return {
+        "velocity": Moments.of(motion.velocities.reshape(-1, 3)),
+        "force": Moments.of(motion.forces.reshape(-1, 3)),
+        "displacement": Moments.of(_lengths((starts - mesh.rest).reshape(-1, 3))),
+        "edge": Moments.of(edges),
+        "edge_length": Moments.of(_lengths(edges)),
+        **{
+            f"correction/{name}": Moments.of((targets - predicted).reshape(-1, 3), free)
+            for name, predicted in motion.predictions.items()
+        },
+    }
+
+
+def _lengths(vectors: Array) -> Array:
+    """(n, 1)."""
+    return np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def _merged(one: dict[str, Moments], other: dict[str, Moments]) -> dict[str, Moments]:
+    both: Iterable[str] = one.keys() & other.keys()
+    return {**one, **other, **{name: one[name].merged(other[name]) for name in both}}

@@ -1,0 +1,515 @@
+"""Windows of data sets: what samples hold, batches, loaders, samplers, statistics."""
+
+import itertools
+import json
+import pickle
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+from torch_geometric.data import Batch  # noqa: E402
+from torch_geometric.loader import DataLoader  # noqa: E402
+
+import reader_samples as samples  # noqa: E402
+from pdcorrect.data.graph import mesh_edges, node_means  # noqa: E402
+from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E402
+from pdcorrect.data.sampling import ShardShuffle  # noqa: E402
+from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
+from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
+
+STEPS = 12  # of a mesh: simulations of 7 and 5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return samples.dataset(tmp_path_factory.mktemp("set"))
+
+
+def opened(folder, split="training", **options):
+    return TrajectoryDataset(folder, split, dtype=torch.float64, **options)
+
+
+def same(one, other):
+    """Equal fields and equal ways to take batches apart."""
+    assert set(one.keys()) == set(other.keys())
+    for name in one.keys():  # noqa: SIM118
+        a, b = one[name], other[name]
+        if isinstance(a, torch.Tensor):
+            assert a.dtype == b.dtype, name
+            assert torch.equal(a, b), name
+        else:
+            assert a == b, name
+
+
+def places(batches):
+    """Mesh, simulation and frame of each sample."""
+    return [
+        tuple(row)
+        for batch in batches
+        for row in torch.stack([batch.mesh, batch.simulation, batch.frame], 1).tolist()
+    ]
+
+
+# --- samples ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("window", [1, 3])
+def test_a_sample_holds_the_window_of_its_simulation(folder, window):
+    dataset = opened(folder, window=window, base="best", runs=("plain",))
+    assert len(dataset) == 4 * (STEPS - 2 * (window - 1))
+    index = 7 - window + 1 + 2  # the first mesh's second simulation, frame 2
+    found = dataset[index]
+    shard = samples.shard(0, cells=samples.SHAPES[0])
+    simulation = shard.simulations[1]
+    truth, plain = (simulation.runs[name].positions for name in ("reference", "plain"))
+    steps = slice(2, 2 + window)
+    for name, expected in {
+        "positions": truth[2],
+        "velocities": (truth[2] - truth[1]) / samples.STEP,
+        "targets": truth[3 : 3 + window].swapaxes(0, 1),
+        "predictions": simulation.runs["best"].predictions[steps].swapaxes(0, 1),
+        "forces": simulation.forces[steps].swapaxes(0, 1),
+        "run_plain": plain[2 : 3 + window].swapaxes(0, 1),
+        "rest": shard.points,
+        "mass": shard.mass,
+        "cell_poisson": shard.poisson,
+        "young": node_means(shard.young, shard.cells, len(shard.points)),
+        "time": [2 * samples.STEP],
+        "time_step": [samples.STEP],
+    }.items():
+        np.testing.assert_allclose(found[name].numpy(), expected, rtol=1e-12, err_msg=name)
+    assert (found.free.numpy() == shard.free).all()
+    assert (found.cells.numpy() == shard.cells).all()
+    assert [int(found[name]) for name in ("mesh", "simulation", "frame")] == [0, 1, 2]
+    assert found.num_nodes == len(shard.points)
+
+
+def test_a_body_starts_without_velocity(folder):
+    assert not opened(folder)[0].velocities.any()
+    assert opened(folder)[1].velocities.any()
+
+
+@pytest.mark.parametrize("window", [1, 5, 6, 7])
+def test_windows_reach_the_last_frame_and_no_further(folder, window):
+    found = list(opened(folder, window=window))
+    frames = {}
+    for sample in found:
+        frames.setdefault((int(sample.mesh), int(sample.simulation)), []).append(int(sample.frame))
+    expected = {}
+    for mesh, (k, steps) in itertools.product(range(4), enumerate((7, 5))):
+        if steps >= window:
+            expected[mesh, k] = list(range(steps - window + 1))
+    assert frames == expected
+    assert all(sample.targets.shape[1] == window for sample in found)
+
+
+def test_nothing_is_left_of_a_window_longer_than_every_simulation(folder):
+    with pytest.raises(InputError, match="no simulation has 8 steps, the longest 7"):
+        opened(folder, window=8)
+
+
+def test_edges_are_those_of_the_cells_once_in_both_directions(folder):
+    found = opened(folder)[0]
+    expected = set()
+    for a, b in itertools.combinations(range(len(found.rest)), 2):
+        if (found.rest[a] - found.rest[b]).norm() < 0.11:  # neighbours of a grid of 0.1 m
+            expected |= {(a, b), (b, a)}
+    edges = list(map(tuple, found.edge_index.T.tolist()))
+    assert len(edges) == len(set(edges))
+    assert set(edges) == expected
+    assert edges == sorted(edges)
+    assert mesh_edges(np.arange(8)[None]).shape == (2, 24)
+
+
+def test_values_of_nodes_are_means_over_their_cells():
+    cells = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [1, 8, 9, 2, 5, 10, 11, 6]])
+    means = node_means(np.array([1.0, 3.0]), cells, 12)
+    assert means[[0, 1, 8]].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_changing_a_sample_leaves_the_data_set_alone(folder):
+    dataset = opened(folder)
+    before = dataset[3].positions.clone()
+    dataset[3].positions.zero_()
+    dataset.batch([3]).positions.zero_()
+    assert torch.equal(dataset[3].positions, before)
+
+
+def test_numbers_come_in_the_type_asked_for(folder):
+    found = TrajectoryDataset(folder, "training")[0]
+    assert {found[n].dtype for n in ("positions", "velocities", "rest", "young", "time")} == {
+        torch.float32
+    }
+    assert found.edge_index.dtype == found.cells.dtype == torch.int64
+
+
+def test_data_without_predictions_is_read_without_a_base(tmp_path):
+    samples.write(tmp_path, [samples.shard(models=())])
+    assert "predictions" not in opened(tmp_path, base=None)[0]
+    with pytest.raises(InputError, match="no predictions of run 'plain'.*base=None"):
+        opened(tmp_path)
+
+
+def test_what_is_not_there_is_named(folder, tmp_path):
+    for options, words in (
+        ({"split": "test"}, "no split 'test': expected one of training, validation, evaluation"),
+        ({"base": "fine"}, "no predictions of run 'fine': expected one of best, plain"),
+        ({"runs": ["fine"]}, "no positions of run 'fine'"),
+        ({"window": 0}, "window = 0"),
+    ):
+        with pytest.raises(InputError, match=words):
+            opened(folder, **options)
+    with pytest.raises(InputError, match="no data set"):
+        opened(tmp_path)
+    with pytest.raises(IndexError):
+        opened(folder).get(4 * STEPS)
+
+
+def test_damaged_files_are_refused_by_name(folder, tmp_path):
+    path = tmp_path / "training" / "mesh-0000.h5"
+    path.parent.mkdir()
+    path.write_bytes(b"nothing of the kind")
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: not a file of a data set"):
+        opened(tmp_path)
+    whole = (folder / "training" / "mesh-0000.h5").read_bytes()
+    dataset = opened(samples.write(tmp_path, [samples.shard()]))
+    path.write_bytes(whole[:-2000])
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: .*truncated"):
+        dataset[0]
+
+
+# --- batches ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{}, {"window": 3, "base": "best", "runs": ("plain", "best")}])
+def test_a_batch_is_what_pytorch_geometric_makes_of_the_samples(folder, options):
+    dataset = opened(folder, **options)
+    chosen = [0, 30, 3, 3, len(dataset) - 1]
+    ours = dataset.batch(chosen)
+    theirs = Batch.from_data_list([dataset[i] for i in chosen])
+    assert type(ours) is type(theirs)
+    same(ours, theirs)
+    for parts in ("_slice_dict", "_inc_dict"):
+        a, b = getattr(ours, parts), getattr(theirs, parts)
+        assert a.keys() == b.keys()
+        assert all(torch.equal(a[name], b[name]) for name in a)
+    assert ours.num_graphs == len(chosen)
+    for i, sample in zip(chosen, ours.to_data_list(), strict=True):
+        same(sample, dataset[i])
+
+
+def test_a_batch_for_another_process_is_the_same(folder):
+    dataset = opened(folder, window=2)
+    same(dataset.packed([5, 1, 39]).batch(), dataset.batch([5, 1, 39]))
+
+
+def test_cells_and_edges_of_a_batch_stay_within_their_graphs(folder):
+    batch = opened(folder).batch([0, 20, 40])
+    assert (batch.batch[batch.edge_index[0]] == batch.batch[batch.edge_index[1]]).all()
+    assert (batch.batch[batch.cells] == batch.batch[batch.cells[:, :1]]).all()
+    assert torch.equal(batch.cells.unique(), torch.arange(batch.num_nodes))
+
+
+def test_the_loader_of_pytorch_geometric_works_too(folder):
+    dataset = opened(folder)
+    for ours, theirs in zip(TrajectoryLoader(dataset, 7), DataLoader(dataset, 7), strict=True):
+        same(ours, theirs)
+
+
+def test_part_of_a_data_set_is_batched_by_its_own_numbers(folder):
+    dataset = opened(folder)
+    part = dataset[[40, 2, 17]]
+    same(part.batch([0, 2]), dataset.batch([40, 17]))
+    assert part.shard_numbers().tolist() == [3, 0, 1]
+    assert sorted(ShardShuffle(part)) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_hand_out_what_one_process_does(folder, method):
+    dataset = opened(folder)
+    dataset[0]  # the parent has read something
+    alone = list(TrajectoryLoader(dataset, 5, ShardShuffle(dataset, seed=3)))
+    loader = TrajectoryLoader(
+        dataset, 5, ShardShuffle(dataset, seed=3), num_workers=2, multiprocessing_context=method
+    )
+    shared = list(loader)
+    for one, other in zip(alone, shared, strict=True):
+        same(one, other)
+    assert sorted(places(shared)) == sorted(places(TrajectoryLoader(dataset, 48)))
+
+
+def test_a_pickled_data_set_starts_with_an_empty_memory(folder):
+    dataset = opened(folder)
+    expected = dataset.batch([0, 40])
+    blob = pickle.dumps(dataset)
+    assert len(blob) < 20_000
+    copy = pickle.loads(blob)
+    assert copy._shards.bytes == len(copy._shards) == 0
+    same(copy.batch([0, 40]), expected)
+
+
+def test_no_file_stays_open(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "set")
+    dataset = opened(tmp_path / "set")
+    expected = dataset.batch([0, 40])
+    shutil.rmtree(tmp_path / "set")
+    same(dataset.batch([0, 40]), expected)
+    with pytest.raises(FileFormatError, match="No such file"):
+        dataset[20]
+
+
+def test_memory_keeps_to_its_bound(folder):
+    sizes = []
+    for number in range(4):
+        dataset = opened(folder)
+        dataset[number * STEPS]
+        sizes.append(dataset._shards.bytes)
+    bound = sizes[0] + sizes[2]
+    dataset = opened(folder, cache_bytes=bound)
+    for number in np.random.default_rng(0).integers(4, size=60):
+        dataset[int(number) * STEPS]
+        kept = dataset._shards
+        assert number in kept
+        assert kept.bytes == sum(sizes[i] for i in range(4) if i in kept) <= bound
+    tiny = opened(folder, cache_bytes=1)
+    for number in (0, 1, 0):
+        tiny[number * STEPS]
+        assert len(tiny._shards) == 1
+
+
+def test_the_least_recently_used_file_goes_first(folder):
+    dataset = opened(folder)
+    loaded = []
+    load = dataset._shards.load
+    dataset._shards.load = lambda number: loaded.append(number) or load(number)
+    for number in (0, 1):
+        dataset[number * STEPS]
+    dataset._shards.limit = dataset._shards.bytes
+    for number in (0, 3, 0, 1):
+        dataset[number * STEPS]
+    assert loaded == [0, 1, 3, 1]
+
+
+# --- order -----------------------------------------------------------------------------
+
+
+def test_an_epoch_has_every_window_once_and_epochs_differ(folder):
+    dataset = opened(folder)
+    sampler = ShardShuffle(dataset, seed=1)
+    orders = []
+    for epoch in range(3):
+        sampler.set_epoch(epoch)
+        orders.append(list(sampler))
+        assert sorted(orders[-1]) == list(range(len(dataset)))
+    assert len(set(map(tuple, orders))) == 3
+    sampler.set_epoch(1)
+    assert list(sampler) == orders[1]
+    assert list(ShardShuffle(dataset, seed=2)) != orders[0]
+
+
+@pytest.mark.parametrize("block", [1, 2])
+def test_files_are_read_block_by_block(folder, block):
+    dataset = opened(folder)
+    order = list(ShardShuffle(dataset, block=block))
+    shards = dataset.shard_numbers()[order]
+    blocks = [set(shards[i : i + block * STEPS]) for i in range(0, len(shards), block * STEPS)]
+    assert [len(each) for each in blocks] == [block] * (4 // block)
+    assert set.union(*blocks) == {0, 1, 2, 3}
+    assert (np.diff(order[:STEPS]) < 0).any()
+
+
+def test_by_default_a_block_is_what_the_memory_holds(folder):
+    assert ShardShuffle(opened(folder)).block == 4
+    assert ShardShuffle(opened(folder, cache_bytes=1)).block == 1
+
+
+@pytest.mark.parametrize("ranks", [2, 3, 5])
+def test_ranks_get_disjoint_parts_of_equal_size(folder, ranks):
+    dataset = opened(folder)
+    for epoch in (0, 4):
+        parts = []
+        for rank in range(ranks):
+            sampler = ShardShuffle(dataset, seed=7, block=2, rank=rank, world_size=ranks)
+            sampler.set_epoch(epoch)
+            parts.append(list(sampler))
+            assert len(sampler) == len(parts[-1]) == len(dataset) // ranks
+        together = [window for part in parts for window in part]
+        assert len(set(together)) == len(together)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("stop", [1, 4, 10])
+def test_training_goes_on_exactly_where_it_stopped(folder, workers, stop):
+    dataset = opened(folder)
+
+    def loader():
+        return TrajectoryLoader(
+            dataset, 5, ShardShuffle(dataset, seed=5, block=2), num_workers=workers
+        )
+
+    whole = loader()
+    whole.set_epoch(2)
+    expected = places(whole)
+    whole.set_epoch(3)
+    following = places(whole)
+
+    first = loader()
+    first.set_epoch(2)
+    before = places(itertools.islice(first, stop))
+    state = json.loads(json.dumps(first.state_dict()))
+    second = loader()
+    second.load_state_dict(state)
+    second.set_epoch(state["epoch"])
+    assert second.state_dict() == state
+    assert before + places(second) == expected
+    second.set_epoch(3)
+    assert places(second) == following
+
+
+def test_a_sampler_alone_resumes_too(folder):
+    dataset = opened(folder)
+    sampler = ShardShuffle(dataset, seed=5)
+    expected = list(sampler)
+    assert list(sampler) == expected
+    before = list(itertools.islice(sampler, 11))
+    other = ShardShuffle(dataset, seed=5)
+    other.load_state_dict(sampler.state_dict())
+    assert before + list(other) == expected
+    assert list(other) == expected
+
+
+def test_a_state_of_another_order_is_refused(folder):
+    dataset = opened(folder)
+    state = ShardShuffle(dataset, seed=5).state_dict()
+    for other, words in (
+        (ShardShuffle(dataset, seed=6), "seed = 5, the sampler 6"),
+        (ShardShuffle(dataset, seed=5, world_size=2), "world_size = 1"),
+        (ShardShuffle(opened(folder, window=2), seed=5), "windows = 48, the sampler 40"),
+    ):
+        with pytest.raises(InputError, match=words):
+            other.load_state_dict(state)
+    with pytest.raises(InputError, match="reads in order"):
+        TrajectoryLoader(dataset, 5).state_dict()
+
+
+def test_impossible_samplers_are_refused(folder):
+    dataset = opened(folder)
+    for options, words in (
+        ({"rank": 2, "world_size": 2}, "rank = 2 of 2"),
+        ({"block": 0}, "block = 0"),
+        ({"world_size": 49}, "48 windows for 49 ranks"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ShardShuffle(dataset, **options)
+
+
+# --- statistics ------------------------------------------------------------------------
+
+
+def direct(folder):
+    """All values of the training split, window by window, from the samples."""
+    found = {}
+    for base in ("plain", "best"):
+        for one in opened(folder, base=base):
+            first, second = one.edge_index
+            correction = (one.targets - one.predictions)[:, 0]
+            values = {f"correction/{base}": torch.where(one.free, correction, torch.nan)}
+            if base == "plain":
+                for name, positions in (("rest_edge", one.rest), ("edge", one.positions)):
+                    values[name] = positions[second] - positions[first]
+                    values[f"{name}_length"] = values[name].norm(dim=1, keepdim=True)
+                values |= {
+                    "velocity": one.velocities,
+                    "force": one.forces[:, 0],
+                    "displacement": (one.positions - one.rest).norm(dim=1, keepdim=True),
+                    "log_young": one.young.log()[:, None],
+                    "poisson": one.poisson[:, None],
+                    "density": one.density[:, None],
+                }
+            for name, array in values.items():
+                found.setdefault(name, []).append(array.numpy())
+    return {name: np.concatenate(arrays) for name, arrays in found.items()}
+
+
+def close(one, other, tolerance=1e-12):
+    for name in ("count", "mean", "deviation", "minimum", "maximum"):
+        a, b = getattr(one, name), getattr(other, name)
+        scale = np.abs([one.minimum, one.maximum]).max()
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * scale)
+
+
+def test_statistics_are_those_of_all_values_of_the_training_split(folder):
+    statistics = compute_statistics(folder)
+    expected = direct(folder)
+    assert statistics.quantities.keys() == expected.keys()
+    for name, values in expected.items():
+        found = statistics[name]
+        assert found.count.tolist() == np.isfinite(values).sum(axis=0).tolist()
+        np.testing.assert_allclose(found.mean, np.nanmean(values, axis=0), rtol=1e-9, atol=1e-13)
+        np.testing.assert_allclose(
+            found.deviation, np.nanstd(values, axis=0), rtol=1e-9, atol=1e-13
+        )
+        np.testing.assert_allclose(found.minimum, np.nanmin(values, axis=0), rtol=1e-12)
+        np.testing.assert_allclose(found.maximum, np.nanmax(values, axis=0), rtol=1e-12)
+
+
+def test_statistics_do_not_depend_on_the_order_of_the_files(folder, tmp_path):
+    for number, cells in enumerate(samples.SHAPES):
+        one = samples.shard(number, cells=cells)
+        moved = {**one.attributes, "number": 3 - number}
+        samples.write(tmp_path, [replace(one, attributes=moved)])
+    one, other = compute_statistics(folder), compute_statistics(tmp_path)
+    for name in one.quantities:
+        close(one[name], other[name])
+
+
+def test_saved_statistics_are_loaded_as_they_were(folder):
+    statistics = compute_statistics(folder)
+    path = statistics.save(folder)
+    loaded = load_statistics(folder)
+    path.unlink()
+    assert (loaded.config_hash, loaded.shards) == (statistics.config_hash, statistics.shards)
+    for name in statistics.quantities:
+        close(loaded[name], statistics[name], 0)
+    with pytest.raises(InputError, match="no statistics of 'speed'"):
+        loaded["speed"]
+
+
+def test_stale_and_damaged_statistics_are_refused(tmp_path):
+    samples.dataset(tmp_path, splits=("training", "validation"))
+    with pytest.raises(FileFormatError, match="there is no such file"):
+        load_statistics(tmp_path)
+    compute_statistics(tmp_path).save(tmp_path)
+    samples.write(tmp_path, [samples.shard(9, "validation")])
+    load_statistics(tmp_path)  # another split is no part of them
+    samples.write(tmp_path, [samples.shard(4)])
+    with pytest.raises(InputError, match=r"stale: mesh-0004\.h5 has changed"):
+        load_statistics(tmp_path)
+    compute_statistics(tmp_path).save(tmp_path)
+    samples.write(tmp_path, [samples.shard(0, steps=(3,))])
+    with pytest.raises(InputError, match=r"stale: mesh-0000\.h5 has changed"):
+        load_statistics(tmp_path)
+    (tmp_path / "statistics.json").write_text('{"version": 1}')
+    with pytest.raises(FileFormatError, match="damaged or something else"):
+        load_statistics(tmp_path)
+
+
+def test_files_of_two_configurations_have_no_statistics(tmp_path):
+    one = samples.shard(1)
+    other = replace(one, attributes={**one.attributes, "config_hash": "another"})
+    samples.write(tmp_path, [samples.shard(0), other])
+    with pytest.raises(InputError, match="files of 2 configurations"):
+        compute_statistics(tmp_path)
+
+
+def test_arrays_come_in_the_files_own_precision(tmp_path):
+    samples.write(tmp_path, [samples.shard()], "float32")
+    _, motions = read_arrays(tmp_path / "training" / "mesh-0000.h5", ("plain",))
+    assert motions[0].positions.dtype == motions[0].predictions["plain"].dtype == np.float32
+    assert motions[0].velocities.dtype == np.float64
