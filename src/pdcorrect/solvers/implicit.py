@@ -119,13 +119,27 @@ class ImplicitStepper:
         InputError
             If shapes are wrong or a number is not finite.
         """
+        state, h = self.accepted(state, forces, time_step)
+        with quiet_blas():
+            return self._step(state, forces, h)
+
+    def accepted(
+        self, state: State, forces: Array | None, time_step: float | None
+    ) -> tuple[State, float]:
+        """The state and the time step (s) that a call with these arguments goes on with.
+
+        The state is without its memory where the step is not the stepper's own, since
+        several-step integrators need equal steps.
+
+        Raises
+        ------
+        InputError
+            As by the call itself.
+        """
         check_input(self.problem, state, forces)
         h = self.time_step if time_step is None else float(time_step)
         _positive("time_step", h)
-        if h != self.time_step:  # several-step integrators need equal steps
-            state = replace(state, memory={})
-        with quiet_blas():
-            return self._step(state, forces, h)
+        return (state if h == self.time_step else replace(state, memory={})), h
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         effort = _Effort()

@@ -73,11 +73,15 @@ class Integrator:
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        before = state.memory.get("previous_times")
-        started = bool(state.memory)
-        if before is not None:  # it needs equal steps
-            started = abs(state.time - before[0, 0] - h) <= _EQUAL_STEPS * h
-        return self.scheme_of(h, started)
+        return self.scheme_of(h, _started(state, h))
+
+    def held(self, state: State, h: float) -> Integrator:
+        """The same integrator with the scheme of that step, whatever the length of its own step.
+
+        As if the steps before ``state`` had the same length.
+        """
+        started = _started(state, h)
+        return Integrator(lambda length, _: self.scheme_of(length, started))
 
     def known(
         self, problem: Problem, state: State, h: float, forces: Array | None
@@ -140,6 +144,19 @@ def solution(scheme: Scheme, before: State, after: State, problem: Problem) -> A
     row = scheme.positions.coefficients
     rest = Linear(**{name: c for name, c in row.items() if name != "y"})
     return problem.relaxed((after.positions - rest({"positions": before.positions})) / row["y"])
+
+
+def _started(state: State, h: float) -> bool:
+    """Whether a state has the memory for a step of h seconds."""
+    before = state.memory.get("previous_times")
+    if before is None:
+        return bool(state.memory)
+    return equal_steps(state.time - before[0, 0], h)
+
+
+def equal_steps(a: float, b: float) -> bool:
+    """Whether two lengths of time, s, count as equal."""
+    return bool(abs(a - b) <= _EQUAL_STEPS * b)
 
 
 def _full(values: Any, like: NDArray[np.bool_]) -> Array:
