@@ -54,17 +54,13 @@ def asymmetric_state(problem, seed=0, amplitude=0.15, invert=False):
     return pc.State(p, v)
 
 
-class OfLength:
-    """A stepper that takes steps of another length than its own."""
+class NewtonOfLength(pc.Newton):
+    """Takes steps of another length than its own."""
 
-    def __init__(self, stepper, time_step):
-        self.stepper, self.length = stepper, time_step
-
-    def __getattr__(self, name):
-        return getattr(self.stepper, name)
+    length = 0.02
 
     def __call__(self, state, forces=None, time_step=None):
-        return self.stepper(state, forces, self.length if time_step is None else time_step)
+        return super().__call__(state, forces, self.length if time_step is None else time_step)
 
 
 class Case:
@@ -250,7 +246,8 @@ def test_a_step_of_another_length_goes_without_memory_as_it_does_forwards(integr
     problem = pc.discretise(scene(time=timed(integrator)))
     stepper = pc.Newton(problem, 1e-13, recover=False)
     state = stepper(asymmetric_state(problem)).state
-    case = Case(problem, OfLength(stepper, 0.02), state, time_step=0.02)
+    longer = NewtonOfLength(problem, 1e-13, recover=False)
+    case = Case(problem, longer, state, time_step=longer.length)
     check_state_gradients(case)
     assert list(case.found.memory) == list(state.memory)
     assert not any(g.any() for g in case.found.memory.values())
@@ -682,3 +679,33 @@ def test_without_a_loss_there_is_nothing_to_solve():
     assert not found.positions.any()
     assert not found.young.any()
     assert found.time_step == 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stepper": "problem"}, "stepper is a Problem: expected ProjectiveDynamics or Newton"),
+        ({"state": "run"}, "state is a Trajectory: expected the step's State"),
+        ({"result": "run"}, "result is a Trajectory: expected the StepResult"),
+        ({"result": "state"}, "result is a State: expected the StepResult"),
+    ],
+)
+def test_arguments_of_the_wrong_kind_are_named(change, message):
+    problem = pc.discretise(beam(time={"frames": 1}))
+    stepper = pc.ProjectiveDynamics(problem)
+    state = problem.rest_state()
+    known = {
+        "problem": problem, "state": state, "run": pc.rollout(stepper, 1), "stepper": stepper,
+        "result": stepper(state),
+    }  # fmt: skip
+    chosen = {name: known[change.get(name, name)] for name in ("stepper", "state", "result")}
+    with pytest.raises(InputError, match=message):
+        pc.adjoint(*chosen.values(), state.positions)
+
+
+def test_a_tolerance_that_is_not_positive_is_refused():
+    problem = pc.discretise(beam(time={"frames": 1}))
+    stepper = pc.ProjectiveDynamics(problem)
+    state = problem.rest_state()
+    with pytest.raises(InputError, match=r"tolerance = -1.0: expected a number between"):
+        pc.adjoint(stepper, state, stepper(state), state.positions, tolerance=-1.0)

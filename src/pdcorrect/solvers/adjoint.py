@@ -40,7 +40,7 @@ from pdcorrect.solvers.adjoint_terms import (
     gravity_slope,
     mass_slope,
 )
-from pdcorrect.solvers.implicit import ImplicitStepper, quiet_blas
+from pdcorrect.solvers.implicit import ImplicitStepper, positive, quiet_blas
 from pdcorrect.solvers.integrators import Integrator
 from pdcorrect.solvers.linear import Linear
 from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
@@ -364,6 +364,8 @@ def adjoint(
         If the linear system cannot be solved.
     """
     check_solver(solver)
+    _check_types(stepper, state, result)
+    positive("tolerance", tolerance)
     _check_status(result.status)
     grad_memory = grad_memory or {}
     _check_names(grad_memory, result.state)
@@ -377,6 +379,19 @@ def adjoint(
     with quiet_blas():
         y = step_solution(step.objective(h), integrate, h, result)
         return Gradients(step, checked, y)
+
+
+def _check_types(stepper: object, state: object, result: object) -> None:
+    if not isinstance(stepper, ImplicitStepper):
+        kind = type(stepper).__name__
+        raise InputError(f"stepper is a {kind}: expected ProjectiveDynamics or Newton.")
+    if not isinstance(state, State):
+        raise InputError(f"state is a {type(state).__name__}: expected the step's State.")
+    if not isinstance(result, StepResult):
+        raise InputError(
+            f"result is a {type(result).__name__}: expected the StepResult that the stepper "
+            "returned. A rollout keeps none: take the steps one by one, result = stepper(state)."
+        )
 
 
 def _check_status(status: Status) -> None:
