@@ -37,8 +37,8 @@ class CoarseCorrection:
     cells : CellBatch
     problems : sequence of Problem
         The distinct ones of the batch, refined.
-    matrices : sequence of (N, N) sparse
-        Their G.
+    matrices : sequence of (N, N) sparse or None
+        Their G; None where it is singular, and there is no correction.
     factors : (float, float)
         On mass (1/s2) and stiffness.
     sharing : Sharing
@@ -48,7 +48,7 @@ class CoarseCorrection:
         self,
         cells: CellBatch,
         problems: Sequence[Problem],
-        matrices: Sequence[sp.csr_matrix],
+        matrices: Sequence[sp.csr_matrix | None],
         factors: tuple[float, float],
         sharing: Sharing,
     ) -> None:
@@ -75,10 +75,14 @@ class CoarseCorrection:
         return self._sharing.scattered(x).to(r.dtype)
 
 
-def _parts(problem: Problem, G: sp.csr_matrix, factors: tuple[float, float]) -> tuple[Array, Array]:
+def _parts(
+    problem: Problem, G: sp.csr_matrix | None, factors: tuple[float, float]
+) -> tuple[Array, Array]:
     """P (N, N_c) and H_c^-1 - G_c^-1, (3 N_c, 3 N_c), zero where clamped."""
     coarse = discretise(problem.scene, element="hex8")
     P = interpolation(coarse.mesh, problem.refine)
+    if G is None:
+        return P.toarray(), np.zeros((coarse.free.size, coarse.free.size))
     identity = sp.eye_array(3)
     free = sp.diags_array(problem.free.ravel().astype(np.float64))
     held = sp.diags_array(coarse.free.ravel().astype(np.float64))

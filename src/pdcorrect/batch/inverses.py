@@ -14,7 +14,7 @@ mesh (`CoarseCorrection`).  Internal modes are eliminated cell by cell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,7 +42,7 @@ def chosen(name: BatchHessian, problems: Sequence[Problem]) -> BatchHessian:
     Raises
     ------
     InputError
-        If there are no two levels.
+        If there is no such name, or there are no two levels.
     """
     refined = all(p.refine > 1 for p in problems)
     if name == "two-level" and not refined:
@@ -50,6 +50,8 @@ def chosen(name: BatchHessian, problems: Sequence[Problem]) -> BatchHessian:
             "first_hessian = 'two-level' for meshes that are not refined: expected refine of 2 "
             "or more."
         )
+    if name not in get_args(BatchHessian):
+        raise InputError(f"first_hessian = {name!r}: expected {', '.join(get_args(BatchHessian))}.")
     if name != "auto":
         return name
     if max(len(p.positions) for p in problems) <= LARGEST_REST:
@@ -80,6 +82,13 @@ class DenseInverse:
         Of all inverses.
     count : int
         Distinct ones.
+    regular : (B,) bool
+        Whether there is an inverse; where not, the products are zero.
+
+    Raises
+    ------
+    ConvergenceError
+        If no scene's matrix is positive definite.
     """
 
     def __init__(
@@ -103,15 +112,21 @@ class DenseInverse:
         shape = (len(distinct), self._axes, size, size)
         self._inverse = torch.zeros(shape, dtype=storage, device=cells.device)
         self.bytes = self._inverse.numel() * self._inverse.element_size()
-        solved, inverted, matrices = [], [], []
+        solved, inverted, matrices, regular = [], [], [], []
         for i, problem in enumerate(distinct):
             blocks = _node_blocks(problem, factors, kind)
             kept, inverse, coupling = _eliminated(blocks, problem.cells.shape[1] * self._width)
             solved.append(coupling)
             inverted.append(inverse)
-            self._fill(i, problem, kept, factors[0])
+            regular.append(self._fill(i, problem, kept, factors[0]))
             if kind == "two-level":
-                matrices.append(_summed(problem, kept, factors[0]))
+                matrices.append(_summed(problem, kept, factors[0]) if regular[i] else None)
+        if not any(regular):
+            raise ConvergenceError(
+                f"scene {problems[0].scene.name!r}: the matrix of the step is not positive "
+                "definite: expected clamps, or inertia that matters beside the stiffness."
+            )
+        self.regular = torch.tensor([regular[k] for k in owners], device=cells.device)
         if n.modes:
             modes = self._width * (n.width - problems[0].cells.shape[1])
             nodes = self._width * problems[0].cells.shape[1]
@@ -203,8 +218,8 @@ class DenseInverse:
 
     # --- preparation -----------------------------------------------------------------------
 
-    def _fill(self, i: int, problem: Problem, blocks: Array, mass_factor: float) -> None:
-        """Invert one problem's matrix into the store."""
+    def _fill(self, i: int, problem: Problem, blocks: Array, mass_factor: float) -> bool:
+        """Invert one problem's matrix into the store, if it is positive definite."""
         device, width = self._cells.device, self._width
         size = width * len(problem.positions)
         numbers = width * problem.cells[:, :, None] + np.arange(width)
@@ -225,12 +240,11 @@ class DenseInverse:
             held = matrix * keep[:, None] * keep + torch.diag(1.0 - keep)
             factor, info = torch.linalg.cholesky_ex(held)
             if int(info):
-                raise ConvergenceError(
-                    f"scene {problem.scene.name!r}: the matrix of the step is not positive "
-                    "definite: expected clamps, or inertia that matters beside the stiffness."
-                )
+                self._inverse[i] = 0.0
+                return False
             inverse = torch.cholesky_inverse(factor) * keep[:, None] * keep
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
+        return True
 
 
 class _Turning:

@@ -131,6 +131,7 @@ class BatchMinimiser:
         finite = self._alive & torch.isfinite(value) & torch.isfinite(self._slope)
         short = largest_displacement(self._d) <= self._threshold
         phase = torch.where(short, int(Phase.WAITING), int(Phase.RUNNING))
+        phase = torch.where(self._inverse.regular, phase, int(Phase.LINE_SEARCH))
         self.phase.copy_(torch.where(finite, phase, int(Phase.NOT_FINITE)))
         self._look()
 

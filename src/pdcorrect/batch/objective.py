@@ -13,7 +13,7 @@ from pdcorrect.fem.problem import Problem
 
 
 class BatchMass:
-    """M x for nodal fields (B, U, 3), kg; internal modes have no mass.
+    """M x for nodal fields (B, U, 3), kg, after `set_density`; internal modes have no mass.
 
     Attributes
     ----------
@@ -30,9 +30,8 @@ class BatchMass:
         blocks = [p.space.cell_masses(p.mass_rule) for p in problems]
         self._blocks = cells.tensor(padded(blocks, (n.cells, nodes, nodes)))
         self._diagonal = all(p.mass_is_diagonal for p in problems)
-        self.density = cells.tensor(padded([p.materials.density for p in problems], (n.cells,)))
-        self.nodal = torch.zeros(n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
-        self.set_density(self.density)
+        self.density = cells.rest.new_zeros(n.scenes, n.cells)
+        self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
 
     def set_density(self, density: Tensor) -> None:
         """Densities (B, C), kg/m3, from now on."""

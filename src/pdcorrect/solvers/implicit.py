@@ -89,8 +89,8 @@ class ImplicitStepper:
         self.problem = problem
         self.time_step = problem.time_step if time_step is None else float(time_step)
         check_backend(backend)
-        _positive("tolerance", tolerance)
-        _positive("time_step", self.time_step)
+        positive("tolerance", tolerance)
+        positive("time_step", self.time_step)
         self.tolerance = float(tolerance)
         time = problem.scene.time
         self.integrator = time.integrator if integrator is None else integrator
@@ -121,7 +121,7 @@ class ImplicitStepper:
         """
         check_input(self.problem, state, forces)
         h = self.time_step if time_step is None else float(time_step)
-        _positive("time_step", h)
+        positive("time_step", h)
         if h != self.time_step:  # several-step integrators need equal steps
             state = replace(state, memory={})
         with quiet_blas():
@@ -338,6 +338,7 @@ def whole(name: str, value: int) -> int:
     return int(value)
 
 
-def _positive(name: str, value: float) -> None:
+def positive(name: str, value: float) -> None:
+    """Refuse what is not a number above 0."""
     if not 0 < value < _LARGEST:
         raise InputError(f"{name} = {value!r}: expected a number between 0 and {_LARGEST:g}.")
