@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
 from pdcorrect.fem.problem import Problem
 
@@ -107,6 +108,26 @@ class CellBatch:
         )
         self._identity = torch.eye(3, dtype=dtype, device=device).reshape(9, 1)
         self._gradients = self.tensor(_gradient_sets(problems, n))
+
+    def narrowed(self, rows: Tensor) -> CellBatch:
+        """Of some scenes."""
+        n, numbers = self.sizes, rows.tolist()
+        moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None]
+        last = n.scenes * n.cells * n.width
+        slots = self._slots.reshape(n.scenes, -1)[rows]
+        shifted = slots + moved * n.cells * n.width
+        slots = torch.where(slots < last, shifted, len(rows) * n.cells * n.width)
+        cells = self._cells.reshape(n.scenes, -1)[rows] + moved * n.unknowns
+        return with_rows(
+            self, rows, "rest", "present_nodes", "present_cells", "_gradients",
+            sizes=n._replace(scenes=len(rows)),
+            node_counts=[self.node_counts[i] for i in numbers],
+            mode_counts=[self.mode_counts[i] for i in numbers],
+            _cells=cells.reshape(-1),
+            _slots=slots.reshape(-1, self._slots.shape[1]),
+            _weights=self._weights.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
+            _volumes=self._volumes.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
+        )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.fem.mesh import interpolation
 from pdcorrect.fem.problem import Problem, discretise
@@ -62,6 +63,11 @@ class CoarseCorrection:
         difference = padded([D for _, D in parts], (3 * most, 3 * most))
         self._difference = torch.as_tensor(difference, dtype=torch.float32, device=device)
         self.bytes = 4 * (self._P.numel() + self._difference.numel())
+
+    def narrowed(self, sharing: Sharing, kept: list[int]) -> CoarseCorrection:
+        """With some of the matrices."""
+        rows = torch.tensor(kept, device=self._P.device)
+        return with_rows(self, rows, "_P", "_difference", _sharing=sharing)
 
     def __call__(self, r: Tensor) -> Tensor:
         shared = self._sharing.gathered(r.to(torch.float32))  # (K, m, N, 3)

@@ -13,6 +13,8 @@ import math
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.narrowing import with_rows
+
 _CURVATURE = 1e-12
 
 
@@ -32,6 +34,11 @@ class BatchHistory:
         self._sg, self._zg = zeros(scenes, length), zeros(scenes, length)
         self._age = torch.full((scenes, length), -1, dtype=torch.int64, device=like.device)
         self._scenes = torch.arange(scenes, device=like.device)
+
+    def narrowed(self, rows: Tensor) -> BatchHistory:
+        """Of some scenes, as it is now."""
+        names = ("_S", "_Z", "_r_inverse", "_yz", "_d", "_sg", "_zg", "_age")
+        return with_rows(self, rows, *names, _scenes=self._scenes[: len(rows)])
 
     def clear(self, which: Tensor) -> None:
         """Forget all pairs of the scenes where ``which`` (B,) holds."""

@@ -25,6 +25,7 @@ from torch import Tensor
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.coarse import CoarseCorrection
 from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
@@ -144,6 +145,21 @@ class DenseInverse:
             self._rotations = list(room)
         self._free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
 
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> DenseInverse:
+        """Of some scenes with their cells, turned as it is now."""
+        sharing, kept = self._sharing.narrowed(rows)
+        modes = ("_solved", "_mode_inverse") if cells.sizes.modes else ()
+        out = with_rows(
+            self, rows, "_free", "regular", *modes,
+            _cells=cells, _sharing=sharing, _inverse=self._inverse[kept],
+            _rotations=[a[rows] for a in self._rotations],
+        )  # fmt: skip
+        if self._rotations:
+            out._turning = self._turning.narrowed(cells, rows)
+        if self._coarse is not None:
+            out._coarse = self._coarse.narrowed(sharing, kept)
+        return out
+
     def turn(self, y: Tensor) -> None:
         """Turn the rest Hessian to a configuration."""
         if self._rotations:
@@ -260,6 +276,9 @@ class _Turning:
         held = [~p.free.all(axis=1) for p in problems]
         self._held = cells.nodal([np.where(h, 1.0, 0.0) for h in held]) > 0.5
         self._nodes = problems[0].cells.shape[1]
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> _Turning:
+        return with_rows(self, rows, "_shares", "_held", _cells=cells)
 
     def since_rest(self, y: Tensor) -> list[Tensor]:
         """Rotations of nodes and modes, nine tensors (B, U)."""

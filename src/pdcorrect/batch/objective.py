@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.fem.problem import Problem
 
 
@@ -32,6 +33,10 @@ class BatchMass:
         self._diagonal = all(p.mass_is_diagonal for p in problems)
         self.density = cells.rest.new_zeros(n.scenes, n.cells)
         self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> BatchMass:
+        """Of some scenes, with their cells."""
+        return with_rows(self, rows, "_blocks", "density", "nodal", _cells=cells)
 
     def set_density(self, density: Tensor) -> None:
         """Densities (B, C), kg/m3, from now on."""
@@ -87,6 +92,13 @@ class BatchObjective:
         self.inertia = self.damping = 0.0
         self.free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
         self.target, self.origin, self.forces = (torch.zeros_like(cells.rest) for _ in range(3))
+
+    def narrowed(self, rows: Tensor) -> BatchObjective:
+        """Of some scenes, as it is now."""
+        cells = self.cells.narrowed(rows)
+        mass = self.mass.narrowed(cells, rows)
+        names = ("free", "target", "origin", "forces")
+        return with_rows(self, rows, *names, cells=cells, mass=mass)
 
     @property
     def factors(self) -> tuple[float, float]:
