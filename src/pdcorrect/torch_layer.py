@@ -291,13 +291,13 @@ def _segment(
     material: Sequence[Tensor | None],
 ) -> list[Frame]:
     """Some steps from number ``first`` on: their frames, or only the last one."""
-    frames = []
+    frames: list[Frame] = []
     for k, push in enumerate(pushes, first):
         if call.layer.mode == "detached" and k:
             frame = (frame[0].detach(), frame[1].detach())
         frame = _Step.apply(call, k, *frame, push, *material)  # type: ignore[no-untyped-call]
-        frames.append(frame)
-    return frames if keep else frames[-1:]
+        frames = [*frames, frame] if keep else [frame]
+    return frames
 
 
 class _Step(torch.autograd.Function):

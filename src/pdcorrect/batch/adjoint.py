@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -147,14 +146,12 @@ class BatchGradients:
     @property
     def young(self) -> Tensor:
         """By each cell's Young's modulus at fixed Poisson's ratio, (B, C), 1/Pa."""
-        mu, lam = self._moduli_slopes[0]
-        return self.mu * mu + self.lam * lam
+        return self._by_modulus(0)
 
     @property
     def poisson(self) -> Tensor:
         """By each cell's Poisson's ratio at fixed Young's modulus, (B, C)."""
-        mu, lam = self._moduli_slopes[1]
-        return self.mu * mu + self.lam * lam
+        return self._by_modulus(1)
 
     @cached_property
     def density(self) -> Tensor:
@@ -179,10 +176,12 @@ class BatchGradients:
     def _rule(self) -> Material:
         return self._stepper.problems[0].scene.material
 
-    @property
-    def _moduli_slopes(self) -> Any:
+    def _by_modulus(self, which: int) -> Tensor:
+        """By Young's modulus (0) or Poisson's ratio (1); zero at cells that a scene lacks."""
         young, poisson, _ = self._material.values
-        return lame_slopes(young, poisson)  # type: ignore[type-var]
+        mu, lam = lame_slopes(young, poisson)[which]  # type: ignore[type-var]
+        present = self._stepper.cells.present_cells
+        return torch.where(present, self.mu * mu + self.lam * lam, 0.0)
 
     # --- internals --------------------------------------------------------------------------------
 
