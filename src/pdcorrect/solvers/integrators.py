@@ -17,7 +17,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
-from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.linear import Linear, by_component
 from pdcorrect.solvers.schemes import Scheme, SchemeOf
 from pdcorrect.state import State
 
@@ -115,9 +115,7 @@ class Integrator:
         known = self.known(problem, state, h, forces)
 
         def split(on_free: Linear, on_clamped: Linear | None) -> Array:
-            if on_clamped is None:
-                return _full(on_free(known), free)
-            return np.where(free, on_free(known), on_clamped(known))
+            return np.asarray(by_component(np, free, known, on_free, on_clamped))
 
         def finish(y: Array) -> State:
             known["y"] = y
@@ -141,9 +139,14 @@ class Integrator:
 
 def solution(scheme: Scheme, before: State, after: State, problem: Problem) -> Array:
     """The y (N + B, 3) of a step between two states, with internal modes in equilibrium."""
+    return problem.relaxed(nodal_solution(scheme, before.positions, after.positions))
+
+
+def nodal_solution(scheme: Scheme, before: Any, after: Any) -> Any:
+    """The nodes' part of y for positions before and after a step, arrays or tensors."""
     row = scheme.positions.coefficients
     rest = Linear(**{name: c for name, c in row.items() if name != "y"})
-    return problem.relaxed((after.positions - rest({"positions": before.positions})) / row["y"])
+    return (after - rest({"positions": before})) / row["y"]
 
 
 def _started(state: State, h: float) -> bool:
@@ -157,10 +160,6 @@ def _started(state: State, h: float) -> bool:
 def equal_steps(a: float, b: float) -> bool:
     """Whether two lengths of time, s, count as equal."""
     return bool(abs(a - b) <= _EQUAL_STEPS * b)
-
-
-def _full(values: Any, like: NDArray[np.bool_]) -> Array:
-    return np.zeros(like.shape) if isinstance(values, float) else np.asarray(values)
 
 
 backward_euler = Integrator(schemes.backward_euler)
