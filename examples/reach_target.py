@@ -10,7 +10,7 @@ Gauss-Newton: the adjoint of all steps gives the derivatives of the tip's three 
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,7 @@ def reach(
 
 def main(folder: Path = Path()) -> dict[str, float]:
     """Reach the target in both ways, print a summary, and draw ``reach_target.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
     problem = pc.discretise(SCENE)
     stepper = pc.ProjectiveDynamics(problem)
     length, width = problem.positions[:, 0].max(), problem.positions[:, 1].max()
@@ -162,4 +163,6 @@ def draw(drawn: dict[str, list[Array]], target: Array, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="for the figure")
+    main(parser.parse_args().folder)

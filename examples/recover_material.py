@@ -10,7 +10,7 @@ distance from the measurement; `pc.adjoint` gives the derivatives of each step.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +79,7 @@ def loss_and_gradient(
 
 def main(folder: Path = Path()) -> dict[str, float]:
     """Recover, print a summary, and draw ``recover_material.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
     problem = pc.discretise(SCENE)
     _, results = simulate(pc.ProjectiveDynamics(problem))
     exact = np.array([result.state.positions for result in results])
@@ -121,7 +122,7 @@ def main(folder: Path = Path()) -> dict[str, float]:
 
 def draw(tried: Array, measured: Array, first: Array, last: Array, folder: Path) -> None:
     """Loss, both parameters, and the path of a corner of the tip."""
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
+    figure = Figure(figsize=(12.5, 3.6), layout="constrained")
     FigureCanvasAgg(figure)
     loss, parameters, path = figure.subplots(1, 3)
     loss.semilogy(tried[:, 0], "o-", color="#0072b2", markersize=4)
@@ -136,14 +137,15 @@ def draw(tried: Array, measured: Array, first: Array, last: Array, folder: Path)
     parameters.set(xlabel="evaluation", ylabel="over the true value", title="Parameters")
     parameters.legend(frameon=False)
     for points, style, colour, label in (
-        (measured, "o", "black", "measured"),
+        (measured, "o", "black", f"measured, noise {1e6 * NOISE * CELL:.0f} µm"),
         (first, "--", "#d55e00", "before"),
         (last, "-", "#009e73", "recovered"),
     ):
         x, z = 1e3 * points[:, 0], 1e3 * points[:, 2]
         path.plot(x, z, style, color=colour, label=label, markersize=4)
+    path.plot(x[0], z[0], "k^", markersize=9, fillstyle="none", label="first frame")
     path.set(xlabel="x, mm", ylabel="z, mm", title="A corner of the tip")
-    path.legend(frameon=False)
+    path.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (loss, parameters):
         axis.xaxis.get_major_locator().set_params(integer=True)
     for axis in (loss, parameters, path):
@@ -153,4 +155,6 @@ def draw(tried: Array, measured: Array, first: Array, last: Array, folder: Path)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="for the figure")
+    main(parser.parse_args().folder)

@@ -10,7 +10,7 @@ the network.  Sixteen scenes with a target each are stepped as one batch.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +75,7 @@ def targets(generator: torch.Generator) -> Tensor:
 
 def main(folder: Path = Path()) -> dict[str, float]:
     """Train, print a summary, and draw ``train_with_layer.png``."""
+    folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(0)
     model = Reacher(pc.discretise(SCENE))
     optimiser = torch.optim.Adam(model.network.parameters(), lr=2e-2)
@@ -117,25 +118,31 @@ def draw(
     folder: Path,
 ) -> None:
     """Both losses, and held-out targets with the points reached."""
-    figure = Figure(figsize=(9.5, 4.0), layout="constrained")
+    figure = Figure(figsize=(12, 3.8), layout="constrained")
     FigureCanvasAgg(figure)
-    losses, points = figure.subplots(1, 2)
+    losses, *views = figure.subplots(1, 3)
     losses.semilogy(trained, color="#0072b2", label="training")
     losses.semilogy(*zip(*validated, strict=True), "o-", color="#d55e00", label="held-out targets")
     losses.set(xlabel="iteration", ylabel="mean squared distance, cells²", title="Loss")
     losses.legend(frameon=False)
-    for a, b in zip(wanted, reached, strict=True):
-        points.plot([a[1], b[1]], [a[2], b[2]], "-", color="#999999", linewidth=1)
-    points.plot(wanted[:, 1], wanted[:, 2], "kx", markersize=8, label="target")
-    points.plot(reached[:, 1], reached[:, 2], "o", color="#009e73", markersize=5, label="reached")
-    points.set(xlabel="y, cells", ylabel="z, cells", title="Tip after five steps")
-    points.set_aspect("equal")
-    points.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    for axis in (losses, points):
+    for points, (across, up) in zip(views, ((0, 2), (1, 2)), strict=True):
+        for a, b in zip(wanted, reached, strict=True):
+            points.plot([a[across], b[across]], [a[up], b[up]], "-", color="#999999", linewidth=1)
+        points.plot(wanted[:, across], wanted[:, up], "kx", markersize=8, label="target")
+        points.plot(
+            reached[:, across], reached[:, up], "o", color="#009e73", markersize=5, label="reached"
+        )
+        points.set(xlabel=f"{'xyz'[across]}, cells", ylabel=f"{'xyz'[up]}, cells")
+        points.set_title("Tip after five steps")
+        points.set_aspect("equal", adjustable="datalim")
+    views[-1].legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    for axis in (losses, *views):
         axis.grid(alpha=0.3)
         axis.spines[["top", "right"]].set_visible(False)
     figure.savefig(folder / "train_with_layer.png", dpi=110)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "."))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(), help="for the figure")
+    main(parser.parse_args().folder)

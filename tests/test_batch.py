@@ -1,6 +1,9 @@
 """Many scenes in one batch are many scenes one by one."""
 
 import json
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +11,15 @@ import pytest
 import torch
 
 import pdcorrect as pc
-from conftest import beam
-from pdcorrect.batch import decomposition
+from conftest import beam, box_mesh, held, problem_on
+from pdcorrect.batch import decomposition, minimise
 from pdcorrect.batch.cells import Sizes
 from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.points import Points
 from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
+from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
 
 VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean"]
@@ -231,7 +235,7 @@ def test_a_scene_of_nan_and_one_that_cannot_converge_fail_alone(device):
     states = moving_states(problems)
     positions = states[7].positions.copy()
     positions[3, 1] = np.nan
-    object.__setattr__(states[7], "positions", positions)  # which State itself would refuse
+    states[7] = replace(states[7], positions=positions)
     stepper = pc.BatchStepper(problems, 1e-9, device=device, recover=False, max_iterations=60)
     found, result = stepped(stepper, states, 1)
     assert result.statuses[7] is pc.Status.NOT_FINITE
@@ -334,3 +338,316 @@ def test_batches_that_cannot_be_are_refused_by_name():
         stepper.state([stepper.problems[0].rest_state()])
     with pytest.raises(InputError, match="state 1 has"):
         stepper.state([stepper.problems[0].rest_state()] * 2)
+
+
+# --- what one scene or step must not do to others ------------------------------------------------
+
+
+def test_a_stretch_nearest_to_unit_volume_is_that_of_the_other_home():
+    """Also next to a uniform expansion, where one candidate vanishes, and inside out."""
+    rng = np.random.default_rng(2)
+    sizes = np.concatenate([np.linspace(0.01, 12.0, 300), [1.587, 1.8899, 2.0]])
+    shapes = [(1 + d, 1 + e * d, sign) for d in (0, 1e-9, 1e-5, 1e-3, 0.03, 0.3, 3.0)
+              for e in (0.0, 0.5, 1.0) for sign in (1, -1, 1e-9, -1e-9)]  # fmt: skip
+    uniform = (sizes[:, None, None] * np.array(shapes)).reshape(-1, 3)
+    random = np.sort(np.exp(rng.normal(scale=1.5, size=(5000, 3))), axis=1)[:, ::-1]
+    random[::3, 2] *= -1
+    s = np.concatenate([uniform, random, [(5.894, 5.877, 5.874), (1.736, 1.663, 1.659)]]).T.copy()
+    exact, k = np.empty_like(s), np.empty(s.shape[1])
+    nearest_volume_lanes(s, exact, k, 0)
+    v, found_k = decomposition.nearest_volume(list(torch.as_tensor(s)))
+    v = torch.stack(v).numpy()
+    distance, least = ((v - s) ** 2).sum(axis=0), ((exact - s) ** 2).sum(axis=0)
+    np.testing.assert_allclose(v.prod(axis=0), 1.0, rtol=1e-7)
+    np.testing.assert_allclose(distance, least, rtol=1e-7, atol=1e-10)
+    unique = np.abs(v - exact).max(axis=0) < 1e-6  # where two are as near, either will do
+    assert unique.mean() > 0.999
+    np.testing.assert_allclose(found_k.numpy()[unique], k[unique], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("factors", [(5.894, 5.877, 5.874), (4, 4, 4), (1.736, 1.663, 1.659)])
+def test_bodies_that_are_blown_up_have_the_energy_of_single_ones(factors):
+    problem = pc.discretise(beam((2, 2, 2), poisson=0.45, clamps=[], loads=[]))
+    stepper = pc.BatchStepper([problem])
+    positions = problem.positions * factors
+    energy, forces = stepper.cells.energy_and_forces(torch.as_tensor(positions)[None])
+    assert float(energy) == pytest.approx(problem.energy(positions), rel=1e-9)
+    exact = problem.forces(positions)
+    if len(set(factors)) == 3:  # else any direction may be the flattened one
+        np.testing.assert_allclose(forces[0], exact, atol=1e-7 * np.abs(exact).max())
+
+
+def test_a_failed_step_leaves_nothing_behind():
+    problems = [pc.discretise(beam((2, 1, 1)))] * 2
+    stepper = pc.BatchStepper(problems, 1e-9, recover=False)
+    bad = stepper.rest_state()
+    bad.positions[0] = torch.nan
+    statuses = stepper(bad).statuses
+    assert statuses == [pc.Status.NOT_FINITE, pc.Status.CONVERGED]
+    rest = stepper.rest_state()
+    result = stepper(rest)
+    assert result.statuses == [pc.Status.CONVERGED] * 2
+    torch.testing.assert_close(result.y[0], result.y[1], rtol=0, atol=1e-12)
+    gradients = pc.BatchGradients(stepper, rest, result, torch.ones_like(rest.positions))
+    assert gradients.ok.all()
+
+
+@pytest.mark.parametrize(("built", "given"), [(0.3, 0.0), (0.0, 0.4)])
+def test_poissons_ratio_may_become_zero_and_leave_it_again(built, given):
+    problem = pc.discretise(beam((3, 1, 1), poisson=built))
+    stepper, state = pc.BatchStepper([problem], 1e-9), moving_states([problem])[0]
+    for poisson in (given, 0.4, None):
+        stepper.set_material(poisson=poisson)
+        found, _ = stepped(stepper, [state], 1)
+        values = {"young": 1e6, "poisson": built if poisson is None else poisson}
+        assert furthest(alone(problem.with_material(**values), state, 1), found[0]) < 1e-9
+
+
+def test_an_energy_without_a_volume_term_stays_without():
+    problem = pc.discretise(beam((2, 1, 1), material={"energy": "corotated-only"}))
+    stepper, state = pc.BatchStepper([problem], 1e-9), problem.rest_state()
+    exact = alone(problem, state, 1)
+    stepper.set_material(poisson=0.1, young=1e6 * 1.1 / 1.45)  # the same mu
+    found, _ = stepped(stepper, [state], 1)
+    assert furthest(exact, found[0]) < 1e-9
+
+
+def test_materials_out_of_range_fail_alone():
+    problems = [pc.discretise(beam((2, 1, 1), poisson=0.3))] * 4
+    stepper = pc.BatchStepper(problems, 1e-9)
+    expected = stepper(stepper.rest_state()).y[0]
+    stepper.set_material(poisson=torch.tensor([[0.3], [0.6], [0.3], [0.3]], dtype=torch.float64))
+    result = stepper(stepper.rest_state())
+    assert [s.ok for s in result.statuses] == [True, False, True, True]
+    torch.testing.assert_close(result.y[2], expected, rtol=0, atol=1e-12)
+
+
+def test_a_scene_without_a_minimum_fails_alone():
+    scenes = [beam((2, 1, 1)), beam((2, 1, 1), clamps=[])]
+    problems = [pc.discretise(s) for s in scenes]
+    for recover in (False, True):
+        stepper = pc.BatchStepper(problems, integrator="quasi-static", recover=recover)
+        statuses = stepper(stepper.rest_state()).statuses
+        assert [s.ok for s in statuses] == [True, False]
+
+
+@pytest.mark.parametrize("first_hessian", ["rest", "G", "two-level"])
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_scenes_that_take_long_go_on_in_a_smaller_batch(element, first_hessian, monkeypatch):
+    """With the same iterates, whatever scenes share a matrix."""
+    refine = 2 if first_hessian == "two-level" else 1
+    problems = [pc.discretise(unlike(seed, element), refine) for seed in (3, 4, 0, 0, 1, 1)]
+    hard = [{"kind": "gravity", "acceleration": [0.0, 0.0, -1e5]}]
+    problems[3] = pc.discretise(unlike(0, element, loads=hard), refine)
+    states = moving_states(problems)
+    found = []
+    for few in (minimise._FEW, 10**9):
+        monkeypatch.setattr(minimise, "_FEW", few)
+        stepper = pc.BatchStepper(problems, 1e-9, first_hessian=first_hessian, recover=False)
+        calls = []
+        whole = stepper.prepare
+
+        def counted(*arguments, whole=whole, stepper=stepper, calls=calls):
+            out = whole(*arguments)
+            narrow = stepper._minimiser._finish_narrowed
+            stepper._minimiser._finish_narrowed = lambda: (calls.append(1), narrow())
+            return out
+
+        stepper.prepare = counted
+        result = stepper(stepper.state(states))
+        found.append((result, bool(calls)))
+    (narrowed, did), (whole, did_not) = found
+    assert did
+    assert not did_not
+    assert narrowed.statuses == whole.statuses
+    assert narrowed.statuses[3].ok
+    torch.testing.assert_close(narrowed.y, whole.y, rtol=0, atol=1e-9)
+    assert (narrowed.evaluations <= 1.3 * whole.evaluations + 5).all()
+
+
+def test_steps_of_another_length_start_bdf2_anew():
+    time = {"integrator": "bdf2", "step": 0.01}
+    problems = [pc.discretise(unlike(seed, time=time)) for seed in range(2)]
+    states = [alone(p, s, 2) for p, s in zip(problems, moving_states(problems), strict=True)]
+    stepper = pc.BatchStepper(problems, 1e-9, time_step=0.005, recover=False)
+    found, _ = stepped(stepper, states, 1)
+    for problem, state, after in zip(problems, states, found, strict=True):
+        exact = pc.ProjectiveDynamics(problem, 1e-9, time_step=0.005)(state).state
+        assert furthest(exact, after) < 1e-9
+    mixed = stepper.state([states[0], found[1]])
+    with pytest.raises(InputError, match="the state of scene 0 came from a step of another"):
+        stepper(mixed)
+
+
+def test_float32_does_not_lose_the_memory_of_bdf2():
+    problem = pc.discretise(beam((2, 1, 1), time={"integrator": "bdf2"}))
+    stepper = pc.BatchStepper([problem], 1e-3, dtype=torch.float32)
+    result = stepper(stepper.rest_state())
+    late = result.state.times[0] + 7.3
+    memory = {**result.state.memory}
+    memory["previous_times"] = memory["previous_times"] + 7.3
+    state = replace(result.state, times=(late,), memory=memory)
+    assert stepper.prepare(state).scheme.inertia == pytest.approx(2.25 / problem.time_step**2)
+
+
+def test_threads_may_share_a_stepper():
+    problems = [pc.discretise(unlike(seed)) for seed in range(2)]
+    stepper = pc.BatchStepper(problems, 1e-9)
+    states = [stepper.state(moving_states(problems, seed)) for seed in (0, 10, 20, 30)]
+    expected = [stepper(s).y for s in states]
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(4) as pool:
+        found = [r.y for r in pool.map(stepper, states)]
+        assert set(pool.map(lambda _: torch.get_num_threads(), range(8))) == {threads}
+    assert torch.get_num_threads() == threads
+    for a, b in zip(found, expected, strict=True):
+        assert torch.equal(a, b)
+
+
+def test_inverted_cells_are_told():
+    scenes = [beam((2, 1, 1), loads=[]), beam((3, 1, 1), clamps=[], loads=[], poisson=0.0)]
+    problems = [pc.discretise(s) for s in scenes]
+    states = [p.rest_state() for p in problems]
+    mirrored = states[1].positions * [1.0, 1.0, -1.0]
+    states[1] = pc.State(mirrored, states[1].velocities)
+    single = pc.ProjectiveDynamics(problems[1], time_step=1e-5)(states[1])
+    stepper = pc.BatchStepper(problems, time_step=1e-5)
+    result = stepper(stepper.state(states))
+    assert single.status is pc.Status.INVERTED
+    assert result.statuses == [pc.Status.CONVERGED, pc.Status.INVERTED]
+    for problem, state, ratio in zip(
+        problems, stepper.states(result.state), result.smallest_volume_ratios, strict=True
+    ):
+        assert ratio == pytest.approx(problem.volume_ratios(state.positions).min(), abs=1e-12)
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_volume_ratios_do_not_see_the_padding(element):
+    settings = {"clamps": [], "loads": [], "solver": {"element": element}}
+    problems = [pc.discretise(beam((n, 1, 1), **settings)) for n in (1, 3)]
+    cells = pc.BatchStepper(problems).cells
+    states = [2.0 * p.positions + 0.7 for p in problems]
+    ratios = cells.smallest_volume_ratios(cells.nodal(states)[:, : cells.sizes.nodes])
+    np.testing.assert_allclose(ratios, 8.0, rtol=1e-12)
+
+
+def test_a_step_in_inference_mode_changes_nothing_later():
+    problem = pc.discretise(beam((2, 1, 1)))
+    with torch.inference_mode():
+        stepper = pc.BatchStepper([problem], 1e-9)
+        first = stepper(stepper.rest_state())
+    state = stepper.rest_state()
+    state.positions.requires_grad_()
+    again = stepper(state, torch.zeros_like(state.positions, requires_grad=True))
+    assert torch.equal(first.y, again.y)
+    assert not again.y.requires_grad
+    gradients = pc.BatchGradients(stepper, state, again, state.positions * 1.0)
+    assert not gradients.density.requires_grad
+
+
+def test_clamps_hold_where_they_are_told_to():
+    """Not where the body is at rest."""
+    problem = pc.discretise(beam((3, 1, 1), loads=[]))
+    nodes = np.flatnonzero(~problem.free.all(axis=1))
+    positions = problem.positions.copy()
+    positions[nodes] += [0.002, 0.001, 0.0]
+    moved = held(problem, nodes, positions)
+    found, _ = stepped(pc.BatchStepper([moved], 1e-9), [moved.rest_state()], 1)
+    assert furthest(alone(moved, moved.rest_state(), 1), found[0]) < 1e-9
+
+
+def test_each_scene_has_its_own_tolerance():
+    tolerances = (1e-2, 1e-10)
+    problems = [
+        pc.discretise(unlike(seed, solver={"tolerance": tolerance}))
+        for seed, tolerance in enumerate(tolerances)
+    ]
+    states = moving_states(problems)
+    found, result = stepped(pc.BatchStepper(problems), states, 1)
+    assert furthest(alone(problems[1], states[1], 1, 1e-11), found[1]) < 2e-10
+    assert result.error_estimates[1] <= 1e-10 * problems[1].cell_size
+
+
+def test_editing_a_state_does_not_change_what_was_solved():
+    problem = pc.discretise(beam((2, 1, 1), damping={"mass": 0.5}))
+    stepper = pc.BatchStepper([problem], 1e-9)
+    before = stepper.rest_state()
+    result = stepper(before)
+    g = torch.ones_like(before.positions)
+    exact = pc.BatchGradients(stepper, before, result, g).density
+    late = pc.BatchGradients(stepper, before, result, g)
+    result.state.positions.zero_()
+    before.positions.add_(1.0)
+    torch.testing.assert_close(late.density, exact)
+
+
+def test_a_stepper_can_be_copied():
+    """With follower loads, and after a step."""
+    problem = pc.discretise(unlike(1))
+    assert any(load.sample is not None for load in problem.loads)
+    pressure = [{"kind": "pressure", "region": {"plane": "z", "at": 0.05}, "pressure": 100.0}]
+    other = pc.discretise(beam((2, 1, 1), 0.05, loads=[{**pressure[0], "follower": True}]))
+    stepper = pc.BatchStepper([problem, other], 1e-9)
+    first = stepper(stepper.rest_state())
+    copy = pickle.loads(pickle.dumps(stepper))
+    assert torch.equal(copy(copy.rest_state()).y, first.y)
+
+
+def test_options_that_make_no_sense_are_refused():
+    problem = pc.discretise(beam((2, 1, 1)))
+    for name, value in {
+        "first_hessian": "foo",
+        "time_step": -0.01,
+        "tolerance": -1.0,
+        "max_iterations": -1,
+    }.items():
+        with pytest.raises(InputError, match=name):
+            pc.BatchStepper([problem], **{name: value})
+    stepper = pc.BatchStepper([problem])
+    rest = stepper.rest_state()
+    with pytest.raises(InputError, match="forces: "):
+        stepper(rest, torch.zeros(3, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
+        stepper.set_material(torch.zeros(4, 7, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"density: torch\.float32"):
+        stepper.set_material(density=torch.ones(1, 1))
+    with pytest.raises(InputError, match="grad_memory has 'momentum'"):
+        pc.BatchGradients(stepper, rest, stepper(rest), grad_memory={"momentum": rest.positions})
+
+
+# --- more kinds of scenes ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_distorted_meshes_step_as_alone(element):
+    problems = [
+        problem_on(box_mesh((n, 2, 2), (0.1 * n, 0.2, 0.2), 0.2, seed=n), element) for n in (2, 3)
+    ]
+    states = moving_states(problems)
+    found, result = stepped(pc.BatchStepper(problems, 1e-9, recover=False), states, 1)
+    assert all(s.ok for s in result.statuses)
+    for problem, state, after in zip(problems, states, found, strict=True):
+        assert furthest(alone(problem, state, 1), after) < 1e-9
+
+
+def test_loads_act_at_each_scenes_own_time_and_on_each_nodes_own_mass():
+    gravity = {"kind": "gravity", "acceleration": [0, 0, -9.81], "table": [[0, 0], [1, 1]]}
+    heavy = [{"region": {"box": [[-1, -1, -1], [0.05, 1, 1]]}, "density": 3000.0}]
+    problems = [pc.discretise(unlike(seed, loads=[gravity], materials=heavy)) for seed in range(2)]
+    states = [
+        pc.State(s.positions, s.velocities, time)
+        for s, time in zip(moving_states(problems), (0.2, 0.7), strict=True)
+    ]
+    found, _ = stepped(pc.BatchStepper(problems, 1e-9), states, 1)
+    for problem, state, after in zip(problems, states, found, strict=True):
+        assert furthest(alone(problem, state, 1), after) < 1e-9
+        assert after.time == state.time + problem.time_step
+
+
+def test_a_volume_term_alone_is_solved_one_by_one():
+    """Its Hessian is singular at rest; single scenes renew their first Hessian on the way."""
+    problem = pc.discretise(beam((3, 1, 1), material={"energy": "volume-only"}))
+    stepper = pc.BatchStepper([problem], 1e-9, max_iterations=100)
+    found, result = stepped(stepper, [problem.rest_state()], 1)
+    assert result.statuses[0].ok
+    assert furthest(alone(problem, problem.rest_state(), 1), found[0]) < 1e-9

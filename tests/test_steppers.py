@@ -595,3 +595,12 @@ def test_restriction_keeps_the_coincident_nodes():
     np.testing.assert_array_equal(here.velocities, run.velocities[:, nodes])
     with pytest.raises(pc.errors.MeshError, match="no coincident node"):
         pc.restrict(run, to=pc.discretise(beam((4, 2, 1))))
+
+
+def test_what_is_no_problem_and_no_state_is_named():
+    scene = beam(time={"frames": 1})
+    with pytest.raises(pc.errors.InputError, match=r"problem is a Scene: expected pc.discretise"):
+        pc.ProjectiveDynamics(scene)
+    stepper = pc.ProjectiveDynamics(pc.discretise(scene))
+    with pytest.raises(pc.errors.InputError, match=r"state is a Trajectory: expected State\("):
+        stepper(pc.rollout(stepper, 1))

@@ -1,11 +1,17 @@
 """Gradients of batches, and the layer."""
 
+import gc
+import pickle
+import weakref
+
 import numpy as np
 import pytest
 import torch
 
 import pdcorrect as pc
-from conftest import beam
+from conftest import beam, box_mesh, problem_on
+from pdcorrect import torch_layer
+from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import ConvergenceError, InputError
 from test_batch import VARIANTS, moving_states, on_every_device, unlike
 
@@ -59,6 +65,58 @@ def test_gradients_of_a_batch_are_those_of_its_scenes(element, integrator, devic
             assert error <= 2e-8 * max(np.abs(exact).max(), 1e-30), name
 
 
+KINDS = {
+    "quasi-static": {"time": {"integrator": "quasi-static"}},
+    "neo-hookean": {"material": {"energy": "neo-hookean"}},
+    "st-venant-kirchhoff": {"material": {"energy": "st-venant-kirchhoff"}},
+    "arap": {"material": {"energy": "arap"}},
+    "no volume": {"material": {"poisson": 0.0}},
+    "moving clamps": {
+        "clamps": [
+            {
+                "region": {"plane": "x", "at": 0.0},
+                "motion": {"times": [0, 1], "displacement": [[0, 0, 0], [0, 0.3, 0.1]]},
+            }
+        ],
+        "solver": {"mass": "consistent"},
+    },
+}
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "inverted", "distorted"])
+def test_so_they_are_for_other_kinds_of_scenes(kind):
+    load = [{"kind": "gravity", "acceleration": [1.0, 2.0, -5.0]}]
+    problems = [
+        pc.discretise(beam((n, 1, 1), 0.05, 0.35, **{"loads": load, **KINDS.get(kind, {})}))
+        for n in (2, 3)
+    ]
+    if kind == "distorted":
+        problems = [problem_on(box_mesh((n, 2, 2), (0.1 * n, 0.2, 0.2), 0.2)) for n in (2, 3)]
+    states = moving_states(problems)
+    h = 0.01
+    if kind == "inverted":
+        flip = [1.0, 1.0, -0.3]
+        states = [pc.State(s.positions * flip, s.velocities) for s in states]
+        h = 1e-4
+    newton = [pc.Newton(p, 1e-12, time_step=h) for p in problems]
+    options = {"storage": torch.float64, "recover": False, "time_step": h}
+    stepper = pc.BatchStepper(problems, 1e-11, **options)
+    before = stepper.state(states)
+    result = stepper(before)
+    g = torch.as_tensor(np.random.default_rng(0).normal(size=before.positions.shape))
+    batch = pc.BatchGradients(stepper, before, result, g, g, tolerance=1e-11)
+    assert batch.ok.all()
+    for i, (one, state) in enumerate(zip(newton, states, strict=True)):
+        by_end = g[i, : len(state.positions)].numpy()
+        single = pc.adjoint(one, state, one(state), by_end, by_end, tolerance=1e-12)
+        for name in NAMES:
+            if kind == "no volume" and name in ("lam", "poisson"):
+                continue  # checked by differences below
+            exact = getattr(single, name)
+            error = np.abs(getattr(batch, name)[i].numpy()[: len(exact)] - exact).max()
+            assert error <= 1e-6 * max(np.abs(exact).max(), 1e-30), name
+
+
 def small_batch(**options):
     """Two tiny scenes of different size."""
     scenes = [
@@ -110,7 +168,7 @@ def test_checkpointed_steps_have_the_same_gradients_and_detached_ones_those_of_t
         found[mode] = (p.grad, f.grad)
     for a, b in zip(found["unrolled"], found["checkpointed"], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=0)
-    assert not found["detached"][0].any()
+    assert found["detached"][0] is None  # nothing of the last frame depends on them
     assert found["detached"][1].any()
     assert not torch.allclose(found["detached"][1], found["unrolled"][1])
 
@@ -238,3 +296,211 @@ def test_wrong_input_is_refused_by_name():
         pc.PDLayer(stepper, on_failure="ignore")
     with pytest.raises(InputError, match="needs a memory"):
         pc.PDLayer(small_batch(integrator="bdf2"))
+
+
+# --- what is recorded, kept and left alone -------------------------------------------------------
+
+
+def test_the_gradient_by_poissons_ratio_at_zero_is_that_of_differences():
+
+    def loss(nu):
+        stepper = small_batch()
+        p, v, f = (x.detach() for x in inputs(stepper))
+        layer = pc.PDLayer(stepper, tolerance=1e-11)
+        return layer(p, v, f, poisson=nu)[0].square().sum()
+
+    nu = torch.zeros(2, 1, dtype=torch.float64, requires_grad=True)
+    loss(nu).backward()
+    h = 1e-4
+    ahead = [float(loss(torch.full_like(nu, k * h).detach())) for k in range(3)]
+    slope = (4.0 * ahead[1] - 3.0 * ahead[0] - ahead[2]) / (2.0 * h)
+    assert float(nu.grad.sum()) == pytest.approx(slope, rel=1e-5)
+
+
+def test_a_layer_leaves_the_steppers_material_alone_and_takes_numbers():
+    stepper = small_batch()
+    stepper.set_material(young=1e5)
+    p, v, f = inputs(stepper)
+    plain, _ = pc.PDLayer(stepper)(p, v, f)
+    direct = stepper(stepper.rest_state()).y
+    stiff, _ = pc.PDLayer(stepper)(p, v, f, young=4e5, density=500.0)
+    stiff.sum().backward()
+    assert torch.equal(stepper(stepper.rest_state()).y, direct)
+    stepper.set_material(young=torch.tensor(4e5, dtype=torch.float64), density=500.0)
+    again, _ = pc.PDLayer(stepper)(p, v, f)
+    torch.testing.assert_close(stiff, again, rtol=0, atol=1e-12)
+    assert not torch.allclose(stiff, plain, rtol=0, atol=1e-6)
+
+
+def test_a_derivative_is_of_its_own_step_whatever_came_later():
+    stepper = small_batch()
+    p, v, _ = (x.detach() for x in inputs(stepper))
+    first = stepper.rest_state()
+    second = BatchState(p, v, first.times)
+    g = torch.ones_like(p)
+    results = [stepper(first), stepper(second)]
+    expected = pc.BatchGradients(stepper, first, results[0], g)
+    exact = {name: getattr(expected, name).clone() for name in ("density", "young", "poisson")}
+    late = pc.BatchGradients(stepper, first, results[0], g)
+    pc.BatchGradients(stepper, second, results[1], g)
+    stepper.set_material(young=1e4, density=10.0)
+    stepper(second)
+    for name, value in exact.items():
+        torch.testing.assert_close(getattr(late, name), value, rtol=1e-12, atol=0)
+
+
+def watched(monkeypatch):
+    """How many steps' frames are kept: a function of nothing, and a list filled by each step."""
+    frames, counts = [], []
+    original = torch_layer._Step.forward
+
+    def kept():
+        gc.collect()
+        return sum(frame() is not None for frame in frames)
+
+    def watch(*arguments):
+        out = original(*arguments)
+        frames.append(weakref.ref(out[0]))
+        counts.append(kept())
+        return out
+
+    monkeypatch.setattr(torch_layer._Step, "forward", staticmethod(watch))
+    return kept, counts
+
+
+@pytest.mark.parametrize(("mode", "most"), [("unrolled", 16), ("checkpointed", 5)])
+def test_checkpointed_steps_keep_the_states_between_segments_only(mode, most, monkeypatch):
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, 16, mode=mode)
+    kept, _ = watched(monkeypatch)
+    after, _ = layer(p, v, f)
+    assert most / 2 < kept() <= most
+    assert len(layer.statuses) == 16
+    after.sum().backward()
+    assert len(layer.statuses) == 16
+
+
+def test_a_layer_without_derivatives_keeps_no_frames(monkeypatch):
+    stepper = small_batch()
+    p, v, f = (x.detach() for x in inputs(stepper))
+    _, counts = watched(monkeypatch)
+    pc.PDLayer(stepper, 6)(p, v, f)
+    assert len(counts) == 6
+    assert max(counts) <= 2
+
+
+def test_what_has_no_derivative_is_told():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, 2, on_failure="zero")
+    step = stepper._step
+
+    def in_parts(state, forces):
+        result = step(state, forces)
+        result.statuses[1] = pc.Status.SUBSTEPPED
+        return result
+
+    stepper._step = in_parts
+    after, _ = layer(p, v, f)
+    assert layer.differentiable.tolist() == [True, False]
+    assert layer.failed_derivatives == []
+    after.sum().backward()
+    assert sorted(layer.failed_derivatives) == [(0, 1), (1, 1)]
+    assert p.grad[0].any()
+    assert not p.grad[1].any()
+
+
+def test_a_linear_system_that_is_not_solved_is_told(monkeypatch):
+    monkeypatch.setattr("pdcorrect.batch.stepper._ADJOINT_STEPS", 0)
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, on_failure="zero")
+    layer(p, v, f)[0].sum().backward()
+    assert layer.differentiable.all()
+    assert layer.failed_derivatives == [(0, 0), (0, 1)]
+    with pytest.raises(ConvergenceError, match="the derivative of scenes 0"):
+        pc.PDLayer(stepper)(p, v, f)[0].sum().backward()
+
+
+def test_a_bad_material_spoils_its_own_scene_only():
+    stepper = small_batch(recover=True)
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, on_failure="zero")
+    poisson = torch.tensor([[0.3], [0.6]], dtype=torch.float64, requires_grad=True)
+    after, _ = layer(p, v, f, poisson=poisson)
+    assert [s.ok for s in layer.statuses[0]] == [True, False]
+    after[layer.differentiable].sum().backward()
+    assert poisson.grad[0].any()
+    assert not poisson.grad[1].any()
+    assert torch.isfinite(p.grad).all()
+
+
+def test_a_failed_call_does_not_spoil_the_next():
+    problem = pc.discretise(beam((2, 1, 1)))
+    stepper = pc.BatchStepper([problem], 1e-9)
+    layer = pc.PDLayer(stepper, on_failure="zero")
+    rest = stepper.rest_state()
+    expected, _ = layer(rest.positions, rest.velocities)
+    layer(rest.positions, rest.velocities, poisson=0.5)
+    layer(torch.full_like(rest.positions, torch.nan), rest.velocities)
+    after, _ = layer(rest.positions, rest.velocities)
+    torch.testing.assert_close(after, expected, rtol=0, atol=1e-12)
+
+
+def test_second_derivatives_are_refused():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    after, _ = pc.PDLayer(stepper)(p, v, f)
+    (grad,) = torch.autograd.grad(after.square().sum(), f, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        grad.sum().backward()
+
+
+def test_nodes_that_a_scene_does_not_have_get_no_gradient():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    _, velocities = pc.PDLayer(stepper)(p, v, f)
+    velocities.sum().backward()
+    absent = ~stepper.cells.present_nodes
+    assert absent.any()
+    for x in (p, v, f):
+        assert not x.grad[absent].any()
+        assert x.grad[~absent].any()
+
+
+def test_steps_in_inference_mode_come_out_the_same():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, 2)
+    with torch.inference_mode():
+        first, _ = layer(p, v, f)
+    after, _ = layer(p, v, f)
+    after.sum().backward()
+    assert torch.equal(first, after)
+    assert p.grad.any()
+
+
+def test_inputs_that_do_not_fit_are_refused_by_name():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, 2)
+    for frames in (1, 5):
+        with pytest.raises(InputError, match=f"forces of {frames} steps"):
+            layer(p, v, torch.stack([f] * frames))
+    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
+        layer(p, v, f, young=torch.ones(4, 7, dtype=torch.float64))
+    with pytest.raises(InputError, match="poisson is a str"):
+        layer(p, v, f, poisson="0.3")
+    with pytest.raises(InputError, match="times = "):
+        layer(p, v, f, times=[0.0])
+
+
+def test_a_layer_with_follower_loads_can_be_copied():
+    twist = [{"kind": "torsion", "strength": 1e4, "stretch": 0.2, "follower": True}]
+    stepper = pc.BatchStepper([pc.discretise(beam((2, 1, 1), loads=twist))], 1e-9)
+    layer = pc.PDLayer(stepper)
+    rest = stepper.rest_state()
+    expected, _ = layer(rest.positions, rest.velocities)
+    after, _ = pickle.loads(pickle.dumps(layer))(rest.positions, rest.velocities)
+    assert torch.equal(after, expected)

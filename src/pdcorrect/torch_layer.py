@@ -8,21 +8,80 @@ loss(positions).backward()
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from pdcorrect.batch.adjoint import BatchGradients
-from pdcorrect.batch.states import BatchState, Solved
+from pdcorrect.batch.checks import check_nodal
+from pdcorrect.batch.material import NAMES, BatchMaterial, by_cell
+from pdcorrect.batch.states import BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.state import Status
 
 Mode = Literal["unrolled", "checkpointed", "detached"]
 OnFailure = Literal["raise", "zero"]
-_INPUTS = ("positions", "velocities", "forces", "young", "poisson", "density")
+Frame = tuple[Tensor, Tensor]
+"""Positions and velocities."""
+_INPUTS = ("positions", "velocities", "forces", *NAMES)
+
+
+@dataclass(eq=False)
+class _Call:
+    """One call of a layer: what its steps, and later their derivatives, share and record.
+
+    Attributes
+    ----------
+    layer : PDLayer
+    material : BatchMaterial
+    times : tuple of float
+        At the start, s.
+    statuses : list of list of Status
+        Of the steps taken so far.
+    failures : list of (int, int)
+        Step and scene of each derivative that failed.
+    """
+
+    layer: PDLayer
+    material: BatchMaterial
+    times: tuple[float, ...]
+    statuses: list[list[Status]] = field(default_factory=list)
+    failures: list[tuple[int, int]] = field(default_factory=list)
+
+    def times_before(self, step: int) -> tuple[float, ...]:
+        h = self.layer.stepper.time_step
+        return tuple(t + step * h for t in self.times)
+
+    def stepped(self, step: int, statuses: list[Status]) -> None:
+        """Record a step; those that are repeated for derivatives are recorded already."""
+        if step == len(self.statuses):
+            self.statuses.append(statuses)
+        self._raise_for("the step", [s.ok for s in statuses])
+
+    def differentiated(self, step: int, ok: list[bool]) -> None:
+        """Record a step's derivative."""
+        self.failures.extend((step, i) for i, fine in enumerate(ok) if not fine)
+        self._raise_for("the derivative", ok)
+
+    def _raise_for(self, what: str, ok: list[bool]) -> None:
+        problems = self.layer.stepper.problems
+        names = [
+            f"{i} ({p.scene.name!r})"
+            for i, (p, fine) in enumerate(zip(problems, ok, strict=True))
+            if not fine
+        ]
+        if names and self.layer.on_failure == "raise":
+            raise ConvergenceError(
+                f"{what} of scenes {', '.join(names)}: expected all to converge. Use smaller "
+                "steps, or on_failure='zero' to leave such scenes out."
+            )
 
 
 class PDLayer(nn.Module):
@@ -35,12 +94,13 @@ class PDLayer(nn.Module):
     steps : int
         Taken in one call.
     mode : {"unrolled", "checkpointed", "detached"}
-        Derivatives go back through all steps; the same, but steps are repeated for them
-        instead of being kept; or each step's input state counts as given.
+        Derivatives go back through all steps; the same, but only the states at the ends of
+        about sqrt(steps) segments are kept, and steps are repeated; or each step's input
+        state counts as given.
     on_failure : {"raise", "zero"}
         What happens when a scene's step, or the linear system of its derivative, fails:
         `ConvergenceError` with the scenes' names, or no derivatives from that scene.
-        ``statuses`` tells in any case.
+        ``statuses`` and ``failed_derivatives`` tell in any case.
     tolerance : float
         Of the linear systems' residuals, relative.
 
@@ -48,12 +108,17 @@ class PDLayer(nn.Module):
     ----------
     statuses : list of list of Status
         Of the last call: for each step, each scene's.
+    failed_derivatives : list of (int, int)
+        Step and scene of each derivative that was looked for and not found, in all backward
+        passes through the last call.
 
     Notes
     -----
-    All tensors are on the stepper's device; none is moved.  Where materials are given, first
-    Hessians stay those of the stepper's problems, which costs iterations, not accuracy.
-    Integrators with a memory (BDF2, generalised-alpha) start anew in each call.
+    All tensors are on the stepper's device; others are refused, none is moved.  Loads that
+    follow the body are sampled on the CPU in each step, and scenes that the batch does not
+    solve are stepped there.  Where materials are given, first Hessians stay those of the
+    stepper's problems, which costs iterations, not accuracy; the stepper's own material is
+    back after the call.  There are no second derivatives.
     """
 
     def __init__(
@@ -79,7 +144,20 @@ class PDLayer(nn.Module):
             )
         self.stepper, self.steps, self.mode = stepper, steps, mode
         self.on_failure, self.tolerance = on_failure, tolerance
-        self.statuses: list[list[Any]] = []
+        self.statuses: list[list[Status]] = []
+        self.failed_derivatives: list[tuple[int, int]] = []
+
+    @property
+    def differentiable(self) -> Tensor:
+        """Whether each scene has derivatives through all steps of the last call, (B,) bool.
+
+        That is, whether each step converged, and in one part.  A derivative's own linear
+        system may still fail, see ``failed_derivatives``.
+        """
+        scenes = torch.ones(len(self.stepper.problems), dtype=torch.bool)
+        for row in self.statuses:
+            scenes &= torch.tensor(in_one(row))
+        return scenes.to(self.stepper.device)
 
     def extra_repr(self) -> str:
         """For printing."""
@@ -91,9 +169,9 @@ class PDLayer(nn.Module):
         velocities: Tensor,
         forces: Tensor | None = None,
         *,
-        young: Tensor | None = None,
-        poisson: Tensor | None = None,
-        density: Tensor | None = None,
+        young: Tensor | float | None = None,
+        poisson: Tensor | float | None = None,
+        density: Tensor | float | None = None,
         times: Sequence[float] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the steps.
@@ -104,8 +182,8 @@ class PDLayer(nn.Module):
             m and m/s; (N, 3) for a stepper of one scene.
         forces : the same, optional
             Nodal forces besides the scenes' loads, N; (steps, B, N, 3) if they change.
-        young, poisson, density : tensors that broadcast to (B, C), optional
-            Pa, dimensionless, kg/m3; those of the problems by default.
+        young, poisson, density : numbers or tensors that broadcast to (B, C), optional
+            Pa, dimensionless, kg/m3; those that the stepper has by default.
         times : (B,) floats, optional
             At the start, s; 0 by default.
 
@@ -120,11 +198,10 @@ class PDLayer(nn.Module):
         ConvergenceError
             If a scene fails, unless ``on_failure`` is "zero".
         """
-        frames_p, frames_v = self.trajectory(
-            positions, velocities, forces, young=young, poisson=poisson, density=density,
-            times=times,
-        )  # fmt: skip
-        return frames_p[-1], frames_v[-1]
+        frame, _ = self._run(
+            positions, velocities, forces, (young, poisson, density), times, keep=False
+        )
+        return frame
 
     def trajectory(
         self,
@@ -132,63 +209,95 @@ class PDLayer(nn.Module):
         velocities: Tensor,
         forces: Tensor | None = None,
         *,
-        young: Tensor | None = None,
-        poisson: Tensor | None = None,
-        density: Tensor | None = None,
+        young: Tensor | float | None = None,
+        poisson: Tensor | float | None = None,
+        density: Tensor | float | None = None,
         times: Sequence[float] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Like `forward`, with all frames: (steps + 1, B, N, 3), frame 0 as given."""
+        _, frames = self._run(
+            positions, velocities, forces, (young, poisson, density), times, keep=True
+        )
+        out = [torch.stack(parts) for parts in zip(*frames, strict=True)]
+        return out[0], out[1]
+
+    def _run(
+        self,
+        positions: Tensor,
+        velocities: Tensor,
+        forces: Tensor | None,
+        material: Sequence[Tensor | float | None],
+        times: Sequence[float] | None,
+        keep: bool,
+    ) -> tuple[Frame, list[Frame]]:
+        """The last frame and, if they are to be kept, all."""
         single = positions.ndim == 2
         if single:
             positions, velocities = positions[None], velocities[None]
             forces = None if forces is None else forces.unsqueeze(-3)
-        self._check("positions", positions)
-        self._check("velocities", velocities)
-        material = [
-            None if m is None else m.expand(self.stepper.material[0].shape)
-            for m in (young, poisson, density)
-        ]
-        now = tuple(times) if times is not None else (0.0,) * len(self.stepper.problems)
-        self.statuses = []
-        frames = [(positions, velocities)]
-        for k in range(self.steps):
-            push = forces[k] if forces is not None and forces.ndim == 4 else forces
-            if push is not None:
-                self._check("forces", push)
-            state = frames[-1]
-            if self.mode == "detached" and k:
-                state = (state[0].detach(), state[1].detach())
-            inputs = (self, now, *state, push, *material)
-            if self.mode == "checkpointed" and torch.is_grad_enabled():
-                frames.append(checkpoint(_Step.apply, *inputs, use_reentrant=False))
+        cells = self.stepper.cells
+        check_nodal(cells, "positions", positions)
+        check_nodal(cells, "velocities", velocities)
+        pushes = self._pushes(forces)
+        given = [by_cell(cells, n, m) for n, m in zip(NAMES, material, strict=True)]
+        call = _Call(self, self.stepper.with_material(given), self._start_times(times))
+        self.statuses, self.failed_derivatives = call.statuses, call.failures
+        frame, frames = (positions, velocities), [(positions, velocities)]
+        repeated = self.mode == "checkpointed" and torch.is_grad_enabled()
+        length = math.isqrt(self.steps - 1) + 1 if repeated else self.steps
+        for first in range(0, self.steps, length):
+            inputs = (call, first, keep, frame, pushes[first : first + length], given)
+            if repeated:
+                new = checkpoint(_segment, *inputs, use_reentrant=False)
             else:
-                frames.append(_Step.apply(*inputs))  # type: ignore[no-untyped-call]
-            now = tuple(t + self.stepper.time_step for t in now)
-        out = tuple(torch.stack(parts) for parts in zip(*frames, strict=True))
-        return (out[0][:, 0], out[1][:, 0]) if single else (out[0], out[1])
+                new = _segment(*inputs)
+            frame = new[-1]
+            frames.extend(new if keep else [])
+        if single:
+            frames = [(p[0], v[0]) for p, v in frames]
+            frame = (frame[0][0], frame[1][0])
+        return frame, frames
 
-    def _check(self, name: str, x: Tensor) -> None:
-        stepper = self.stepper
-        n = stepper.cells.sizes
-        wanted = (n.scenes, n.nodes, 3)
-        if tuple(x.shape) != wanted or x.dtype != stepper.dtype or x.device != stepper.device:
+    def _pushes(self, forces: Tensor | None) -> list[Tensor | None]:
+        """Extra forces of each step."""
+        if forces is None:
+            return [None] * self.steps
+        each = list(forces) if forces.ndim == 4 else [forces] * self.steps
+        if len(each) != self.steps:
             raise InputError(
-                f"{name}: {tuple(x.shape)}, {x.dtype}, on {x.device}; expected {wanted}, "
-                f"{stepper.dtype}, on {stepper.device}, as the stepper."
+                f"forces of {len(each)} steps: expected one set, or one for each of the layer's "
+                f"{self.steps} steps."
             )
+        for push in each[: self.steps if forces.ndim == 4 else 1]:
+            check_nodal(self.stepper.cells, "forces", push)
+        return list(each)
 
-    def failed(self, what: str, ok: Sequence[bool]) -> None:
-        """Raise if scenes failed and the layer is to."""
-        names = [
-            f"{i} ({p.scene.name!r})"
-            for i, (p, fine) in enumerate(zip(self.stepper.problems, ok, strict=True))
-            if not fine
-        ]
-        if names and self.on_failure == "raise":
-            raise ConvergenceError(
-                f"{what} of scenes {', '.join(names)}: expected all to converge. Use smaller "
-                "steps, or on_failure='zero' to leave such scenes out."
-            )
+    def _start_times(self, times: Sequence[float] | None) -> tuple[float, ...]:
+        scenes = len(self.stepper.problems)
+        if times is None:
+            return (0.0,) * scenes
+        found = tuple(float(t) for t in times)
+        if len(found) != scenes or not all(map(math.isfinite, found)):
+            raise InputError(f"times = {found}: expected {scenes} finite numbers, one a scene.")
+        return found
+
+
+def _segment(
+    call: _Call,
+    first: int,
+    keep: bool,
+    frame: Frame,
+    pushes: Sequence[Tensor | None],
+    material: Sequence[Tensor | None],
+) -> list[Frame]:
+    """Some steps from number ``first`` on: their frames, or only the last one."""
+    frames: list[Frame] = []
+    for k, push in enumerate(pushes, first):
+        if call.layer.mode == "detached" and k:
+            frame = (frame[0].detach(), frame[1].detach())
+        frame = _Step.apply(call, k, *frame, push, *material)  # type: ignore[no-untyped-call]
+        frames = [*frames, frame] if keep else [frame]
+    return frames
 
 
 class _Step(torch.autograd.Function):
@@ -196,37 +305,36 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def forward(  # type: ignore[no-untyped-def]
-        ctx, layer, times, positions, velocities, forces, young, poisson, density
+        ctx, call, step, positions, velocities, forces, young, poisson, density
     ):
-        stepper: BatchStepper = layer.stepper
-        stepper.set_material(young, poisson, density)
-        before = BatchState(positions.detach(), velocities.detach(), times)
-        result = stepper(before, forces)
-        layer.statuses.append(result.statuses)
-        layer.failed("the step", [status.ok for status in result.statuses])
-        ctx.layer, ctx.times, ctx.statuses = layer, times, result.statuses
-        ctx.save_for_backward(positions, velocities, forces, young, poisson, density, result.y)
-        return result.state.positions, result.state.velocities
+        stepper: BatchStepper = call.layer.stepper
+        with stepper.using(call.material):
+            result = stepper(BatchState(positions, velocities, call.times_before(step)), forces)
+        call.stepped(step, result.statuses)
+        after = result.state
+        modes = result.y[:, stepper.cells.sizes.nodes :].clone()
+        ctx.call, ctx.step, ctx.statuses = call, step, result.statuses
+        ctx.save_for_backward(positions, velocities, forces, after.positions, modes)
+        return after.positions, after.velocities
 
     @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx, grad_positions, grad_velocities):  # type: ignore[no-untyped-def]
-        *inputs, y = ctx.saved_tensors
-        positions, velocities, forces, young, poisson, density = inputs
-        layer, stepper = ctx.layer, ctx.layer.stepper
-        stepper.set_material(young, poisson, density)
-        before = BatchState(positions, velocities, ctx.times)
-        gradients = BatchGradients(
-            stepper, before, Solved(y, ctx.statuses), grad_positions, grad_velocities,
-            forces=forces, tolerance=layer.tolerance,
-        )  # fmt: skip
-        layer.failed("the derivative", gradients.ok.tolist())
-        needed = ctx.needs_input_grad[2:]
-        found = [
-            getattr(gradients, name) if need else None
-            for name, need in zip(_INPUTS, needed, strict=True)
-        ]
+        positions, velocities, forces, after, modes = ctx.saved_tensors
+        call, stepper = ctx.call, ctx.call.layer.stepper
+        before = BatchState(positions, velocities, call.times_before(ctx.step))
+        with stepper.using(call.material):
+            y = stepper.staging.solution(before, after, modes)
+            gradients = BatchGradients(
+                stepper, before, Solved(y, ctx.statuses), grad_positions, grad_velocities,
+                forces=forces, tolerance=call.layer.tolerance,
+            )  # fmt: skip
+        call.differentiated(ctx.step, gradients.ok.tolist())
         ok = gradients.ok[:, None, None]
-        for i, grad in enumerate(found):
+        found = []
+        for name, needed in zip(_INPUTS, ctx.needs_input_grad[2:], strict=True):
+            grad = getattr(gradients, name) if needed else None
             if grad is not None:
-                found[i] = torch.where(ok if grad.ndim == 3 else ok[:, 0], grad, 0.0)
+                grad = torch.where(ok if grad.ndim == 3 else ok[:, 0], grad, 0.0)
+            found.append(grad)
         return None, None, *found

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.states import BatchResult, BatchState, Solved
+from pdcorrect.batch.checks import check_nodal
+from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.batch.threads import one_thread
 from pdcorrect.errors import InputError
+from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.linear import Linear
-from pdcorrect.state import Status
 
 
 class BatchGradients:
     """Derivatives of a loss by the inputs of one step of B scenes.
 
-    Those that take more than the adjoint state are computed when first asked for.
+    Those that take more than the adjoint state are computed when first asked for; steps that
+    the stepper takes meanwhile do not matter.
 
     Parameters
     ----------
@@ -60,44 +60,49 @@ class BatchGradients:
         tolerance: float = 1e-6,
     ) -> None:
         self._stepper, self._before, self._y = stepper, before, result.y
-        self._after = {
-            "positions": self._given("grad_positions", grad_positions),
-            "velocities": self._given("grad_velocities", grad_velocities),
-            **{n: self._given(n, g) for n, g in (grad_memory or {}).items()},
-        }
-        self._forces = forces
-        self._scheme, self._known = stepper.prepare(before, forces)
-        self._objective = stepper.objective
         self._nodes = stepper.cells.sizes.nodes
-        self._free = self._objective.free[:, : self._nodes] > 0.5
+        self._free = stepper.staging.free
         self._sums: dict[str, Tensor] = {}
-        scheme = self._scheme
-        self._pull(scheme.positions, None, self._after["positions"])
-        self._pull(scheme.velocities, scheme.clamped_velocities, self._after["velocities"])
-        for name, rows in scheme.memory.items():
-            if name in self._after:
-                self._pull(*rows, self._after[name])
-        by_y = self._sums.pop("y")
-        in_one = [s.ok and s is not Status.SUBSTEPPED for s in result.statuses]
-        fine = torch.tensor(in_one, device=by_y.device)
-        with one_thread(stepper.device):
-            solver = stepper.solve_adjoint(self._y, stepper.extended(by_y), fine, tolerance)
-        self.ok = fine & solver.converged
-        self.iterations = solver.steps
-        self.x = torch.where(self.ok[:, None, None], solver.x, 0.0)
-        self._nodal = self.x[:, : self._nodes]
-        self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
+        with stepper.alone():
+            self._stage = stepper.prepare(before, forces)
+            self._material = stepper.present
+            self._inertia, self._damping = stepper.objective.inertia, stepper.objective.damping
+            by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
+            fine = torch.tensor(in_one(result.statuses), device=by_y.device)
+            solver = stepper.solve_adjoint(self._y, stepper.staging.extended(by_y), fine, tolerance)
+            self.ok = fine & solver.converged
+            self.iterations = solver.steps
+            self.x = torch.where(self.ok[:, None, None], solver.x, 0.0)
+            self._nodal = self.x[:, : self._nodes]
+            self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
+
+    def _pull_end(
+        self, positions: Tensor | None, velocities: Tensor | None, memory: Mapping[str, Tensor]
+    ) -> Tensor:
+        """Derivatives of the loss by y, from those by what follows from y."""
+        scheme = self._stage.scheme
+        unknown = sorted(set(memory) - set(scheme.memory))
+        if unknown:
+            raise InputError(
+                f"grad_memory has {unknown[0]!r}: expected names of the memory after the step, "
+                f"{', '.join(scheme.memory) or 'of which there are none'}."
+            )
+        self._pull(scheme.positions, None, self._given("grad_positions", positions))
+        self._pull(
+            scheme.velocities,
+            scheme.clamped_velocities,
+            self._given("grad_velocities", velocities),
+        )
+        for name, g in memory.items():
+            self._pull(*scheme.memory[name], self._given(name, g))
+        return self._sums.pop("y")
 
     def _given(self, name: str, g: Tensor | None) -> Tensor:
-        like = self._before.positions
+        """A derivative by nodal values; zero at nodes that a scene does not have."""
         if g is None:
-            return torch.zeros_like(like)
-        if g.shape != like.shape or g.device != like.device:
-            raise InputError(
-                f"{name} is {tuple(g.shape)} on {g.device}: expected {tuple(like.shape)} on "
-                f"{like.device}."
-            )
-        return g.to(like.dtype)
+            return torch.zeros_like(self._before.positions)
+        check_nodal(self._stepper.cells, name, g)
+        return torch.where(self._stepper.cells.present_nodes[..., None], g, 0.0)
 
     # --- by the state and what acts on it ---------------------------------------------------
 
@@ -136,43 +141,47 @@ class BatchGradients:
     @property
     def lam(self) -> Tensor:
         """By each cell's lambda, (B, C), 1/Pa."""
-        rule = self._stepper.problems[0].scene.material.volume_weight
-        return self._weights[1] * (1.0 if rule == "published" else 3.0)
+        return self._weights[1] * (1.0 if self._rule.volume_weight == "published" else 3.0)
 
     @property
     def young(self) -> Tensor:
         """By each cell's Young's modulus at fixed Poisson's ratio, (B, C), 1/Pa."""
-        mu, lam = self._moduli_slopes[0]
-        return self.mu * mu + self.lam * lam
+        return self._by_modulus(0)
 
     @property
     def poisson(self) -> Tensor:
         """By each cell's Poisson's ratio at fixed Young's modulus, (B, C)."""
-        mu, lam = self._moduli_slopes[1]
-        return self.mu * mu + self.lam * lam
+        return self._by_modulus(1)
 
     @cached_property
     def density(self) -> Tensor:
         """By each cell's density, (B, C), m3/kg; gravity included."""
-        objective, stepper = self._objective, self._stepper
-        mass = objective.mass
-        fall = stepper.loads.acceleration(stepper.spans(self._scheme, self._before))
-        out = mass.row_slopes((self.x * fall).sum(dim=-1))
-        out = out - objective.inertia * mass.slopes(self.x, self._y - objective.target)
-        if objective.damping:
-            out = out - objective.damping * mass.slopes(self.x, self._y - objective.origin)
-        return out
+        stage, mass = self._stage, self._stepper.objective.mass
+        with self._stepper.alone():
+            fall = self._stepper.loads.acceleration(stage.spans)
+            out = mass.row_slopes((self.x * fall).sum(dim=-1))
+            out = out - self._inertia * mass.slopes(self.x, self._y - stage.target)
+            if self._damping:
+                out = out - self._damping * mass.slopes(self.x, self._y - stage.origin)
+            return out
 
     @cached_property
     def _weights(self) -> tuple[Tensor, Tensor]:
-        by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, self.x)
-        present = self._stepper.cells.terms
-        return -by_mu * present[0], -by_omega * present[1]
+        with self._stepper.alone():
+            by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, self.x)
+            has_terms = self._rule.has_shear_term, self._rule.has_volume_term
+            return -by_mu * has_terms[0], -by_omega * has_terms[1]
 
     @property
-    def _moduli_slopes(self) -> Any:
-        young, poisson, _ = self._stepper.material
-        return lame_slopes(young, poisson)  # type: ignore[type-var]
+    def _rule(self) -> Material:
+        return self._stepper.problems[0].scene.material
+
+    def _by_modulus(self, which: int) -> Tensor:
+        """By Young's modulus (0) or Poisson's ratio (1); zero at cells that a scene lacks."""
+        young, poisson, _ = self._material.values
+        mu, lam = lame_slopes(young, poisson)[which]  # type: ignore[type-var]
+        present = self._stepper.cells.present_cells
+        return torch.where(present, self.mu * mu + self.lam * lam, 0.0)
 
     # --- internals --------------------------------------------------------------------------------
 
@@ -188,15 +197,16 @@ class BatchGradients:
         on_clamped.transpose(torch.where(self._free, 0.0, g), self._sums)
 
     def _pull_stage(self, by_y: Tensor, image: Tensor) -> None:
-        scheme, objective, stepper = self._scheme, self._objective, self._stepper
-        momentum = objective.mass(self.x)[:, : self._nodes]
-        if scheme.inertia:
-            self._pull(scheme.target, scheme.clamped_target, scheme.inertia * momentum)
-        if objective.damping:
-            self._pull(scheme.origin, scheme.clamped_origin, objective.damping * momentum)
+        stage, stepper = self._stage, self._stepper
+        scheme = stage.scheme
+        momentum = stepper.objective.mass(self.x)[:, : self._nodes]
+        if self._inertia:
+            self._pull(scheme.target, scheme.clamped_target, self._inertia * momentum)
+        if self._damping:
+            self._pull(scheme.origin, scheme.clamped_origin, self._damping * momentum)
         back = torch.where(self._free, 0.0, by_y - image)
         scheme.clamped.transpose(back, self._sums)
         if stepper.loads.follow:
-            spans = stepper.spans(scheme, self._before)
-            slope = stepper.loads.pulled(spans, scheme.loads_at(self._known), self._nodal)
+            positions = scheme.loads_at(stage.known)
+            slope = stepper.loads.pulled(stage.spans, positions, self._nodal)
             scheme.loads_at.transpose(slope, self._sums)

@@ -7,6 +7,7 @@ not have carry no weight and stay at zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
 from pdcorrect.fem.problem import Problem
 
@@ -48,7 +50,7 @@ def padded(arrays: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float =
 
 
 class CellBatch:
-    """The cells of B problems with the same element and energy.
+    """The cells of B problems with the same element and energy, weightless until `set_weights`.
 
     Parameters
     ----------
@@ -60,6 +62,8 @@ class CellBatch:
     ----------
     sizes : Sizes
     node_counts : list of int
+    present_nodes, present_cells : (B, N), (B, C) bool
+        Which are a body's own, not padding.
     """
 
     def __init__(
@@ -86,21 +90,44 @@ class CellBatch:
         self._cells = torch.as_tensor((cells + offsets).reshape(-1), device=device)
         self._slots = torch.as_tensor(_slots(local, n), device=device)
         shape = (n.cells, points)
-        terms = [padded([p.point_weights[:, k] for p in problems], shape) for k in (0, 1)]
-        self._weights = self.tensor(np.stack(terms)).reshape(2, -1)
+        present = padded([np.ones(len(p.cells)) for p in problems], (n.cells,))
+        self.present_cells = torch.as_tensor(present > 0.5, device=device)
+        present = padded([np.ones(count) for count in self.node_counts], (n.nodes,))
+        self.present_nodes = torch.as_tensor(present > 0.5, device=device)
         volumes = [
             padded([p.quadrature.weights for p in problems], shape),
             padded([p.quadrature.volume_weights for p in problems], shape),
         ]
         self._volumes = self.tensor(np.stack(volumes)).reshape(2, -1)
+        self._weights = torch.zeros_like(self._volumes)
         self._points = Points(
             first.materials.model,
-            first.quadrature.first_volume if terms[1].any() else points,
+            first.quadrature.first_volume if first.scene.material.has_volume_term else points,
             points,
             compiled=device.type == "cuda",
         )
         self._identity = torch.eye(3, dtype=dtype, device=device).reshape(9, 1)
         self._gradients = self.tensor(_gradient_sets(problems, n))
+
+    def narrowed(self, rows: Tensor) -> CellBatch:
+        """Of some scenes."""
+        n, numbers = self.sizes, rows.tolist()
+        moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None]
+        last = n.scenes * n.cells * n.width
+        slots = self._slots.reshape(n.scenes, -1)[rows]
+        shifted = slots + moved * n.cells * n.width
+        slots = torch.where(slots < last, shifted, len(rows) * n.cells * n.width)
+        cells = self._cells.reshape(n.scenes, -1)[rows] + moved * n.unknowns
+        return with_rows(
+            self, rows, "rest", "present_nodes", "present_cells", "_gradients",
+            sizes=n._replace(scenes=len(rows)),
+            node_counts=[self.node_counts[i] for i in numbers],
+            mode_counts=[self.mode_counts[i] for i in numbers],
+            _cells=cells.reshape(-1),
+            _slots=slots.reshape(-1, self._slots.shape[1]),
+            _weights=self._weights.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
+            _volumes=self._volumes.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
+        )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
 
@@ -120,11 +147,6 @@ class CellBatch:
             out[i, : len(array[:nodes])] = array[:nodes]
             out[i, self.sizes.nodes : self.sizes.nodes + len(modes)] = modes
         return self.tensor(out)
-
-    def unpadded(self, x: Tensor) -> list[NDArray[Any]]:
-        """The bodies' nodal parts of (B, U, ...) as arrays."""
-        host = x.detach().cpu().numpy()
-        return [host[i, :count] for i, count in enumerate(self.node_counts)]
 
     def _renumbered(self, problem: Problem) -> NDArray[np.int64]:
         nodes = len(problem.positions)
@@ -147,16 +169,24 @@ class CellBatch:
         return self.gathered(self._points.product(tangent, self.gradients(x, 0.0)))
 
     def set_weights(self, mu: Tensor, omega: Tensor) -> None:
-        """Weights of the two energy terms from now on, (B, C), Pa; absent terms stay absent."""
+        """Weights of the two energy terms from now on, (B, C), Pa."""
         shape = (2, self.sizes.scenes, self.sizes.cells, self.sizes.points)
-        values = torch.stack([mu, omega])[..., None] * self._volumes.reshape(shape)
-        self._weights.copy_(torch.where(self._weights != 0.0, values.reshape(2, -1), 0.0))
+        volumes = self._volumes.reshape(shape)
+        values = torch.stack([mu, omega])[..., None] * volumes
+        self._weights.copy_(torch.where(volumes != 0.0, values, 0.0).reshape(2, -1))
 
-    @property
-    def terms(self) -> Tensor:
-        """Whether each cell has each of the two energy terms, (2, B, C)."""
+    def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
+        """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).
+
+        Of the nodes' displacements alone, see `ElasticBody.volume_ratios`.
+        """
         n = self.sizes
-        return (self._weights.reshape(2, n.scenes, n.cells, n.points) != 0.0).any(dim=-1)
+        u = torch.zeros_like(self.rest)
+        u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
+        a, b, c, d, e, f, g, h, i = self.gradients(u, 1.0).unbind()
+        ratios = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+        by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
+        return torch.where(self.present_cells, by_cell, math.inf).amin(dim=1)
 
     def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
         """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).

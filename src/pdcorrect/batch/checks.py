@@ -1,7 +1,10 @@
-"""What the scenes of a batch must have in common."""
+"""What the scenes of a batch must have in common, and what a step is given."""
 
 from __future__ import annotations
 
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 
@@ -48,3 +51,14 @@ def check_problems(
                 f"scene {i} ({scene.name!r}): moving clamps with {name} are not "
                 "available in batches. Use ProjectiveDynamics."
             )
+
+
+def check_nodal(cells: CellBatch, name: str, x: Tensor) -> None:
+    """Refuse what is not (B, N, 3) of the batch's type on its device."""
+    wanted = (cells.sizes.scenes, cells.sizes.nodes, 3)
+    device = cells.rest.device
+    if tuple(x.shape) != wanted or x.dtype != cells.dtype or x.device != device:
+        raise InputError(
+            f"{name}: {tuple(x.shape)}, {x.dtype}, on {x.device}; expected {wanted}, "
+            f"{cells.dtype}, on {device}, as the stepper."
+        )

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.fem.mesh import interpolation
 from pdcorrect.fem.problem import Problem, discretise
@@ -37,8 +38,8 @@ class CoarseCorrection:
     cells : CellBatch
     problems : sequence of Problem
         The distinct ones of the batch, refined.
-    matrices : sequence of (N, N) sparse
-        Their G.
+    matrices : sequence of (N, N) sparse or None
+        Their G; None where it is singular, and there is no correction.
     factors : (float, float)
         On mass (1/s2) and stiffness.
     sharing : Sharing
@@ -48,7 +49,7 @@ class CoarseCorrection:
         self,
         cells: CellBatch,
         problems: Sequence[Problem],
-        matrices: Sequence[sp.csr_matrix],
+        matrices: Sequence[sp.csr_matrix | None],
         factors: tuple[float, float],
         sharing: Sharing,
     ) -> None:
@@ -63,6 +64,11 @@ class CoarseCorrection:
         self._difference = torch.as_tensor(difference, dtype=torch.float32, device=device)
         self.bytes = 4 * (self._P.numel() + self._difference.numel())
 
+    def narrowed(self, sharing: Sharing, kept: list[int]) -> CoarseCorrection:
+        """With some of the matrices."""
+        rows = torch.tensor(kept, device=self._P.device)
+        return with_rows(self, rows, "_P", "_difference", _sharing=sharing)
+
     def __call__(self, r: Tensor) -> Tensor:
         shared = self._sharing.gathered(r.to(torch.float32))  # (K, m, N, 3)
         count, most, nodes, _ = shared.shape
@@ -75,10 +81,14 @@ class CoarseCorrection:
         return self._sharing.scattered(x).to(r.dtype)
 
 
-def _parts(problem: Problem, G: sp.csr_matrix, factors: tuple[float, float]) -> tuple[Array, Array]:
+def _parts(
+    problem: Problem, G: sp.csr_matrix | None, factors: tuple[float, float]
+) -> tuple[Array, Array]:
     """P (N, N_c) and H_c^-1 - G_c^-1, (3 N_c, 3 N_c), zero where clamped."""
     coarse = discretise(problem.scene, element="hex8")
     P = interpolation(coarse.mesh, problem.refine)
+    if G is None:
+        return P.toarray(), np.zeros((coarse.free.size, coarse.free.size))
     identity = sp.eye_array(3)
     free = sp.diags_array(problem.free.ravel().astype(np.float64))
     held = sp.diags_array(coarse.free.ravel().astype(np.float64))

@@ -7,11 +7,15 @@ row-major.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 _SWEEPS = {torch.float64: 5, torch.float32: 3}
 _VOLUME_STEPS = 8
+_UNIT_VOLUME = {torch.float64: 1e-8, torch.float32: 1e-3}
+"""Difference of a root's volume from one; where there is no root it is of the order of one."""
 LARGE_VOLUME = 4.0
 """Above this det F the nearest unit-determinant matrix may not be unique (see `extreme`)."""
 _TINY = {torch.float64: 1e-300, torch.float32: 1e-37}
@@ -144,23 +148,38 @@ def transposed(A: list[Tensor]) -> list[Tensor]:
 def nearest_volume(s: list[Tensor]) -> tuple[list[Tensor], Tensor]:
     """Nearest stretch of unit volume v (3) and multiplier k for s (3).
 
-    Where det F exceeds `LARGE_VOLUME` there may be two candidates, which both are
-    looked for.
+    Where det F exceeds `LARGE_VOLUME` there may be two candidates: the root next to s, and
+    one with the third direction flattened.  Either may be missing.
+    """
+    near = _volume_root(s, _first_stretch(s))
+    v, k, cost = _stretches(s, near)
+    flat = _volume_root(s, _first_flattened(s))
+    w, other, flat_cost = _stretches(s, flat)
+    use = (s[0] * s[1] * s[2] > LARGE_VOLUME) & (flat_cost < cost)
+    chosen = [torch.where(use, b, a) for a, b in zip(v, w, strict=True)]
+    return chosen, torch.where(use, other, k)
+
+
+def _first_stretch(s: list[Tensor]) -> Tensor:
+    """A bound above the root v3 next to s3.
+
+    From there Newton's method converges monotonically: the volume is convex in v3 above
+    s3 / 2.  The bounds follow from v1 >= v2 >= v3, and v1 >= s1 where s is to expand, else
+    v1 >= s1 / 2 and v3 <= s3.
     """
     a, b, c = s
-    volume = a * b * c
-    squares = a * a * b * b + (a * a + b * b) * c * c
-    guess = c + (1.0 - volume) * a * b / (squares + tiny(c))
-    near = (c > 0.5) & (volume > 0.5) & (volume < 2.0) & (guess > 0.2)
-    start = torch.where(near, guess, torch.ones_like(c))
+    one, small = torch.ones_like(c), tiny(c)
+    expand = torch.minimum(torch.rsqrt(a + small), 1.0 / (a * b + small))
+    shrink = torch.minimum(torch.sqrt(2.0 / (a + small)), c)
+    return torch.minimum(torch.where(a * b * c > 1.0, shrink, expand), one)
+
+
+def _first_flattened(s: list[Tensor]) -> Tensor:
+    """The smaller v3 of unit volume where s2 = s3 and s1 is much larger; 1 for small volumes."""
+    volume = s[0] * s[1] * s[2]
     large = volume > LARGE_VOLUME
-    start = torch.where(large, c, start)  # the root next to s
-    last = _volume_root(s, start)
-    flattened = _volume_root(s, 1.0 / (a * b + tiny(c)))
-    cost = [_stretches(s, root)[2] for root in (last, flattened)]
-    root = torch.where(large & (cost[1] < cost[0]), flattened, last)
-    v, k, _ = _stretches(s, root)
-    return v, k
+    share = torch.sqrt(torch.clamp(1.0 - 4.0 / torch.where(large, volume, 4.0), min=0.0))
+    return torch.where(large, 0.5 * s[2] * (1.0 - share), 1.0)
 
 
 def _volume_root(s: list[Tensor], c: Tensor) -> Tensor:
@@ -177,9 +196,13 @@ def _volume_root(s: list[Tensor], c: Tensor) -> Tensor:
 
 
 def _stretches(s: list[Tensor], c: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Of the stationary family with v3 = c: v, the multiplier and |v - s|^2."""
+    """Of the stationary family with v3 = c: v, the multiplier and |v - s|^2.
+
+    The last is infinite where the volume is not one.
+    """
     k = c * (c - s[2])
     a = 0.5 * (s[0] + torch.sqrt(torch.clamp(s[0] * s[0] + 4.0 * k, min=0.0)))
     b = 0.5 * (s[1] + torch.sqrt(torch.clamp(s[1] * s[1] + 4.0 * k, min=0.0)))
     cost = (a - s[0]) ** 2 + (b - s[1]) ** 2 + (c - s[2]) ** 2
-    return [a, b, c], k, cost
+    unit = (a * b * c - 1.0).abs() < _UNIT_VOLUME[c.dtype]
+    return [a, b, c], k, torch.where(unit, cost, math.inf)

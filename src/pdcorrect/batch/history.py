@@ -8,8 +8,12 @@ from an upper triangular R removes a row and a column from its inverse.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+
+from pdcorrect.batch.narrowing import with_rows
 
 _CURVATURE = 1e-12
 
@@ -31,13 +35,17 @@ class BatchHistory:
         self._age = torch.full((scenes, length), -1, dtype=torch.int64, device=like.device)
         self._scenes = torch.arange(scenes, device=like.device)
 
+    def narrowed(self, rows: Tensor) -> BatchHistory:
+        """Of some scenes, as it is now."""
+        names = ("_S", "_Z", "_r_inverse", "_yz", "_d", "_sg", "_zg", "_age")
+        return with_rows(self, rows, *names, _scenes=self._scenes[: len(rows)])
+
     def clear(self, which: Tensor) -> None:
         """Forget all pairs of the scenes where ``which`` (B,) holds."""
-        keep = (~which).to(self._d.dtype)
         for small in (self._d, self._sg, self._zg):
-            small.mul_(keep[:, None])
+            small.masked_fill_(which[:, None], 0.0)
         for matrix in (self._r_inverse, self._yz):
-            matrix.mul_(keep[:, None, None])
+            matrix.masked_fill_(which[:, None, None], 0.0)
         self._age.masked_fill_(which[:, None], -1)
 
     @property
@@ -65,13 +73,14 @@ class BatchHistory:
     ) -> None:
         """Add a pair to the scenes that ``moved`` (B,) between two gradients, all else (B, D).
 
-        A pair without positive curvature is not stored.
+        A pair without positive curvature is not stored.  Numbers that are not finite stay
+        out, in whatever scene: what is stored is multiplied by zeros later.
         """
         sg, zg = _times(self._S, new_gradient), _times(self._Z, new_gradient)
         s_new, z_new = (step * new_gradient).sum(1), (change * new_gradient).sum(1)
         y_s, y_z = s_new - (step * gradient).sum(1), z_new - (change * gradient).sum(1)
         floor = _CURVATURE * torch.sqrt(y_z.abs() * (step * step).sum(1))
-        good = moved & (y_s > floor) & (y_z > 0.0)
+        good = moved & (y_s > floor) & (y_z > 0.0) & (y_s < math.inf)
         place = self._age.argmin(dim=1)
         unit = torch.nn.functional.one_hot(place, self._age.shape[1]).to(sg.dtype)
         unit = unit * good.to(sg.dtype)[:, None]
@@ -81,11 +90,12 @@ class BatchHistory:
         y_s = torch.where(good, y_s, torch.ones_like(y_s))
         self._r_inverse.mul_(both)
         column = (unit - _times(self._r_inverse, sy)) / y_s[:, None]
-        self._r_inverse.add_(column[:, :, None] * unit[:, None, :])
+        new_pair = good[:, None, None]
+        self._r_inverse.add_(torch.where(new_pair, column[:, :, None] * unit[:, None, :], 0.0))
         self._yz.mul_(both)
         cross = zy[:, :, None] * unit[:, None, :]
-        self._yz.add_(cross + cross.transpose(1, 2))
-        self._yz.add_(y_z[:, None, None] * unit[:, :, None] * unit[:, None, :])
+        corner = y_z[:, None, None] * unit[:, :, None] * unit[:, None, :]
+        self._yz.add_(torch.where(new_pair, cross + cross.transpose(1, 2) + corner, 0.0))
         self._d.copy_(self._d * kept + y_s[:, None] * unit)
         seen = moved[:, None]
         new = (sg * kept + s_new[:, None] * unit, zg * kept + z_new[:, None] * unit)

@@ -14,7 +14,7 @@ mesh (`CoarseCorrection`).  Internal modes are eliminated cell by cell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,6 +25,7 @@ from torch import Tensor
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.coarse import CoarseCorrection
 from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
@@ -42,7 +43,7 @@ def chosen(name: BatchHessian, problems: Sequence[Problem]) -> BatchHessian:
     Raises
     ------
     InputError
-        If there are no two levels.
+        If there is no such name, or there are no two levels.
     """
     refined = all(p.refine > 1 for p in problems)
     if name == "two-level" and not refined:
@@ -50,6 +51,8 @@ def chosen(name: BatchHessian, problems: Sequence[Problem]) -> BatchHessian:
             "first_hessian = 'two-level' for meshes that are not refined: expected refine of 2 "
             "or more."
         )
+    if name not in get_args(BatchHessian):
+        raise InputError(f"first_hessian = {name!r}: expected {', '.join(get_args(BatchHessian))}.")
     if name != "auto":
         return name
     if max(len(p.positions) for p in problems) <= LARGEST_REST:
@@ -80,6 +83,13 @@ class DenseInverse:
         Of all inverses.
     count : int
         Distinct ones.
+    regular : (B,) bool
+        Whether there is an inverse; where not, the products are zero.
+
+    Raises
+    ------
+    ConvergenceError
+        If no scene's matrix is positive definite.
     """
 
     def __init__(
@@ -103,15 +113,21 @@ class DenseInverse:
         shape = (len(distinct), self._axes, size, size)
         self._inverse = torch.zeros(shape, dtype=storage, device=cells.device)
         self.bytes = self._inverse.numel() * self._inverse.element_size()
-        solved, inverted, matrices = [], [], []
+        solved, inverted, matrices, regular = [], [], [], []
         for i, problem in enumerate(distinct):
             blocks = _node_blocks(problem, factors, kind)
             kept, inverse, coupling = _eliminated(blocks, problem.cells.shape[1] * self._width)
             solved.append(coupling)
             inverted.append(inverse)
-            self._fill(i, problem, kept, factors[0])
+            regular.append(self._fill(i, problem, kept, factors[0]))
             if kind == "two-level":
-                matrices.append(_summed(problem, kept, factors[0]))
+                matrices.append(_summed(problem, kept, factors[0]) if regular[i] else None)
+        if not any(regular):
+            raise ConvergenceError(
+                f"scene {problems[0].scene.name!r}: the matrix of the step is not positive "
+                "definite: expected clamps, or inertia that matters beside the stiffness."
+            )
+        self.regular = torch.tensor([regular[k] for k in owners], device=cells.device)
         if n.modes:
             modes = self._width * (n.width - problems[0].cells.shape[1])
             nodes = self._width * problems[0].cells.shape[1]
@@ -128,6 +144,21 @@ class DenseInverse:
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
         self._free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> DenseInverse:
+        """Of some scenes with their cells, turned as it is now."""
+        sharing, kept = self._sharing.narrowed(rows)
+        modes = ("_solved", "_mode_inverse") if cells.sizes.modes else ()
+        out = with_rows(
+            self, rows, "_free", "regular", *modes,
+            _cells=cells, _sharing=sharing, _inverse=self._inverse[kept],
+            _rotations=[a[rows] for a in self._rotations],
+        )  # fmt: skip
+        if self._rotations:
+            out._turning = self._turning.narrowed(cells, rows)
+        if self._coarse is not None:
+            out._coarse = self._coarse.narrowed(sharing, kept)
+        return out
 
     def turn(self, y: Tensor) -> None:
         """Turn the rest Hessian to a configuration."""
@@ -203,8 +234,8 @@ class DenseInverse:
 
     # --- preparation -----------------------------------------------------------------------
 
-    def _fill(self, i: int, problem: Problem, blocks: Array, mass_factor: float) -> None:
-        """Invert one problem's matrix into the store."""
+    def _fill(self, i: int, problem: Problem, blocks: Array, mass_factor: float) -> bool:
+        """Invert one problem's matrix into the store, if it is positive definite."""
         device, width = self._cells.device, self._width
         size = width * len(problem.positions)
         numbers = width * problem.cells[:, :, None] + np.arange(width)
@@ -225,12 +256,11 @@ class DenseInverse:
             held = matrix * keep[:, None] * keep + torch.diag(1.0 - keep)
             factor, info = torch.linalg.cholesky_ex(held)
             if int(info):
-                raise ConvergenceError(
-                    f"scene {problem.scene.name!r}: the matrix of the step is not positive "
-                    "definite: expected clamps, or inertia that matters beside the stiffness."
-                )
+                self._inverse[i] = 0.0
+                return False
             inverse = torch.cholesky_inverse(factor) * keep[:, None] * keep
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
+        return True
 
 
 class _Turning:
@@ -246,6 +276,9 @@ class _Turning:
         held = [~p.free.all(axis=1) for p in problems]
         self._held = cells.nodal([np.where(h, 1.0, 0.0) for h in held]) > 0.5
         self._nodes = problems[0].cells.shape[1]
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> _Turning:
+        return with_rows(self, rows, "_shares", "_held", _cells=cells)
 
     def since_rest(self, y: Tensor) -> list[Tensor]:
         """Rotations of nodes and modes, nine tensors (B, U)."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
+from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.recording import Recorder
 
 _CHUNK = 2
@@ -47,7 +48,7 @@ class BatchConjugateGradients:
         self._tolerance, self._share, self._settled = rest.new_zeros(3)
         self._busy = torch.zeros((), dtype=torch.bool, device=rest.device)
         self.steps = 0
-        self._tangent = objective.cells.linearise(self._y)
+        self._tangent: Tangent
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._chunk)
 

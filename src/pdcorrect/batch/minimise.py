@@ -4,7 +4,8 @@ One iteration evaluates every scene once: scenes whose trial step is accepted mo
 a new direction, the others try a shorter step.  It has no branches that depend on values,
 so a GPU replays it (`recording`).  A scene stops when its own step is short; then the
 remaining displacement is estimated with the true Hessian, by conjugate gradients, for all
-scenes that wait for it.
+scenes that wait for it.  On the CPU, when few scenes are left, the loop goes on with a
+smaller batch of those (recorded work is for one size).
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ HISTORY = 12
 _CHUNK = 2
 """Iterations between two looks at the scenes' progress."""
 _CG_STEPS = 60
+_FEW = 4
+"""One in so many scenes or less are few."""
+_OUTCOME = ("y", "gradient", "phase", "iterations", "evaluations", "estimate")
+_PROGRESS = ("_x", "_d", "_value", "_scale", "_step", "_slope", "_threshold", "_tried")
 
 
 class Phase(IntEnum):
@@ -79,7 +84,8 @@ class BatchMinimiser:
         counters = torch.zeros(4, scenes, dtype=torch.int64, device=rest.device)
         self.phase, self.iterations, self.evaluations, self._tried = counters
         self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
-        self._left = torch.zeros(2, dtype=torch.bool, device=rest.device)
+        self._left = torch.zeros(2, dtype=torch.int64, device=rest.device)
+        self._narrows = rest.device.type == "cpu" and scenes >= _FEW
         self._history = BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
         self.linear_solver = BatchConjugateGradients(objective, self._precondition, recorder)
@@ -92,14 +98,39 @@ class BatchMinimiser:
         self._start.copy_(start)
         self._alive.copy_(alive)
         self._begin()
+        self._finish()
+
+    def _finish(self) -> None:
+        """Go on until no scene is left."""
         while True:
             running, waiting = self._left.tolist()
             if not running and not waiting:
                 return
-            if running:
+            if self._few(running + waiting):
+                self._finish_narrowed()
+            elif running and not (waiting and self._few(running)):
                 self._advance()
             else:
                 self._estimate()
+
+    def _few(self, scenes: int) -> bool:
+        return self._narrows and _FEW * scenes <= len(self.phase)
+
+    def _finish_narrowed(self) -> None:
+        """The same in a batch of the scenes that are left."""
+        left = (self.phase == Phase.RUNNING) | (self.phase == Phase.WAITING)
+        rows = left.nonzero()[:, 0]
+        objective = self._objective.narrowed(rows)
+        inverse = self._inverse.narrowed(objective.cells, rows)
+        part = BatchMinimiser(objective, inverse, self._tolerance[rows], self._most)
+        part._history = self._history.narrowed(rows)
+        for name in (*_OUTCOME, *_PROGRESS):
+            getattr(part, name).copy_(getattr(self, name)[rows])
+        part._look()
+        part._finish()
+        for name in _OUTCOME:
+            getattr(self, name)[rows] = getattr(part, name)
+        self._look()
 
     def forget(self) -> None:
         """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
@@ -131,12 +162,13 @@ class BatchMinimiser:
         finite = self._alive & torch.isfinite(value) & torch.isfinite(self._slope)
         short = largest_displacement(self._d) <= self._threshold
         phase = torch.where(short, int(Phase.WAITING), int(Phase.RUNNING))
+        phase = torch.where(self._inverse.regular, phase, int(Phase.LINE_SEARCH))
         self.phase.copy_(torch.where(finite, phase, int(Phase.NOT_FINITE)))
         self._look()
 
     def _look(self) -> None:
-        self._left[0] = (self.phase == Phase.RUNNING).any()
-        self._left[1] = (self.phase == Phase.WAITING).any()
+        self._left[0] = (self.phase == Phase.RUNNING).sum()
+        self._left[1] = (self.phase == Phase.WAITING).sum()
 
     def _chunk(self) -> None:
         for _ in range(_CHUNK):

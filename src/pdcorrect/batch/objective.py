@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.fem.problem import Problem
 
 
 class BatchMass:
-    """M x for nodal fields (B, U, 3), kg; internal modes have no mass.
+    """M x for nodal fields (B, U, 3), kg, after `set_density`; internal modes have no mass.
 
     Attributes
     ----------
@@ -30,9 +31,12 @@ class BatchMass:
         blocks = [p.space.cell_masses(p.mass_rule) for p in problems]
         self._blocks = cells.tensor(padded(blocks, (n.cells, nodes, nodes)))
         self._diagonal = all(p.mass_is_diagonal for p in problems)
-        self.density = cells.tensor(padded([p.materials.density for p in problems], (n.cells,)))
-        self.nodal = torch.zeros(n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
-        self.set_density(self.density)
+        self.density = cells.rest.new_zeros(n.scenes, n.cells)
+        self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> BatchMass:
+        """Of some scenes, with their cells."""
+        return with_rows(self, rows, "_blocks", "density", "nodal", _cells=cells)
 
     def set_density(self, density: Tensor) -> None:
         """Densities (B, C), kg/m3, from now on."""
@@ -88,6 +92,13 @@ class BatchObjective:
         self.inertia = self.damping = 0.0
         self.free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
         self.target, self.origin, self.forces = (torch.zeros_like(cells.rest) for _ in range(3))
+
+    def narrowed(self, rows: Tensor) -> BatchObjective:
+        """Of some scenes, as it is now."""
+        cells = self.cells.narrowed(rows)
+        mass = self.mass.narrowed(cells, rows)
+        names = ("free", "target", "origin", "forces")
+        return with_rows(self, rows, *names, cells=cells, mass=mass)
 
     @property
     def factors(self) -> tuple[float, float]:

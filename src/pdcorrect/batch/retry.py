@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.states import BatchResult, BatchState, apart, together
+from pdcorrect.batch.states import BatchResult, BatchState, state_of, with_states
 from pdcorrect.errors import PdcorrectError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import solution
@@ -28,7 +28,9 @@ class OneByOne:
     cells : CellBatch
     problem : callable
         The problem of a scene, by its number, as it is now.
-    tolerance, time_step, integrator
+    tolerances : sequence of float
+        The scenes', of their cell sizes.
+    time_step, integrator
         Of the steps.
     """
 
@@ -36,12 +38,13 @@ class OneByOne:
         self,
         cells: CellBatch,
         problem: Callable[[int], Problem],
-        tolerance: float,
+        tolerances: Sequence[float],
         time_step: float,
         integrator: str,
     ) -> None:
         self._cells, self._problem = cells, problem
-        self._settings = (tolerance, time_step, integrator)
+        self._tolerances = tolerances
+        self._time_step, self._integrator = time_step, integrator
         self._steppers: dict[int, ProjectiveDynamics] = {}
 
     def __call__(
@@ -49,44 +52,56 @@ class OneByOne:
     ) -> BatchResult:
         """The result with those scenes' in it that now converged."""
         failed = [i for i, status in enumerate(result.statuses) if status in _WORTH_IT]
-        if not failed:
+        found = {i: self._step(i, before, forces, result) for i in failed}
+        steps = {i: step for i, step in found.items() if step is not None}
+        if not steps:
             return result
-        states, after = apart(self._cells, before), apart(self._cells, result.state)
-        statuses, estimates = list(result.statuses), result.error_estimates.copy()
-        iterations, y = result.iterations.copy(), result.y.clone()
-        for i in failed:
-            found = self._step(i, states[i], forces)
-            if found is None:
-                continue
-            after[i], statuses[i] = found.state, found.status
-            if found.status is Status.CONVERGED:
-                statuses[i] = Status.RECOVERED
-            estimates[i] = found.error_estimate
-            iterations[i] += found.iterations
-            y[i] = self._configuration(i, states[i], found.state)
+        statuses, y = list(result.statuses), result.y.clone()
+        estimates, iterations = result.error_estimates.copy(), result.iterations.copy()
+        ratios = result.smallest_volume_ratios.copy()
+        for i, step in steps.items():
+            converged = step.status is Status.CONVERGED
+            statuses[i] = Status.RECOVERED if converged else step.status
+            estimates[i] = step.error_estimate
+            iterations[i] += step.iterations
+            ratios[i] = step.stats["smallest_volume_ratio"]
+            y[i] = self._configuration(i, state_of(self._cells, before, i), step.state)
         return replace(
             result,
-            state=together(self._cells, after),
+            state=with_states(
+                self._cells, result.state, {i: step.state for i, step in steps.items()}
+            ),
             y=y,
             statuses=statuses,
             iterations=iterations,
             error_estimates=estimates,
+            smallest_volume_ratios=ratios,
         )
 
-    def _step(self, i: int, state: State, forces: Tensor | None) -> StepResult | None:
-        problem = self._problem(i)
-        if i not in self._steppers or self._steppers[i].problem is not problem:
-            tolerance, h, integrator = self._settings
-            self._steppers[i] = ProjectiveDynamics(
-                problem, tolerance, time_step=h, integrator=integrator
-            )
+    def _step(
+        self, i: int, before: BatchState, forces: Tensor | None, result: BatchResult
+    ) -> StepResult | None:
+        """The step of one scene; None, and the batch's own status stands, if that fails too."""
         extra = None
         if forces is not None:
-            extra = forces[i, : len(problem.positions)].detach().to("cpu", torch.float64).numpy()
+            rows = forces[i, : self._cells.node_counts[i]]
+            extra = rows.detach().to("cpu", torch.float64).numpy()
         try:
-            return self._steppers[i](state, extra)
-        except PdcorrectError:  # the batch's own status stands
+            found = self._stepper(i)(state_of(self._cells, before, i), extra)
+        except PdcorrectError:
             return None
+        return found if set(found.state.memory) == set(result.state.memory) else None
+
+    def _stepper(self, i: int) -> ProjectiveDynamics:
+        problem = self._problem(i)
+        if i not in self._steppers or self._steppers[i].problem is not problem:
+            self._steppers[i] = ProjectiveDynamics(
+                problem,
+                self._tolerances[i],
+                time_step=self._time_step,
+                integrator=self._integrator,
+            )
+        return self._steppers[i]
 
     def _configuration(self, i: int, before: State, after: State) -> Tensor:
         """The y of a scene that was stepped alone."""

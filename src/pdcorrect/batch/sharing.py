@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Sequence
 
@@ -33,11 +34,24 @@ class Sharing:
                 seen[key] = len(self.distinct)
                 self.distinct.append(problem)
             self.owners.append(seen[key])
+        self._arrange(device)
+
+    def narrowed(self, rows: Tensor) -> tuple[Sharing, list[int]]:
+        """Of some scenes; and the numbers of the matrices that they have."""
+        owners = [self.owners[i] for i in rows.tolist()]
+        kept = sorted(set(owners))
+        out = copy.copy(self)
+        out.distinct = [self.distinct[k] for k in kept]
+        out.owners = [kept.index(k) for k in owners]
+        out._arrange(rows.device)
+        return out, kept
+
+    def _arrange(self, device: torch.device) -> None:
         members: list[list[int]] = [[] for _ in self.distinct]
         for scene, owner in enumerate(self.owners):
             members[owner].append(scene)
         most = max(map(len, members))
-        self._scenes = len(problems)
+        self._scenes = len(self.owners)
         filled = [row + [self._scenes] * (most - len(row)) for row in members]
         self._members = torch.tensor(filled, device=device)
         self._alone = most == 1

@@ -64,12 +64,20 @@ class BatchResult(Solved):
     iterations, evaluations : (B,) int
     error_estimates : (B,)
         m; infinite where there is none.
+    smallest_volume_ratios : (B,)
+        Smallest det F of each body, see `ElasticBody.volume_ratios`.
     """
 
     state: BatchState
     iterations: NDArray[np.int64]
     evaluations: NDArray[np.int64]
     error_estimates: Array
+    smallest_volume_ratios: Array
+
+
+def in_one(statuses: Sequence[Status]) -> list[bool]:
+    """Whether each scene's step has a result, and not in smaller parts: so it has derivatives."""
+    return [s.ok and s is not Status.SUBSTEPPED for s in statuses]
 
 
 def together(cells: CellBatch, states: Sequence[State]) -> BatchState:
@@ -102,14 +110,39 @@ def together(cells: CellBatch, states: Sequence[State]) -> BatchState:
 
 def apart(cells: CellBatch, batch: BatchState) -> list[State]:
     """The scenes' states one by one."""
-    tensors = {"positions": batch.positions, "velocities": batch.velocities, **batch.memory}
-    host = {n: t.detach().to("cpu", torch.float64).numpy() for n, t in tensors.items()}
-    return [
-        State(
-            host["positions"][i, :count],
-            host["velocities"][i, :count],
-            batch.times[i],
-            {name: host[name][i, :count] for name in batch.memory},
-        )
-        for i, count in enumerate(cells.node_counts)
-    ]
+    return [state_of(cells, batch, i) for i in range(len(cells.node_counts))]
+
+
+def state_of(cells: CellBatch, batch: BatchState, i: int) -> State:
+    """The state of one scene."""
+
+    def host(x: Tensor) -> Array:
+        rows: Array = x[i, : cells.node_counts[i]].detach().to("cpu", torch.float64).numpy().copy()
+        return rows
+
+    return State(
+        host(batch.positions),
+        host(batch.velocities),
+        batch.times[i],
+        {name: host(x) for name, x in batch.memory.items()},
+    )
+
+
+def with_states(cells: CellBatch, batch: BatchState, new: Mapping[int, State]) -> BatchState:
+    """The same states, but other ones in some scenes, all with the same memory."""
+
+    def nodal(x: Tensor, arrays: Mapping[int, Array]) -> Tensor:
+        out = x.clone()
+        for i, array in arrays.items():
+            out[i, : len(array)] = cells.tensor(array)
+        return out
+
+    return BatchState(
+        nodal(batch.positions, {i: s.positions for i, s in new.items()}),
+        nodal(batch.velocities, {i: s.velocities for i, s in new.items()}),
+        batch.times,
+        {
+            name: nodal(x, {i: s.memory[name] for i, s in new.items()})
+            for name, x in batch.memory.items()
+        },
+    )

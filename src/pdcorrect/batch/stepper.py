@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,23 +13,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.batch.checks import check_problems
+from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.checks import check_nodal, check_problems
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
+from pdcorrect.batch.material import NAMES, BatchMaterial, by_cell, changed, own_material
 from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import OneByOne
+from pdcorrect.batch.stage import BatchStage, BatchStaging
 from pdcorrect.batch.states import BatchResult, BatchState, apart, together
 from pdcorrect.batch.threads import one_thread
-from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
-from pdcorrect.scene.materials import lame
+from pdcorrect.solvers.implicit import positive, whole
 from pdcorrect.solvers.integrators import integrator as make_integrator
-from pdcorrect.solvers.linear import Linear
-from pdcorrect.solvers.schemes import Scheme
 from pdcorrect.state import State, Status
 
 Array = NDArray[np.float64]
@@ -56,12 +57,14 @@ class BatchStepper:
     ----------
     problems : sequence of Problem
     tolerance : float, optional
-        Of each scene's coarse cell size; the first scene's by default.
+        Of each scene's coarse cell size; each scene's own by default.
     first_hessian : {"auto", "G", "G-scaled", "two-level", "rest"}
         See `DenseInverse`; "auto" is "rest" for small meshes and "two-level" for others
         that are refined.
     max_iterations : int
-    time_step, integrator : optional
+    time_step : float, optional
+        s; the first scene's by default.
+    integrator : str, optional
         The first scene's by default.
     device : str
         "cpu", "cuda", "cuda:1", ...
@@ -73,12 +76,12 @@ class BatchStepper:
         Whether scenes that do not converge are tried again, one at a time, with
         `ProjectiveDynamics` and its fallbacks.
 
-    Attributes
-    ----------
-    material : tuple of (B, C) tensors
-        Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell, now.
+    Notes
+    -----
+    One thread at a time steps: others that call the same stepper wait.
     """
 
+    @torch.inference_mode(mode=False)
     def __init__(
         self,
         problems: Sequence[Problem],
@@ -97,37 +100,49 @@ class BatchStepper:
         check_problems(self.problems, time_step, integrator)
         first = self.problems[0]
         time = first.scene.time
-        self.tolerance = first.scene.solver.tolerance if tolerance is None else float(tolerance)
+        self.tolerances = tuple(
+            p.scene.solver.tolerance if tolerance is None else float(tolerance)
+            for p in self.problems
+        )
+        positive("tolerance", min(self.tolerances))
         self.time_step = first.time_step if time_step is None else float(time_step)
+        positive("time_step", self.time_step)
         self.integrator = time.integrator if integrator is None else integrator
         self.integrate = make_integrator(self.integrator, time.spectral_radius)
+        self.first_hessian = chosen(first_hessian, self.problems)
+        self._storage, self._recover = storage, recover
+        self._most = whole("max_iterations", max_iterations)
         self.cells = CellBatch(self.problems, torch.device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
         self.objective = BatchObjective(self.cells, self.problems)
-        self._own: tuple[Tensor, ...] = tuple(
-            self.cells.tensor(padded(values, (self.cells.sizes.cells,)))
-            for values in zip(
-                *(
-                    (p.materials.young, p.materials.poisson, p.materials.density)
-                    for p in self.problems
-                ),
-                strict=True,
-            )
-        )
-        self.material = self._own
-        self.first_hessian = chosen(first_hessian, self.problems)
-        self._storage, self._most, self._recover = storage, max_iterations, recover
+        self._own = self._material = own_material(self.cells, self.problems)
+        self._write(self._own)
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
-        self._clamped = self.cells.nodal([p.positions for p in self.problems])
+        self.staging = BatchStaging(self.cells, self.problems, self.integrate, self.time_step)
+        self._forget()
+
+    def _forget(self) -> None:
+        """Make what is not kept in copies of the stepper, or anew when it is first needed."""
+        self._lock = threading.RLock()
         self._minimiser: BatchMinimiser | None = None
         self._inverse: DenseInverse | None = None
         self._one_by_one = OneByOne(
-            self.cells,
-            self._problems_now,
-            self.tolerance,
-            self.time_step,
-            self.integrator,
+            self.cells, self._problem_now, self.tolerances, self.time_step, self.integrator
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        left = ("_lock", "_minimiser", "_inverse", "_one_by_one")
+        return {name: value for name, value in self.__dict__.items() if name not in left}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """For work on the stepper's tensors: by one Python thread, and never for autograd."""
+        with self._lock, torch.inference_mode(mode=False), torch.no_grad(), one_thread(self.device):
+            yield
 
     # --- states -------------------------------------------------------------------------
 
@@ -143,167 +158,147 @@ class BatchStepper:
         """The scenes' states one by one."""
         return apart(self.cells, batch)
 
-    def extended(self, nodal: Tensor) -> Tensor:
-        """(B, N, 3) as configurations (B, U, 3)."""
-        n = self.cells.sizes
-        if not n.modes:
-            return nodal
-        return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
-
     # --- material --------------------------------------------------------------------------
+
+    @property
+    def material(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell now, (B, C)."""
+        return self._material.values
 
     def set_material(
         self,
-        young: Tensor | None = None,
-        poisson: Tensor | None = None,
-        density: Tensor | None = None,
+        young: Tensor | float | None = None,
+        poisson: Tensor | float | None = None,
+        density: Tensor | float | None = None,
     ) -> None:
-        """Material values from now on, each (B, C) or what broadcasts to it.
+        """Material values from now on, each a number or a tensor that broadcasts to (B, C).
 
-        Those that are not given are the problems' own.  First Hessians stay those of the
+        Those that are not given are the problems' own.  A scene with values out of their
+        range fails (`NOT_FINITE`), and no other does.  First Hessians stay those of the
         problems: they are only preconditioners.
-        """
-        given = (young, poisson, density)
-        if all(m is None for m in given) and self.material is self._own:
-            return
-        values = tuple(
-            own if m is None else m.detach().expand(own.shape).clone()
-            for m, own in zip(given, self._own, strict=True)
-        )
-        mu, lam = lame(values[0], values[1])  # type: ignore[type-var]
-        published = self.problems[0].scene.material.volume_weight == "published"
-        self.cells.set_weights(mu, lam if published else 3.0 * lam)
-        self.objective.mass.set_density(values[2])
-        self.material = self._own if all(m is None for m in given) else values
 
-    def _problems_now(self, i: int) -> Problem:
+        Raises
+        ------
+        InputError
+            If a tensor has another type or device, or does not broadcast.
+        """
+        pairs = zip(NAMES, (young, poisson, density), strict=True)
+        with self.alone():
+            given = [by_cell(self.cells, name, value) for name, value in pairs]
+            self._apply(self._with(self._own, given))
+
+    def with_material(self, given: Sequence[Tensor | None]) -> BatchMaterial:
+        """The present material with other values, each (B, C) or None, for `using`."""
+        with self.alone():
+            return self._with(self._material, given)
+
+    @contextmanager
+    def using(self, material: BatchMaterial) -> Iterator[None]:
+        """Work alone and with a material; afterwards the present one is back."""
+        with self.alone():
+            before = self._material
+            self._apply(material)
+            try:
+                yield
+            finally:
+                self._apply(before)
+
+    @property
+    def present(self) -> BatchMaterial:
+        """The present material, for `using`."""
+        return self._material
+
+    def _with(self, base: BatchMaterial, given: Sequence[Tensor | None]) -> BatchMaterial:
+        if all(m is None for m in given):
+            return base
+        return changed(self.cells, self.problems[0].scene.material, base, given)
+
+    def _apply(self, material: BatchMaterial) -> None:
+        if material is not self._material:
+            self._write(material)
+            self._material = material
+
+    def _write(self, material: BatchMaterial) -> None:
+        self.cells.set_weights(material.mu, material.volume_weight)
+        self.objective.mass.set_density(material.density)
+
+    def _problem_now(self, i: int) -> Problem:
         """A scene with the material that it has now."""
         problem = self.problems[i]
-        if self.material is self._own:
+        if self._material is self._own:
             return problem
         count = len(problem.cells)
-        young, poisson, density = (
-            m[i, :count].to("cpu", torch.float64).numpy() for m in self.material
-        )
-        return problem.with_material(young, poisson, density)
+        values = (m[i, :count].to("cpu", torch.float64).numpy() for m in self.material)
+        return problem.with_material(*values)
 
     # --- a step ---------------------------------------------------------------------------
 
     def __call__(self, state: BatchState, forces: Tensor | None = None) -> BatchResult:
-        """Advance all scenes by one step, with extra nodal forces (B, N, 3), N."""
-        with one_thread(self.device):
+        """Advance all scenes by one step, with extra nodal forces (B, N, 3), N.
+
+        Raises
+        ------
+        InputError
+            If a tensor has another shape, type or device than the stepper's.
+        """
+        with self.alone():
             result = self._step(state, forces)
-        return self._one_by_one(state, forces, result) if self._recover else result
+            return self._one_by_one(state, forces, result) if self._recover else result
 
     def _step(self, state: BatchState, forces: Tensor | None) -> BatchResult:
-        scheme, known = self.prepare(state, forces)
+        stage = self.prepare(state, forces)
         minimiser = self._minimiser
         assert minimiser is not None
-        start = self._start(scheme, known)
-        alive = torch.isfinite(start).all(dim=2).all(dim=1)
+        start = self.staging.start(stage)
+        alive = torch.isfinite(start).all(dim=2).all(dim=1) & self._material.sound
         minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
         y = minimiser.y.clone()  # the next step overwrites it
-        phases = minimiser.phase.tolist()
+        after = self.staging.finish(stage, y, state)
+        ratios = self.cells.smallest_volume_ratios(after.positions).to("cpu", torch.float64).numpy()
+        statuses = [_STATUSES[Phase(p)] for p in minimiser.phase.tolist()]
         return BatchResult(
             y,
-            [_STATUSES[Phase(p)] for p in phases],
-            self._finish(scheme, known, y, state),
+            [
+                Status.INVERTED if s is Status.CONVERGED and ratio <= 0.0 else s
+                for s, ratio in zip(statuses, ratios, strict=True)
+            ],
+            after,
             minimiser.iterations.cpu().numpy(),
             minimiser.evaluations.cpu().numpy(),
-            minimiser.estimate.to("cpu", torch.float64).numpy() * scheme.gain,
+            minimiser.estimate.to("cpu", torch.float64).numpy() * stage.scheme.gain,
+            ratios,
         )
 
-    def prepare(
-        self, state: BatchState, forces: Tensor | None = None
-    ) -> tuple[Scheme, dict[str, Any]]:
+    def prepare(self, state: BatchState, forces: Tensor | None = None) -> BatchStage:
         """Set up the step's objective and first Hessian."""
-        h = self.time_step
-        scheme = self.integrate.scheme_of(h, bool(state.memory))
-        known = self._known(scheme, state)
-        free = self.objective.free[:, : self.cells.sizes.nodes] > 0.5
-
-        def split(on_free: Linear, on_clamped: Linear | None) -> Tensor:
-            values = on_free(known)
-            if on_clamped is not None:
-                values = torch.where(free, values, on_clamped(known))
-            return values
-
-        objective = self.objective
-        alpha = self.problems[0].scene.damping.mass
-        factors = (objective.inertia, objective.damping)
-        objective.inertia, objective.damping = scheme.inertia, scheme.rate * alpha
-        objective.target.copy_(self.extended(split(scheme.target, scheme.clamped_target)))
-        if objective.damping:
-            objective.origin.copy_(self.extended(split(scheme.origin, scheme.clamped_origin)))
-        total = self.loads(self.spans(scheme, state), scheme.loads_at(known))
+        check_nodal(self.cells, "positions", state.positions)
+        check_nodal(self.cells, "velocities", state.velocities)
         if forces is not None:
-            total = total + self.extended(forces.to(total))
-        objective.forces.copy_(total)
+            check_nodal(self.cells, "forces", forces)
+        stage, objective = self.staging(state), self.objective
+        scheme = stage.scheme
+        factors = (objective.inertia, objective.damping)
+        objective.inertia = scheme.inertia
+        objective.damping = scheme.rate * self.problems[0].scene.damping.mass
+        objective.target.copy_(stage.target)
+        if objective.damping:
+            objective.origin.copy_(stage.origin)
+        total = self.loads(stage.spans, scheme.loads_at(stage.known))
+        objective.forces.copy_(total if forces is None else total + self.staging.extended(forces))
         if self._minimiser is None or factors != (objective.inertia, objective.damping):
-            self._inverse = DenseInverse(
-                self.cells, self.problems, objective.factors, self.first_hessian, self._storage
-            )
-            sizes = [self.tolerance * p.cell_size / scheme.gain for p in self.problems]
-            tolerance = self.cells.tensor(np.array(sizes))
-            self._minimiser = BatchMinimiser(objective, self._inverse, tolerance, self._most)
-        return scheme, known
+            self._make_minimiser(scheme.gain)
+        return stage
 
-    def spans(self, scheme: Scheme, state: BatchState) -> list[tuple[float, float]]:
-        """Time intervals over which each scene's loads act in a step, s."""
-        first, last = scheme.loads_over
-        return [(t + first * self.time_step, t + last * self.time_step) for t in state.times]
-
-    def _known(self, scheme: Scheme, state: BatchState) -> dict[str, Any]:
-        h = self.time_step
-        known: dict[str, Any] = {
-            "positions": state.positions,
-            "velocities": state.velocities,
-            "prescribed": self._prescribed([t + h for t in state.times]),
-            "time": torch.zeros_like(state.positions)
-            + by_scene(state.positions.new_tensor(state.times)),
-            **state.memory,
-            "clamp_velocity": 0.0,
-            "clamp_velocity_at_y": 0.0,
-            "clamp_jump": 0.0,
-        }
-        if "accelerations" in scheme.memory and "accelerations" not in known:
-            raise InputError(
-                "generalised-alpha in a batch starts from states with accelerations: expected "
-                "memory. Take the first step of each scene with ProjectiveDynamics."
-            )
-        return known
-
-    def _prescribed(self, times: Sequence[float]) -> Tensor:
-        if not any(p.clamps.moving for p in self.problems):
-            return self._clamped[:, : self.cells.sizes.nodes]
-        pairs = zip(self.problems, times, strict=True)
-        held = self.cells.nodal([p.clamped_positions(t) for p, t in pairs])
-        return held[:, : self.cells.sizes.nodes]
-
-    def _start(self, scheme: Scheme, known: Mapping[str, Any]) -> Tensor:
-        nodes = self.cells.sizes.nodes
-        free = self.objective.free[:, :nodes] > 0.5
-        return self.extended(torch.where(free, scheme.start(known), scheme.clamped(known)))
-
-    def _finish(
-        self, scheme: Scheme, known: dict[str, Any], y: Tensor, state: BatchState
-    ) -> BatchState:
-        nodes = self.cells.sizes.nodes
-        free = self.objective.free[:, :nodes] > 0.5
-        known = {**known, "y": y[:, :nodes]}
-
-        def split(on_free: Linear, on_clamped: Linear | None) -> Tensor:
-            values = on_free(known)
-            if isinstance(values, float):
-                values = torch.zeros_like(state.positions)
-            if on_clamped is not None:
-                values = torch.where(free, values, on_clamped(known))
-            return values
-
-        memory = {name: split(*rows) for name, rows in scheme.memory.items()}
-        velocities = split(scheme.velocities, scheme.clamped_velocities)
-        times = tuple(t + self.time_step for t in state.times)
-        return BatchState(split(scheme.positions, None), velocities, times, memory)
+    def _make_minimiser(self, gain: float) -> None:
+        self._minimiser = self._inverse = None  # whose memory is needed
+        self._inverse = DenseInverse(
+            self.cells, self.problems, self.objective.factors, self.first_hessian, self._storage
+        )
+        pairs = zip(self.tolerances, self.problems, strict=True)
+        sizes = np.array([tolerance * p.cell_size / gain for tolerance, p in pairs])
+        self._minimiser = BatchMinimiser(
+            self.objective, self._inverse, self.cells.tensor(sizes), self._most
+        )
 
     def solve_adjoint(
         self, y: Tensor, b: Tensor, which: Tensor, tolerance: float

@@ -2,10 +2,34 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+
+
+class _Restored:
+    """The number to go back to, shared by all Python threads that are on one torch thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside, self._number = 0, 1
+
+    def enter(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._number = torch.get_num_threads()
+            self._inside += 1
+            torch.set_num_threads(1)
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            torch.set_num_threads(self._number)
+
+
+_restored = _Restored()
 
 
 @contextmanager
@@ -19,9 +43,8 @@ def one_thread(device: torch.device) -> Iterator[None]:
     if device.type != "cpu":
         yield
         return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    _restored.enter()
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        _restored.leave()

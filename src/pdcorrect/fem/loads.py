@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.fields import cofactor, tensor_cross, torsion_field, torsion_pull
 from pdcorrect.fem.operators import Space, scatter
+from pdcorrect.fem.quadrature import FaceQuadrature
 from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import (
     BodyForce,
@@ -196,67 +197,100 @@ def _traction(load: Traction, space: Space, selector: Selector, mass: Array, key
     return _fixed(scatter(space.cells[face.cells], values, len(space.positions)))
 
 
-def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+@dataclass(frozen=True, eq=False)
+class _Pressure:
     """Nanson's formula: n da = cof(F) N dA."""
-    face = space.face_quadrature(selector.faces(load.region, key))
-    nodes = space.cells[face.cells]
 
-    def sample(positions: Array) -> Array:
-        F = np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
+    pressure: float
+    face: FaceQuadrature
+    nodes: NDArray[np.int64]
+
+    def sample(self, positions: Array) -> Array:
+        face = self.face
+        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
         area = np.einsum("nqij,nqj->nqi", cofactor(F), face.normals)
-        values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -load.pressure * area)
-        return scatter(nodes, values, len(positions))
+        values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -self.pressure * area)
+        return scatter(self.nodes, values, len(positions))
 
-    def pull(positions: Array, x: Array) -> Array:
-        F = np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
-        at_points = -load.pressure * np.einsum(
-            "nq,nqk,nki->nqi", face.weights, face.values, x[nodes]
+    def pull(self, positions: Array, x: Array) -> Array:
+        face = self.face
+        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
+        at_points = -self.pressure * np.einsum(
+            "nq,nqk,nki->nqi", face.weights, face.values, x[self.nodes]
         )
         slope = tensor_cross(F, at_points[..., :, None] * face.normals[..., None, :])
         values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
-        return scatter(nodes, values, len(positions))
+        return scatter(self.nodes, values, len(positions))
 
-    return sample, pull
+
+def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    face = space.face_quadrature(selector.faces(load.region, key))
+    field = _Pressure(load.pressure, face, space.cells[face.cells])
+    return field.sample, field.pull
+
+
+@dataclass(frozen=True, eq=False)
+class _TorsionField:
+    """The field at points, N/m3 or N."""
+
+    load: Torsion
+    centre: Array
+
+    def __call__(self, points: Array) -> Array:
+        about, load = points - self.centre, self.load
+        return load.strength * torsion_field(about, load.attraction, load.stretch)
+
+    def pull(self, points: Array, x: Array) -> Array:
+        about, load = points - self.centre, self.load
+        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
+
+
+@dataclass(frozen=True, eq=False)
+class _NodalTorsion:
+    """The field at some nodes."""
+
+    field: _TorsionField
+    nodes: NDArray[np.int64]
+
+    def sample(self, positions: Array) -> Array:
+        out = np.zeros_like(positions)
+        out[self.nodes] = self.field(positions[self.nodes])
+        return out
+
+    def pull(self, positions: Array, x: Array) -> Array:
+        out = np.zeros_like(positions)
+        out[self.nodes] = self.field.pull(positions[self.nodes], x[self.nodes])
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _CellTorsion:
+    """The field integrated over cells, ``inside`` (C, 1, 1) being 1 there."""
+
+    field: _TorsionField
+    space: Space
+    inside: Array
+
+    def sample(self, positions: Array) -> Array:
+        return self.space.body_load(self.field(self.space.interpolate(positions)) * self.inside)
+
+    def pull(self, positions: Array, x: Array) -> Array:
+        space = self.space
+        forces = space.body_load_transposed(x) * self.inside
+        return space.interpolate_transposed(self.field.pull(space.interpolate(positions), forces))
 
 
 def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
     rest = space.positions
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    centre = middle if load.centre is None else np.array(load.centre)
-
-    def field(points: Array) -> Array:
-        return load.strength * torsion_field(points - centre, load.attraction, load.stretch)
-
-    def slope(points: Array, x: Array) -> Array:
-        about = points - centre
-        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
-
+    field = _TorsionField(load, middle if load.centre is None else np.array(load.centre))
     if load.distribution == "nodal":
-        nodes = selector.coarse_nodes(load.region, key)
-
-        def sample(positions: Array) -> Array:
-            out = np.zeros_like(positions)
-            out[nodes] = field(positions[nodes])
-            return out
-
-        def pull(positions: Array, x: Array) -> Array:
-            out = np.zeros_like(positions)
-            out[nodes] = slope(positions[nodes], x[nodes])
-            return out
-
-        return sample, pull
-
+        nodal = _NodalTorsion(field, selector.coarse_nodes(load.region, key))
+        return nodal.sample, nodal.pull
     inside = np.zeros((len(space.cells), 1, 1))
     inside[selector.cells(load.region, key)] = 1.0
-
-    def sample_cells(positions: Array) -> Array:
-        return space.body_load(field(space.interpolate(positions)) * inside)
-
-    def pull_cells(positions: Array, x: Array) -> Array:
-        forces = space.body_load_transposed(x) * inside
-        return space.interpolate_transposed(slope(space.interpolate(positions), forces))
-
-    return sample_cells, pull_cells
+    spread = _CellTorsion(field, space, inside)
+    return spread.sample, spread.pull
 
 
 _SAMPLERS: dict[type, Callable[..., Sampler]] = {

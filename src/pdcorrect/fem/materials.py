@@ -15,8 +15,6 @@ from pdcorrect.scene.materials import lame
 
 Array = NDArray[np.float64]
 
-_NO_VOLUME = ("corotated-only", "arap")
-
 
 @dataclass(frozen=True, eq=False)
 class Materials:
@@ -52,8 +50,8 @@ class Materials:
         return cls(
             young=young,
             poisson=poisson,
-            mu=np.zeros_like(mu) if rule.energy == "volume-only" else mu,
-            volume_weight=np.zeros_like(lam) if rule.energy in _NO_VOLUME else omega,
+            mu=mu if rule.has_shear_term else np.zeros_like(mu),
+            volume_weight=omega if rule.has_volume_term else np.zeros_like(lam),
             density=density,
             model=energy_code(rule.energy),
         )

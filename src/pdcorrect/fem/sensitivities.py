@@ -19,7 +19,8 @@ from pdcorrect.fem.internal_modes import Condensed
 Array = NDArray[np.float64]
 
 _STEP = 1e-4
-"""Of a deformation gradient's entry, for differences of fourth order of tangents."""
+"""Of a deformation gradient's entry, and of Young's modulus for weights, which may be zero:
+for differences of fourth order of tangents."""
 
 
 def weight_slopes(body: ElasticBody, configuration: Array, x: Array) -> tuple[Array, Array]:
@@ -58,11 +59,12 @@ def tangent_slopes(
     )
     F = F + np.eye(3)
     energy = model_name(body.materials.model)
-    shear = body.materials.mu[:, None] * body.quadrature.weights
-    volume = body.materials.volume_weight[:, None] * body.quadrature.volume_weights
+    mu, omega = body.materials.mu, body.materials.volume_weight
 
-    def contracted(F: Array, scales: tuple[float, float] = (1.0, 1.0)) -> Array:
-        C = elasticity(F, scales[0] * shear, scales[1] * volume, project=True, energy=energy)
+    def contracted(F: Array, mu: Array = mu, omega: Array = omega) -> Array:
+        shear = mu[:, None] * body.quadrature.weights
+        volume = omega[:, None] * body.quadrature.volume_weights
+        C = elasticity(F, shear, volume, project=True, energy=energy)
         return np.einsum("cqij,cqijkl,cqkl->cq", along, C, across, optimize=True)
 
     slope = np.empty_like(F)
@@ -71,26 +73,18 @@ def tangent_slopes(
             step = np.zeros((3, 3))
             step[i, j] = _STEP
             slope[..., i, j] = _difference(lambda t, e=step: contracted(F + t * e)) / _STEP
-    by_mu = _difference(lambda t: contracted(F, (1.0 + _STEP * t, 1.0))).sum(axis=1)
-    by_omega = _difference(lambda t: contracted(F, (1.0, 1.0 + _STEP * t))).sum(axis=1)
+    change = _STEP * body.materials.young
+    by_mu = _difference(lambda t: contracted(F, mu + t * change, omega)).sum(axis=1) / change
+    by_omega = _difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
     by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
     flat = cells.ravel()
     by_shape = [np.bincount(flat, by_cell[..., i].ravel(), minlength=len(x)) for i in range(3)]
-    materials = body.materials
-    return (
-        np.stack(by_shape, axis=1),
-        _quotient(by_mu, _STEP * materials.mu),
-        _quotient(by_omega, _STEP * materials.volume_weight),
-    )
+    return np.stack(by_shape, axis=1), by_mu, by_omega
 
 
 def _difference(function) -> Array:  # type: ignore[no-untyped-def]
     """Derivative at 0 of a function of t by central differences of fourth order, t = 1, 2."""
     return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
-
-
-def _quotient(a: Array, b: Array) -> Array:
-    return np.divide(a, b, out=np.zeros_like(a), where=b > 0.0)
 
 
 class Following:

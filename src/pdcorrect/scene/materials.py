@@ -64,6 +64,16 @@ class Material(Strict):
     density: Positive
 
     @property
+    def has_shear_term(self) -> bool:
+        """Whether the energy has a term that mu weighs."""
+        return self.energy != "volume-only"
+
+    @property
+    def has_volume_term(self) -> bool:
+        """Whether the energy has a term that lambda weighs."""
+        return self.energy not in ("corotated-only", "arap")
+
+    @property
     def mu(self) -> float:
         """Shear modulus, Pa."""
         return lame(self.young, self.poisson)[0]
@@ -80,8 +90,8 @@ class Material(Strict):
         For small strain ``|F - V|^2 = tr(eps)^2 / 3``, so the volume term acts
         as a first Lame parameter ``omega / 3``.
         """
-        mu = 0.0 if self.energy == "volume-only" else self.mu
-        lam = 0.0 if self.energy in ("corotated-only", "arap") else self.lam
+        mu = self.mu if self.has_shear_term else 0.0
+        lam = self.lam if self.has_volume_term else 0.0
         lam = lam if self.volume_weight == "lame" else lam / 3
         total = lam + mu
         if total == 0:

@@ -27,6 +27,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
+    AdjointSolution,
     AdjointSolver,
     check_solver,
     solve_adjoint,
@@ -39,9 +40,10 @@ from pdcorrect.solvers.adjoint_terms import (
     gravity_slope,
     mass_slope,
 )
-from pdcorrect.solvers.implicit import ImplicitStepper, quiet_blas
+from pdcorrect.solvers.implicit import ImplicitStepper, positive, quiet_blas
+from pdcorrect.solvers.integrators import Integrator
 from pdcorrect.solvers.linear import Linear
-from pdcorrect.solvers.step import StepObjective
+from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
 from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
@@ -53,18 +55,40 @@ _STEP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One step that was taken, and how to solve for its adjoint."""
+    """One step that was taken, and how to solve for its adjoint.
+
+    ``state`` is as the step used it, ``remembered`` the names in the memory it was given;
+    ``integrate`` keeps to the step's scheme.
+    """
 
     stepper: ImplicitStepper
     state: State
+    remembered: tuple[str, ...]
     forces: Array | None
     time_step: float
+    integrate: Integrator
     solver: AdjointSolver
     tolerance: float
 
-    def objective(self, time_step: float | None = None) -> StepObjective:
-        h = self.time_step if time_step is None else time_step
-        return self.stepper.objective(self.state, self.forces, h)
+    def objective(self, time_step: float) -> StepObjective:
+        return self.stepper.objective(self.state, self.forces, time_step, self.integrate)
+
+    def global_solver(self, objective: StepObjective) -> GlobalSolver:
+        """G^-1 for the thesis's G, whatever the stepper's first Hessian is."""
+        return self.stepper.global_solver(objective.factors, volume_scale=1.0)
+
+    def solve(
+        self, H: HessianOperator, y: Array, g: Array, solver: AdjointSolver, tolerance: float
+    ) -> AdjointSolution:
+        """X with H x = g for the Hessian H at y."""
+        return solve_adjoint(
+            H,
+            g,
+            solver,
+            lambda: self.stepper.preconditioner(H.objective, y),
+            lambda: self.global_solver(H.objective),
+            tolerance,
+        )
 
 
 class Gradients:
@@ -86,8 +110,8 @@ class Gradients:
     def __init__(self, step: _Step, after: Mapping[str, Array], y: Array) -> None:
         self._step, self._after, self._y = step, after, y
         self._problem = step.stepper.problem
-        self._objective = step.objective()
-        self._scheme = step.stepper.integrate.scheme(step.state, step.time_step)
+        self._objective = step.objective(step.time_step)
+        self._scheme = step.integrate.scheme(step.state, step.time_step)
         self._sums: dict[str, Array] = {}
         self._pull(self._scheme.positions, None, after["positions"])
         self._pull(self._scheme.velocities, self._scheme.clamped_velocities, after["velocities"])
@@ -96,14 +120,8 @@ class Gradients:
                 self._pull(*rows, after[name])
         by_y = self._sums.pop("y")
         self._H = self._objective.hessian_operator(y)
-        found = solve_adjoint(
-            self._H,
-            self._problem.extended(by_y) * self._objective.free,
-            step.solver,
-            lambda: step.stepper.preconditioner(self._objective, y),
-            lambda: step.stepper.global_solver(self._objective.factors),
-            step.tolerance,
-        )
+        g = self._problem.extended(by_y) * self._objective.free
+        found = step.solve(self._H, y, g, step.solver, step.tolerance)
         self.x, self.solver, self.iterations = found.x, found.solver, found.iterations
         self.residual = found.residual
         self._nodal = self.x[: len(by_y)]
@@ -154,14 +172,20 @@ class Gradients:
 
     @property
     def memory(self) -> dict[str, Array]:
-        """By the entries of `State.memory` at the start of the step, each (N, 3)."""
-        return {name: self._sum(name) for name in self._step.state.memory}
+        """By the entries of `State.memory` at the start of the step, each (N, 3).
+
+        Zero where the step was not the stepper's own, for it went without them.
+        """
+        return {name: self._sum(name) for name in self._step.remembered}
 
     @cached_property
     def time_step(self) -> float:
         """By the time step, 1/s, everything that is given as a function of time included.
 
-        By differences of fourth order of the step's equation at fixed y.
+        Everything at the start of the step is held, its time and memory too, and so is the
+        scheme: for BDF2 the step before gets longer with this one.  With loads and clamps
+        that do not change in time the sum over all steps is the derivative by the length
+        that they share.  By differences of fourth order of the step's equation at fixed y.
         """
         h, e = self._step.time_step, _STEP * self._step.time_step
         f = self._lagrangian
@@ -209,8 +233,7 @@ class Gradients:
     @cached_property
     def spectral_radius(self) -> float:
         """Of G^-1 (G - H), the convergence factor of the thesis's fixed point (eq. 3-30)."""
-        solve = self._step.stepper.global_solver(self._objective.factors, 1.0)
-        return spectral_radius(self._H, solve)
+        return spectral_radius(self._H, self._step.global_solver(self._objective))
 
     def estimated_errors(self) -> dict[str, float]:
         """How much the gradients change in one Newton step from y, relative.
@@ -219,15 +242,7 @@ class Gradients:
         exactly; first order in what it left.
         """
         _, gradient = self._objective.value_and_gradient(self._y)
-        stepper = self._step.stepper
-        found = solve_adjoint(
-            self._H,
-            gradient,
-            "auto",
-            lambda: stepper.preconditioner(self._objective, self._y),
-            lambda: stepper.global_solver(self._objective.factors),
-            1e-6,
-        )
+        found = self._step.solve(self._H, self._y, gradient, "auto", 1e-6)
         better = Gradients(self._step, self._after, self._y - found.x)
         out = {}
         for name in ("positions", "velocities", "forces", "young", "poisson", "density"):
@@ -272,10 +287,10 @@ class Gradients:
         problem = self._problem
         parts = [weight_slopes(problem, self._y, -self.x)]
         parts += [term.weights for term in (self._damping, self._first) if term is not None]
-        weights = problem.materials.mu, problem.materials.volume_weight
+        rule = problem.scene.material
         by_mu = np.sum([part[0] for part in parts], axis=0)
         by_omega = np.sum([part[1] for part in parts], axis=0)
-        return by_mu * (weights[0] > 0.0), by_omega * (weights[1] > 0.0)
+        return by_mu * rule.has_shear_term, by_omega * rule.has_volume_term
 
     @property
     def _moduli_slopes(self) -> tuple[tuple[Array, Array], ...]:
@@ -322,7 +337,7 @@ def adjoint(
     grad_positions, grad_velocities : (N, 3), optional
         Derivatives of the loss by the positions (1/m) and velocities (s/m) after the step.
     grad_memory : mapping of str to (N, 3), optional
-        And by the entries of its memory.
+        And by entries of its memory, by name.
     forces : (N, 3), optional
         The extra nodal forces that the step was given, N.
     time_step : float, optional
@@ -343,26 +358,59 @@ def adjoint(
     Raises
     ------
     InputError
-        If shapes are wrong, or the step failed or was taken in parts.
+        If shapes or names are wrong, the step failed or was taken in parts, or the result
+        is not that of a step from ``state`` with these forces and this time step.
     ConvergenceError
         If the linear system cannot be solved.
     """
     check_solver(solver)
-    if not result.status.ok:
-        raise InputError(f"the step {result.status.value}: expected one that has a result.")
-    if result.status is Status.SUBSTEPPED:
+    _check_types(stepper, state, result)
+    positive("tolerance", tolerance)
+    _check_status(result.status)
+    grad_memory = grad_memory or {}
+    _check_names(grad_memory, result.state)
+    after = {"positions": grad_positions, "velocities": grad_velocities, **grad_memory}
+    shape = state.positions.shape
+    checked = {name: _gradient(f"grad_{name}", g, shape) for name, g in after.items()}
+    remembered = tuple(state.memory)
+    state, h = stepper.accepted(state, forces, time_step)
+    integrate = stepper.integrate.held(state, h)
+    step = _Step(stepper, state, remembered, forces, h, integrate, solver, tolerance)
+    with quiet_blas():
+        y = step_solution(step.objective(h), integrate, h, result)
+        return Gradients(step, checked, y)
+
+
+def _check_types(stepper: object, state: object, result: object) -> None:
+    if not isinstance(stepper, ImplicitStepper):
+        kind = type(stepper).__name__
+        raise InputError(f"stepper is a {kind}: expected ProjectiveDynamics or Newton.")
+    if not isinstance(state, State):
+        raise InputError(f"state is a {type(state).__name__}: expected the step's State.")
+    if not isinstance(result, StepResult):
+        raise InputError(
+            f"result is a {type(result).__name__}: expected the StepResult that the stepper "
+            "returned. A rollout keeps none: take the steps one by one, result = stepper(state)."
+        )
+
+
+def _check_status(status: Status) -> None:
+    if not status.ok:
+        raise InputError(f"the step {status.value}: expected one that has a result.")
+    if status is Status.SUBSTEPPED:
         raise InputError(
             "the step converged only in smaller parts, which are steps of their own: expected a "
             "step in one. Take smaller time steps, and the adjoint of each."
         )
-    after = {"positions": grad_positions, "velocities": grad_velocities, **(grad_memory or {})}
-    shape = state.positions.shape
-    checked = {name: _gradient(f"grad_{name}", g, shape) for name, g in after.items()}
-    h = stepper.time_step if time_step is None else float(time_step)
-    step = _Step(stepper, state, forces, h, solver, tolerance)
-    with quiet_blas():
-        y = step_solution(step.objective(), step.stepper.integrate, step.time_step, result)
-        return Gradients(step, checked, y)
+
+
+def _check_names(grad_memory: Mapping[str, Array], after: State) -> None:
+    unknown = [name for name in grad_memory if name not in after.memory]
+    if unknown:
+        raise InputError(
+            f"grad_memory has {', '.join(unknown)}: expected names in the memory of the state "
+            f"after the step ({', '.join(after.memory) or 'it has none'})."
+        )
 
 
 def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:

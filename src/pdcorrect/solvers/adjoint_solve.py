@@ -29,6 +29,8 @@ AdjointSolver = Literal["auto", "cg", "direct", "fixed-point"]
 
 _CG_STEPS = 300
 _FIXED_POINT_STEPS = 20000
+_DIRECT_STEPS = 4
+"""The first solution and refinements: LU pivots little."""
 _HOPELESS = 1e3
 """Growth of the fixed point's change at which it is given up."""
 
@@ -83,41 +85,40 @@ def solve_adjoint(
     Raises
     ------
     ConvergenceError
-        If the method asked for does not converge, or H is singular.
+        If the method asked for does not reach the tolerance, as where H is singular.
     """
     if not g.any():
         return AdjointSolution(np.zeros_like(g), "none needed", 0, 0.0)
     if solver == "fixed-point":
-        return _checked(H, g, *_fixed_point(H, g, global_solver(), tolerance), solver)
+        return _fixed_point(H, g, global_solver(), tolerance)
     if solver != "direct":
         found = conjugate_gradients(
             H, g, precondition(), tolerance=0.1, max_steps=_CG_STEPS, residual_share=tolerance
         )
         if found.converged:
-            return _checked(H, g, found.x, found.steps, "cg")
+            return AdjointSolution(found.x, "cg", found.steps, _residual(H, g, found.x)[1])
         if solver == "cg":
             why = "did not converge" if found.convex else "met negative curvature"
             raise ConvergenceError(
                 f"adjoint by conjugate gradients: {why} in {found.steps} steps, expected a state "
                 "that a step converged to. Use solver='direct'."
             )
-    return _checked(H, g, _direct(H, g), 1, "direct")
+    return _direct(H, g, tolerance)
 
 
-def _checked(H: HessianOperator, g: Array, x: Array, steps: int, solver: str) -> AdjointSolution:
-    residual = float(np.linalg.norm(g - H(x)) / np.linalg.norm(g))
-    return AdjointSolution(x, solver, steps, residual)
+def _residual(H: HessianOperator, g: Array, x: Array) -> tuple[Array, float]:
+    """G - H x, and its size relative to g's."""
+    r = g - H(x)
+    return r, float(np.linalg.norm(r) / np.linalg.norm(g))
 
 
-def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -> tuple[Array, int]:
-    x = np.zeros_like(g)
-    r, size = g, float(np.linalg.norm(g))
+def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -> AdjointSolution:
+    x, r = np.zeros_like(g), g
     for step in range(1, _FIXED_POINT_STEPS + 1):
         x = x + solve(r)
-        r = g - H(x)
-        left = float(np.linalg.norm(r)) / size
+        r, left = _residual(H, g, x)
         if left <= tolerance:
-            return x, step
+            return AdjointSolution(x, "fixed-point", step, left)
         if not left < _HOPELESS:
             break
     raise ConvergenceError(
@@ -126,8 +127,8 @@ def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -
     )
 
 
-def _direct(H: HessianOperator, g: Array) -> Array:
-    """By a sparse LU factorisation of H, which may be indefinite."""
+def _direct(H: HessianOperator, g: Array, tolerance: float) -> AdjointSolution:
+    """By a sparse LU factorisation of H, which may be indefinite, and refinements of its x."""
     matrix, free = assembled(H.objective, H)
     try:
         factor = spla.splu(matrix.tocsc())
@@ -136,11 +137,18 @@ def _direct(H: HessianOperator, g: Array) -> Array:
             f"adjoint: the Hessian at this state is singular ({error}); the step has no "
             "derivative there."
         ) from None
-    out = np.zeros(g.size)
-    out[free] = factor.solve(g.ravel()[free])
-    r = (g - H(out.reshape(g.shape))).ravel()[free]  # one refinement: LU pivots little
-    out[free] += factor.solve(r)
-    return out.reshape(g.shape)
+    flat, r = np.zeros(g.size), g
+    x = flat.reshape(g.shape)
+    for step in range(1, _DIRECT_STEPS + 1):
+        flat[free] += factor.solve(r.ravel()[free])
+        r, left = _residual(H, g, x)
+        if left <= tolerance:
+            return AdjointSolution(x, "direct", step, left)
+    raise ConvergenceError(
+        f"adjoint by factors of the Hessian: relative residual {left:.1e} after {step} "
+        f"solutions, expected {tolerance:g} or less. If it is large, the Hessian at this state is "
+        "singular and the step has no derivative there; if it is small, use a larger tolerance."
+    )
 
 
 def assembled(

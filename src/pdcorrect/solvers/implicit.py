@@ -62,9 +62,9 @@ class ImplicitStepper:
     Parameters
     ----------
     problem : Problem
-    tolerance : float
+    tolerance : float or None
         Largest accepted estimate of a node's distance from the step's exact
-        solution, as a fraction of the coarse cell size.
+        solution, as a fraction of the coarse cell size; None for the scene's.
     time_step : float, optional
         s; the scene's by default.
     integrator : str, optional
@@ -80,18 +80,22 @@ class ImplicitStepper:
     def __init__(
         self,
         problem: Problem,
-        tolerance: float,
+        tolerance: float | None,
         time_step: float | None = None,
         integrator: str | None = None,
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
+        if not isinstance(problem, Problem):
+            raise InputError(
+                f"problem is a {type(problem).__name__}: expected pc.discretise(scene)."
+            )
         self.problem = problem
         self.time_step = problem.time_step if time_step is None else float(time_step)
         check_backend(backend)
-        _positive("tolerance", tolerance)
-        _positive("time_step", self.time_step)
-        self.tolerance = float(tolerance)
+        self.tolerance = float(problem.scene.solver.tolerance if tolerance is None else tolerance)
+        positive("tolerance", self.tolerance)
+        positive("time_step", self.time_step)
         time = problem.scene.time
         self.integrator = time.integrator if integrator is None else integrator
         self.integrate = make_integrator(self.integrator, time.spectral_radius)
@@ -119,13 +123,27 @@ class ImplicitStepper:
         InputError
             If shapes are wrong or a number is not finite.
         """
-        check_input(self.problem, state, forces)
-        h = self.time_step if time_step is None else float(time_step)
-        _positive("time_step", h)
-        if h != self.time_step:  # several-step integrators need equal steps
-            state = replace(state, memory={})
+        state, h = self.accepted(state, forces, time_step)
         with quiet_blas():
             return self._step(state, forces, h)
+
+    def accepted(
+        self, state: State, forces: Array | None, time_step: float | None
+    ) -> tuple[State, float]:
+        """The state and the time step (s) that a call with these arguments goes on with.
+
+        The state is without its memory where the step is not the stepper's own, since
+        several-step integrators need equal steps.
+
+        Raises
+        ------
+        InputError
+            As by the call itself.
+        """
+        check_input(self.problem, state, forces)
+        h = self.time_step if time_step is None else float(time_step)
+        positive("time_step", h)
+        return (state if h == self.time_step else replace(state, memory={})), h
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         effort = _Effort()
@@ -338,6 +356,7 @@ def whole(name: str, value: int) -> int:
     return int(value)
 
 
-def _positive(name: str, value: float) -> None:
+def positive(name: str, value: float) -> None:
+    """Refuse a number that is not positive."""
     if not 0 < value < _LARGEST:
         raise InputError(f"{name} = {value!r}: expected a number between 0 and {_LARGEST:g}.")

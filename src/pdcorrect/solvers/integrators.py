@@ -17,7 +17,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
-from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.linear import Linear, by_component
 from pdcorrect.solvers.schemes import Scheme, SchemeOf
 from pdcorrect.state import State
 
@@ -73,11 +73,15 @@ class Integrator:
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        before = state.memory.get("previous_times")
-        started = bool(state.memory)
-        if before is not None:  # it needs equal steps
-            started = abs(state.time - before[0, 0] - h) <= _EQUAL_STEPS * h
-        return self.scheme_of(h, started)
+        return self.scheme_of(h, _started(state, h))
+
+    def held(self, state: State, h: float) -> Integrator:
+        """The same integrator with the scheme of that step, whatever the length of its own step.
+
+        As if the steps before ``state`` had the same length.
+        """
+        started = _started(state, h)
+        return Integrator(lambda length, _: self.scheme_of(length, started))
 
     def known(
         self, problem: Problem, state: State, h: float, forces: Array | None
@@ -111,9 +115,7 @@ class Integrator:
         known = self.known(problem, state, h, forces)
 
         def split(on_free: Linear, on_clamped: Linear | None) -> Array:
-            if on_clamped is None:
-                return _full(on_free(known), free)
-            return np.where(free, on_free(known), on_clamped(known))
+            return np.asarray(by_component(np, free, known, on_free, on_clamped))
 
         def finish(y: Array) -> State:
             known["y"] = y
@@ -137,13 +139,27 @@ class Integrator:
 
 def solution(scheme: Scheme, before: State, after: State, problem: Problem) -> Array:
     """The y (N + B, 3) of a step between two states, with internal modes in equilibrium."""
+    return problem.relaxed(nodal_solution(scheme, before.positions, after.positions))
+
+
+def nodal_solution(scheme: Scheme, before: Any, after: Any) -> Any:
+    """The nodes' part of y for positions before and after a step, arrays or tensors."""
     row = scheme.positions.coefficients
     rest = Linear(**{name: c for name, c in row.items() if name != "y"})
-    return problem.relaxed((after.positions - rest({"positions": before.positions})) / row["y"])
+    return (after - rest({"positions": before})) / row["y"]
 
 
-def _full(values: Any, like: NDArray[np.bool_]) -> Array:
-    return np.zeros(like.shape) if isinstance(values, float) else np.asarray(values)
+def _started(state: State, h: float) -> bool:
+    """Whether a state has the memory for a step of h seconds."""
+    before = state.memory.get("previous_times")
+    if before is None:
+        return bool(state.memory)
+    return equal_steps(state.time - before[0, 0], h)
+
+
+def equal_steps(a: float, b: float) -> bool:
+    """Whether two lengths of time, s, count as equal."""
+    return bool(abs(a - b) <= _EQUAL_STEPS * b)
 
 
 backward_euler = Integrator(schemes.backward_euler)

@@ -65,3 +65,19 @@ class Linear:
 
     def __truediv__(self, divisor: float) -> Linear:
         return self * (1.0 / divisor)
+
+
+def by_component(
+    library: Any, free: Any, known: Mapping[str, Any], on_free: Linear, on_clamped: Linear | None
+) -> Any:
+    """One sum on free components and, if there is another, that one on clamped components.
+
+    ``library`` is numpy or torch, whichever ``free`` (bool) and ``known``, with an entry
+    "positions", belong to.
+    """
+    values = on_free(known)
+    if isinstance(values, float):
+        values = library.zeros_like(known["positions"])
+    if on_clamped is None:
+        return values
+    return library.where(free, values, on_clamped(known))

@@ -80,9 +80,8 @@ class ProjectiveDynamics(ImplicitStepper):
         backend: Backend = "auto",
         recover: bool = True,
     ) -> None:
-        _check_method(problem, method, first_hessian)
-        tolerance = problem.scene.solver.tolerance if tolerance is None else tolerance
         super().__init__(problem, tolerance, time_step, integrator, backend, recover)
+        _check_method(problem, method, first_hessian)
         self.method = method
         self.name = f"projective dynamics ({method})"
         plain = method == "local-global"

@@ -288,12 +288,17 @@ class GlobalSolver:
 
 
 def check_input(problem: Problem, state: State, forces: Array | None) -> None:
-    """Refuse states and forces of the wrong shape or with NaN, naming the node.
+    """Refuse what is no state, and states and forces of the wrong shape or with NaN.
 
     Raises
     ------
     InputError
+        That names the node.
     """
+    if not isinstance(state, State):
+        raise InputError(
+            f"state is a {type(state).__name__}: expected State(positions, velocities)."
+        )
     named = {"positions": state.positions, "velocities": state.velocities}
     if forces is not None:
         named["forces"] = np.asarray(forces, dtype=np.float64)

@@ -5,16 +5,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.internal_modes import Condensed
-from pdcorrect.solvers.integrators import Integrator, solution
+from pdcorrect.solvers.integrators import Integrator, equal_steps, solution
 from pdcorrect.solvers.step import StepObjective
-from pdcorrect.state import StepResult
+from pdcorrect.state import State, StepResult
 
 Array = NDArray[np.float64]
 
 _MODE_STEPS, _SETTLED = 100, 1e-13
 """Newton steps to find internal modes, and the last one's length, of the cell size."""
+_BALANCE = 10.0
+"""Of the residual that a step reports.  Its internal modes need not be in equilibrium."""
+_ROUNDING = 1e-11
+"""Of positions: what they are off by moves the residual by the stiffness times that."""
 
 
 def step_solution(
@@ -24,15 +28,43 @@ def step_solution(
 
     Raises
     ------
+    InputError
+        If the result is not that step's: it is at another time, or out of balance by more
+        than it reports.
     ConvergenceError
         If internal modes are not found.
     """
     problem = objective.problem
+    _check_time(objective.state, time_step, result)
     scheme = integrate.scheme(objective.state, time_step)
     y = solution(scheme, objective.state, result.state, problem)
     if problem.scene.damping.stiffness and problem.space.internal:
         y = _damped_modes(objective, y)
+    _check_balance(objective, y, result)
     return y
+
+
+def _check_time(state: State, time_step: float, result: StepResult) -> None:
+    taken = result.state.time - state.time
+    if not equal_steps(taken, time_step):
+        raise InputError(
+            f"the result is {taken:g} s after the state, but time_step = {time_step:g} s: expected "
+            "the state that the step started from and the time step that it was given."
+        )
+
+
+def _check_balance(objective: StepObjective, y: Array, result: StepResult) -> None:
+    _, gradient = objective.value_and_gradient(y)
+    found, allowed = float(np.abs(gradient).max()), _BALANCE * result.residual
+    if found <= allowed:
+        return
+    stiffest = float(objective.problem.scalar_matrix(*objective.factors).diagonal().max())
+    if not found <= allowed + _ROUNDING * stiffest * float(np.abs(y).max()):
+        raise InputError(
+            f"the result is out of balance by {found:.2g} N as a step from this state with these "
+            f"forces, but reports {result.residual:.2g} N: expected the stepper, state and forces "
+            "that it was made with."
+        )
 
 
 def _damped_modes(objective: StepObjective, y: Array) -> Array:

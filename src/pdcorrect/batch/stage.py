@@ -1,0 +1,164 @@
+"""The equation of one step of a batch: `pdcorrect.solvers.integrators` for B scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.loads import Spans
+from pdcorrect.batch.objective import by_scene
+from pdcorrect.batch.states import BatchState
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.integrators import Integrator, equal_steps, nodal_solution
+from pdcorrect.solvers.linear import Linear, by_component
+from pdcorrect.solvers.schemes import Scheme
+
+
+@dataclass(frozen=True, eq=False)
+class BatchStage:
+    """One step's equation and what it was made of.
+
+    Attributes
+    ----------
+    scheme : Scheme
+    known : dict
+        What the scheme's sums are of, see `Scheme`.
+    spans : sequence of (float, float)
+        Time intervals over which each scene's loads act, s.
+    target, origin : (B, U, 3)
+        q and o, m; not changed later.
+    """
+
+    scheme: Scheme
+    known: dict[str, Any]
+    spans: Spans
+    target: Tensor
+    origin: Tensor
+
+
+class BatchStaging:
+    """From states of B scenes to the equation of a step, and from its solution to states.
+
+    Parameters
+    ----------
+    cells : CellBatch
+    problems : sequence of Problem
+    integrate : Integrator
+    time_step : float
+        s.
+    """
+
+    def __init__(
+        self, cells: CellBatch, problems: Sequence[Problem], integrate: Integrator, time_step: float
+    ) -> None:
+        self._cells, self._problems = cells, problems
+        self._integrate, self._h = integrate, time_step
+        self._moving = any(p.clamps.moving for p in problems)
+        self._clamped = self._held([0.0] * len(problems))
+        self.free = cells.nodal([p.free.astype(float) for p in problems])[:, : cells.sizes.nodes]
+        self.free = self.free > 0.5
+
+    def extended(self, nodal: Tensor) -> Tensor:
+        """(B, N, 3) as configurations (B, U, 3)."""
+        n = self._cells.sizes
+        if not n.modes:
+            return nodal
+        return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
+
+    def __call__(self, state: BatchState) -> BatchStage:
+        """The step from a state."""
+        scheme = self._scheme(state)
+        known = self._known(scheme, state)
+        first, last = scheme.loads_over
+        h = self._h
+        return BatchStage(
+            scheme,
+            known,
+            [(t + first * h, t + last * h) for t in state.times],
+            self.extended(self._split(known, scheme.target, scheme.clamped_target)),
+            self.extended(self._split(known, scheme.origin, scheme.clamped_origin)),
+        )
+
+    def start(self, stage: BatchStage) -> Tensor:
+        """First iterate (B, U, 3), prescribed where clamped."""
+        scheme = stage.scheme
+        return self.extended(self._split(stage.known, scheme.start, scheme.clamped))
+
+    def finish(self, stage: BatchStage, y: Tensor, state: BatchState) -> BatchState:
+        """The state after the step from ``state`` with solution y (B, U, 3).
+
+        Its tensors share no memory with others.
+        """
+        known = {**stage.known, "y": y[:, : self._cells.sizes.nodes]}
+        scheme = stage.scheme
+        return BatchState(
+            self._split(known, scheme.positions, None),
+            self._split(known, scheme.velocities, scheme.clamped_velocities),
+            tuple(t + self._h for t in state.times),
+            {name: self._split(known, *rows) for name, rows in scheme.memory.items()},
+        )
+
+    def solution(self, before: BatchState, positions: Tensor, modes: Tensor) -> Tensor:
+        """The y (B, U, 3) of a step from a state to positions, and modes (B, U - N, 3)."""
+        nodal = nodal_solution(self._scheme(before), before.positions, positions)
+        return torch.cat([nodal, modes], dim=1)
+
+    def _scheme(self, state: BatchState) -> Scheme:
+        return self._integrate.scheme_of(self._h, self._started(state))
+
+    def _started(self, state: BatchState) -> bool:
+        """Whether the states have the memory for a step of this length."""
+        before = state.memory.get("previous_times")
+        if before is None:
+            return bool(state.memory)
+        lengths = [t - e for t, e in zip(state.times, before[:, 0, 0].tolist(), strict=True)]
+        rounding = 2.0 * torch.finfo(before.dtype).eps
+        started = [
+            equal_steps(length, self._h) or abs(length - self._h) <= rounding * abs(t)
+            for length, t in zip(lengths, state.times, strict=True)
+        ]
+        if any(started) and not all(started):
+            other = started.index(False)
+            raise InputError(
+                f"the state of scene {other} came from a step of another length than "
+                f"{self._h:g} s, those of others did not: expected all or none."
+            )
+        return all(started)
+
+    def _known(self, scheme: Scheme, state: BatchState) -> dict[str, Any]:
+        known: dict[str, Any] = {
+            "positions": state.positions,
+            "velocities": state.velocities,
+            "prescribed": self._prescribed([t + self._h for t in state.times]),
+            "time": torch.zeros_like(state.positions)
+            + by_scene(state.positions.new_tensor(state.times)),
+            **state.memory,
+            "clamp_velocity": 0.0,
+            "clamp_velocity_at_y": 0.0,
+            "clamp_jump": 0.0,
+        }
+        if "accelerations" in scheme.memory and "accelerations" not in known:
+            raise InputError(
+                "generalised-alpha in a batch starts from states with accelerations: expected "
+                "memory. Take the first step of each scene with ProjectiveDynamics."
+            )
+        return known
+
+    def _prescribed(self, times: Sequence[float]) -> Tensor:
+        return self._held(times) if self._moving else self._clamped
+
+    def _held(self, times: Sequence[float]) -> Tensor:
+        pairs = zip(self._problems, times, strict=True)
+        held = self._cells.nodal([p.clamped_positions(t) for p, t in pairs])
+        return held[:, : self._cells.sizes.nodes]
+
+    def _split(self, known: dict[str, Any], on_free: Linear, on_clamped: Linear | None) -> Tensor:
+        """A sum (B, N, 3) in memory of its own."""
+        values: Tensor = by_component(torch, self.free, known, on_free, on_clamped)
+        return values.clone() if any(values is other for other in known.values()) else values
