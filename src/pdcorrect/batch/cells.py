@@ -188,17 +188,6 @@ class CellBatch:
         by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
         return torch.where(self.present_cells, by_cell, math.inf).amin(dim=1)
 
-    def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
-        """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).
-
-        Of the nodes' displacements alone, see `ElasticBody.volume_ratios`.
-        """
-        n = self.sizes
-        u = torch.zeros_like(self.rest)
-        u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
-        F = self.gradients(u, 1.0).reshape(3, 3, n.scenes, -1)
-        return torch.linalg.det(F.permute(2, 3, 0, 1)).amin(dim=1)
-
     def rotations(self, F: Tensor) -> Tensor:
         """Nearest rotations (9, M) of matrices (9, M)."""
         return self._points.rotations(F)

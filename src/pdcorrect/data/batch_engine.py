@@ -109,7 +109,7 @@ class _Log:
         """A step inside a frame."""
         self._iterations += result.iterations
         self._estimates = np.maximum(self._estimates, result.error_estimates)
-        ratios = self._stepper.cells.smallest_volume_ratios(result.state.positions).cpu().numpy()
+        ratios = result.smallest_volume_ratios
         self._ratios = np.fmin(self._ratios, ratios)
         for i, status in enumerate(result.statuses):
             self._judge(i, status, float(ratios[i]))
