@@ -609,7 +609,7 @@ def test_a_stepper_can_be_copied():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("first_hessian", "foo"), ("integrator", "euler"),
+        ("first_hessian", "foo"), ("integrator", "euler"), ("integrator", ["midpoint"]),
         ("time_step", -0.01), ("time_step", 0), ("time_step", "0.01"), ("time_step", True),
         ("tolerance", -1.0), ("tolerance", 0), ("tolerance", np.nan), ("tolerance", [1e-3]),
         ("max_iterations", -1), ("max_iterations", 0), ("max_iterations", 2.0),
@@ -642,6 +642,8 @@ WRONG = {
     "a result": (lambda s, r, o: s(o), "state is a BatchResult: .* the state of a result"),
     "a tensor": (lambda s, r, o: s(r.positions), "state is a Tensor"),
     "few times": (lambda s, r, o: s(replace(r, times=(0.0,))), r"times = \(0\.0,\): expected 2"),
+    "no times": (lambda s, r, o: s(replace(r, times=None)), "times = None: expected 2"),
+    "no memory at all": (lambda s, r, o: s(replace(r, memory=None)), "memory is a NoneType"),
     "array forces": (lambda s, r, o: s(r, r.positions.numpy()), "forces is a ndarray"),
     "flat forces": (lambda s, r, o: s(r, r.positions[0]), r"forces: \(16, 3\); expected \(2, 16"),
     "state of one": (lambda s, r, o: s.state(s.states(r)[0]), "states is a State"),

@@ -317,6 +317,7 @@ WRONG = {
     "no velocities": (lambda r, p, v: ((p, None), {}), "velocities is a NoneType"),
     "arrays": (lambda r, p, v: ((p.numpy(), v.numpy()), {}), "positions is a ndarray"),
     "a list of forces": (lambda r, p, v: ((p, v, [1.0]), {}), "forces is a list"),
+    "flat forces": (lambda r, p, v: ((p, v, p[0, 0]), {}), r"forces: \(3,\); expected \(2, 12"),
     "array forces": (lambda r, p, v: ((p, v, p.numpy()), {}), "forces is a ndarray"),
     "one scene": (lambda r, p, v: ((p[0], v[0]), {}), r"positions: \(12, 3\); expected \(2, 12, 3"),
     "one time": (lambda r, p, v: ((p, v), {"times": 0.5}), r"times = 0\.5: expected 2 finite"),
@@ -403,6 +404,8 @@ def test_one_scenes_output_becomes_a_state():
     stepper = pc.BatchStepper([problem], 1e-9)
     start = torch.as_tensor(problem.positions.copy())
     out = pc.PDLayer(stepper)(start, torch.zeros_like(start))
+    with pytest.raises(InputError, match=r"forces: \(3,\); expected \(1, 12, 3"):
+        pc.PDLayer(stepper)(start, torch.zeros_like(start), start[0])
     (state,) = stepper.states(out, [problem.time_step])
     np.testing.assert_array_equal(state.positions, out[0])
     assert pc.ProjectiveDynamics(problem)(state).status.ok

@@ -289,7 +289,7 @@ class PDLayer(nn.Module):
         if forces is None:
             return [None] * self.steps
         check_tensor(self.stepper.cells, "forces", forces)
-        forces = forces.unsqueeze(-3) if single else forces
+        forces = forces.unsqueeze(-3) if single and forces.ndim > 1 else forces
         each = list(forces) if forces.ndim == 4 else [forces] * self.steps
         if len(each) != self.steps:
             raise InputError(

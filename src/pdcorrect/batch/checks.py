@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -214,16 +214,20 @@ def check_state(cells: CellBatch, state: BatchState, name: str = "state") -> Non
     check_kind(name, state, BatchState, "stepper.state(states) or the state of a result")
     check_nodal(cells, "positions", state.positions)
     check_nodal(cells, "velocities", state.velocities)
-    start_times(cells, state.times)
+    finite_times(cells, state.times)
+    check_kind("memory", state.memory, Mapping, "a dict")
     for name, x in state.memory.items():
         check_nodal(cells, f"memory {name!r}", x)
 
 
 def start_times(cells: CellBatch, times: Sequence[float] | None) -> tuple[float, ...]:
     """One time for each scene, s; zeros if there are none."""
+    return (0.0,) * cells.sizes.scenes if times is None else finite_times(cells, times)
+
+
+def finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
+    """One time for each scene, s; others are refused."""
     scenes = cells.sizes.scenes
-    if times is None:
-        return (0.0,) * scenes
     try:
         found = tuple(float(t) for t in times)
     except (TypeError, ValueError):

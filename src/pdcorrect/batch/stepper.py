@@ -73,6 +73,7 @@ class BatchStepper:
         See `DenseInverse`; "auto" is "rest" for small meshes and "two-level" for others
         that are refined.
     max_iterations : int
+        At least 1.
     time_step : float, optional
         s; the first scene's by default.
     integrator : str, optional
@@ -80,12 +81,17 @@ class BatchStepper:
     device : str
         "cpu", "cuda", "cuda:1", ...
     dtype : torch.dtype
-        Of states, energies and gradients.
+        Of states, energies and gradients: ``torch.float64`` or ``torch.float32``.
     storage : torch.dtype
-        Of the inverses.
+        Of the inverses, which are preconditioners: one of the same.
     recover : bool
         Whether scenes that do not converge are tried again, one at a time, with
         `ProjectiveDynamics` and its fallbacks.
+
+    Raises
+    ------
+    InputError
+        If scenes cannot step together, or an option has no meaning here.
 
     Notes
     -----
