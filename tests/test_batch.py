@@ -412,14 +412,27 @@ def test_an_energy_without_a_volume_term_stays_without():
     assert furthest(exact, found[0]) < 1e-9
 
 
-def test_materials_out_of_range_fail_alone():
-    problems = [pc.discretise(beam((2, 1, 1), poisson=0.3))] * 4
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("young", -1e5), ("young", 0.0), ("young", np.inf), ("density", -1.0),
+        ("density", np.nan), ("poisson", -0.2), ("poisson", 0.5), ("poisson", np.nan),
+    ],
+)  # fmt: skip
+def test_materials_out_of_range_are_refused_and_leave_the_stepper_alone(name, value):
+    problems = [pc.discretise(beam((n, 1, 1), poisson=0.3, name=f"n{n}")) for n in (2, 3)]
     stepper = pc.BatchStepper(problems, 1e-9)
-    expected = stepper(stepper.rest_state()).y[0]
-    stepper.set_material(poisson=torch.tensor([[0.3], [0.6], [0.3], [0.3]], dtype=torch.float64))
-    result = stepper(stepper.rest_state())
-    assert [s.ok for s in result.statuses] == [True, False, True, True]
-    torch.testing.assert_close(result.y[2], expected, rtol=0, atol=1e-12)
+    rest = stepper.rest_state()
+    expected = stepper(rest)
+    good = {"young": 1e6, "poisson": 0.3, "density": 1e3}[name]
+    given = torch.tensor([[good], [value]], dtype=torch.float64)
+    message = rf"{name} of cell 0 in scene 1 \('n3'\) is .*: expected a finite number"
+    with pytest.raises(InputError, match=message):
+        stepper.set_material(**{name: given})
+    again = stepper(rest)
+    assert torch.equal(again.y, expected.y)
+    assert again.statuses == expected.statuses
+    assert (again.iterations == expected.iterations).all()
 
 
 def test_a_scene_without_a_minimum_fails_alone():
@@ -593,26 +606,120 @@ def test_a_stepper_can_be_copied():
     assert torch.equal(copy(copy.rest_state()).y, first.y)
 
 
-def test_options_that_make_no_sense_are_refused():
-    problem = pc.discretise(beam((2, 1, 1)))
-    for name, value in {
-        "first_hessian": "foo",
-        "time_step": -0.01,
-        "tolerance": -1.0,
-        "max_iterations": -1,
-    }.items():
-        with pytest.raises(InputError, match=name):
-            pc.BatchStepper([problem], **{name: value})
-    stepper = pc.BatchStepper([problem])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("first_hessian", "foo"), ("integrator", "euler"), ("integrator", ["midpoint"]),
+        ("time_step", -0.01), ("time_step", 0), ("time_step", "0.01"), ("time_step", True),
+        ("tolerance", -1.0), ("tolerance", 0), ("tolerance", np.nan), ("tolerance", [1e-3]),
+        ("max_iterations", -1), ("max_iterations", 0), ("max_iterations", 2.0),
+        ("dtype", torch.float16), ("dtype", torch.int64), ("dtype", "float32"),
+        ("storage", "float32"), ("device", "gpu"), ("device", 3.5), ("device", "meta"),
+        ("device", "cuda:99"),
+    ],
+)  # fmt: skip
+def test_options_that_make_no_sense_are_refused(name, value):
+    with pytest.raises(InputError, match=name):
+        pc.BatchStepper([pc.discretise(beam((2, 1, 1)))], **{name: value})
+
+
+def two(**options):
+    """A batch of two scenes of unlike size, its state at rest and a step from it."""
+    stepper = pc.BatchStepper([pc.discretise(beam((n, 1, 1))) for n in (2, 3)], **options)
     rest = stepper.rest_state()
-    with pytest.raises(InputError, match="forces: "):
-        stepper(rest, torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
-        stepper.set_material(torch.zeros(4, 7, dtype=torch.float64))
-    with pytest.raises(InputError, match=r"density: torch\.float32"):
-        stepper.set_material(density=torch.ones(1, 1))
-    with pytest.raises(InputError, match="grad_memory has 'momentum'"):
-        pc.BatchGradients(stepper, rest, stepper(rest), grad_memory={"momentum": rest.positions})
+    return stepper, rest, stepper(rest)
+
+
+WRONG = {
+    "a problem": (lambda s, r, o: pc.BatchStepper(s.problems[0]), "problems is a Problem"),
+    "scenes": (
+        lambda s, r, o: pc.BatchStepper([s.problems[0].scene]),
+        r"problems\[0\] is a Scene: expected pc\.discretise\(scene\)",
+    ),
+    "nothing": (lambda s, r, o: pc.BatchStepper(None), "problems is a NoneType: expected a list"),
+    "a State": (lambda s, r, o: s(s.states(r)[0]), r"state is a State: .*stepper\.state\(states\)"),
+    "States": (lambda s, r, o: s(s.states(r)), "state is a list"),
+    "a result": (lambda s, r, o: s(o), "state is a BatchResult: .* the state of a result"),
+    "a tensor": (lambda s, r, o: s(r.positions), "state is a Tensor"),
+    "few times": (lambda s, r, o: s(replace(r, times=(0.0,))), r"times = \(0\.0,\): expected 2"),
+    "no times": (lambda s, r, o: s(replace(r, times=None)), "times = None: expected 2"),
+    "no memory at all": (lambda s, r, o: s(replace(r, memory=None)), "memory is a NoneType"),
+    "array forces": (lambda s, r, o: s(r, r.positions.numpy()), "forces is a ndarray"),
+    "flat forces": (lambda s, r, o: s(r, r.positions[0]), r"forces: \(16, 3\); expected \(2, 16"),
+    "state of one": (lambda s, r, o: s.state(s.states(r)[0]), "states is a State"),
+    "state of problems": (lambda s, r, o: s.state(s.problems), r"states\[0\] is a Problem"),
+    "states of a result": (lambda s, r, o: s.states(o), "state is a BatchResult"),
+    "states of a float": (lambda s, r, o: s.states((r.positions, 0.0)), "velocities is a float"),
+    "float32": (
+        lambda s, r, o: s.states((r.positions.float(), r.velocities)),
+        r"positions: torch\.float32 on cpu; expected torch\.float64 .*dtype= and device=",
+    ),
+    "young of scenes": (
+        lambda s, r, o: s.set_material(torch.full((2,), 1e5, dtype=torch.float64)),
+        r"young: \(2,\).*one value a scene is \(2, 1\)",
+    ),
+    "density in float32": (
+        lambda s, r, o: s.set_material(density=torch.ones(1, 1)), r"density: torch\.float32",
+    ),
+    "a list of young": (lambda s, r, o: s.set_material([1e5]), "young is a list"),
+    "stepper": (lambda s, r, o: pc.BatchGradients(s.problems, r, o), "stepper is a tuple"),
+    "swapped": (lambda s, r, o: pc.BatchGradients(s, o, r), "before is a BatchResult"),
+    "a state": (lambda s, r, o: pc.BatchGradients(s, r, o.state), "result is a BatchState"),
+    "another time": (lambda s, r, o: pc.BatchGradients(s, o.state, o), "expected a step of 0.01 s"),
+    "others": (
+        lambda s, r, o: pc.BatchGradients(pc.BatchStepper(s.problems[:1]), r, o), "positions: ",
+    ),
+    "array": (lambda s, r, o: pc.BatchGradients(s, r, o, r.positions.numpy()), "grad_positions is"),
+    "tolerance": (lambda s, r, o: pc.BatchGradients(s, r, o, tolerance=0), "tolerance = 0"),
+    "no memory": (
+        lambda s, r, o: pc.BatchGradients(s, r, o, grad_memory={"momentum": r.positions}),
+        "grad_memory has 'momentum'",
+    ),
+    "list of memory": (lambda s, r, o: pc.BatchGradients(s, r, o, grad_memory=[1]), "grad_memory"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_arguments_of_the_wrong_kind_are_named(what):
+    call, message = WRONG[what]
+    with pytest.raises(InputError, match=message):
+        call(*two())
+
+
+def test_a_result_keeps_its_numbers():
+    """Whatever steps come later."""
+    stepper, rest, result = two()
+    names = ("iterations", "evaluations", "error_estimates", "smallest_volume_ratios")
+    before = [getattr(result, name).copy() for name in names]
+    y = result.y.clone()
+    stretched = [pc.State(1.2 * s.positions, s.velocities) for s in stepper.states(rest)]
+    later = stepper(stepper.state(stretched))
+    assert (later.iterations != result.iterations).any()
+    for name, value in zip(names, before, strict=True):
+        np.testing.assert_array_equal(getattr(result, name), value)
+    assert torch.equal(result.y, y)
+
+
+def test_padding_is_told():
+    stepper, rest, result = two()
+    assert stepper.node_counts == (12, 16)
+    assert stepper.node_mask.sum(dim=1).tolist() == [12, 16]
+    assert not rest.positions[~stepper.node_mask].any()
+    pair = (result.state.positions, result.state.velocities)
+    for found in (stepper.states(pair, result.state.times), stepper.states(result.state)):
+        assert [s.positions.shape for s in found] == [(12, 3), (16, 3)]
+        assert [s.time for s in found] == list(result.state.times)
+        np.testing.assert_array_equal(found[0].velocities, pair[1][0, :12])
+    assert [s.time for s in stepper.states(pair)] == [0.0, 0.0]
+
+
+def test_the_expected_memory_is_known_before_the_first_step():
+    problems = [pc.discretise(beam((n, 1, 1))) for n in (2, 2, 3)]
+    stepper = pc.BatchStepper(problems)
+    assert stepper.expected_bytes == expected_bytes(stepper.cells.sizes, 2, 3)
+    expected = stepper.expected_bytes
+    stepper(stepper.rest_state())
+    assert stepper.expected_bytes == expected
 
 
 # --- more kinds of scenes ------------------------------------------------------------------------

@@ -604,3 +604,10 @@ def test_what_is_no_problem_and_no_state_is_named():
     stepper = pc.ProjectiveDynamics(pc.discretise(scene))
     with pytest.raises(pc.errors.InputError, match=r"state is a Trajectory: expected State\("):
         stepper(pc.rollout(stepper, 1))
+
+
+def test_forces_that_are_no_array_are_named():
+    problem = pc.discretise(beam())
+    for forces in ({}, 1.0):
+        with pytest.raises(pc.errors.InputError, match=r"forces is a \w+: expected an array"):
+            pc.ProjectiveDynamics(problem)(problem.rest_state(), forces)

@@ -268,7 +268,7 @@ def test_a_failed_scene_raises_by_name_or_gives_no_gradient():
     stepper = pc.BatchStepper(problems, 1e-9, max_iterations=30, recover=False)
     rest = stepper.rest_state()
     p = rest.positions.clone().requires_grad_()
-    with pytest.raises(ConvergenceError, match=r"the step of scenes 1 \("):
+    with pytest.raises(ConvergenceError, match=r"step 1 of 1: scene 1 .*failed: "):
         pc.PDLayer(stepper)(p, rest.velocities)
     layer = pc.PDLayer(stepper, on_failure="zero")
     after, _ = layer(p, rest.velocities)
@@ -288,14 +288,127 @@ def test_wrong_input_is_refused_by_name():
         layer(p, v.float())
     with pytest.raises(InputError, match="forces: "):
         layer(p, v, f[:1])
-    with pytest.raises(InputError, match="mode = 'rolled'"):
-        pc.PDLayer(stepper, mode="rolled")
-    with pytest.raises(InputError, match="steps = 0"):
-        pc.PDLayer(stepper, steps=0)
-    with pytest.raises(InputError, match="on_failure"):
-        pc.PDLayer(stepper, on_failure="ignore")
     with pytest.raises(InputError, match="needs a memory"):
         pc.PDLayer(small_batch(integrator="bdf2"))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mode", "rolled"), ("steps", 0), ("steps", 2.0), ("steps", True),
+        ("on_failure", "ignore"), ("tolerance", 0), ("tolerance", "1e-6"), ("tolerance", np.nan),
+    ],
+)  # fmt: skip
+def test_options_that_make_no_sense_are_refused(name, value):
+    with pytest.raises(InputError, match=f"{name} = "):
+        pc.PDLayer(small_batch(), **{name: value})
+
+
+@pytest.mark.parametrize("kind", ["problems", "problem", "single"])
+def test_a_layer_is_of_a_batch_stepper(kind):
+    problem = pc.discretise(beam((2, 1, 1)))
+    given = {"problems": [problem], "problem": problem, "single": pc.ProjectiveDynamics(problem)}
+    with pytest.raises(InputError, match="stepper is a .*: expected a BatchStepper"):
+        pc.PDLayer(given[kind])
+
+
+WRONG = {
+    "a state": (lambda r, p, v: ((r, None), {}), "positions is a BatchState"),
+    "no velocities": (lambda r, p, v: ((p, None), {}), "velocities is a NoneType"),
+    "arrays": (lambda r, p, v: ((p.numpy(), v.numpy()), {}), "positions is a ndarray"),
+    "a list of forces": (lambda r, p, v: ((p, v, [1.0]), {}), "forces is a list"),
+    "flat forces": (lambda r, p, v: ((p, v, p[0, 0]), {}), r"forces: \(3,\); expected \(2, 12"),
+    "array forces": (lambda r, p, v: ((p, v, p.numpy()), {}), "forces is a ndarray"),
+    "one scene": (lambda r, p, v: ((p[0], v[0]), {}), r"positions: \(12, 3\); expected \(2, 12, 3"),
+    "one time": (lambda r, p, v: ((p, v), {"times": 0.5}), r"times = 0\.5: expected 2 finite"),
+    "few times": (lambda r, p, v: ((p, v), {"times": [0.0]}), r"times = \[0\.0\]"),
+    "words": (lambda r, p, v: ((p, v), {"times": "ab"}), "times = 'ab'"),
+    "infinite times": (lambda r, p, v: ((p, v), {"times": [0.0, np.inf]}), "times = "),
+    "integers": (lambda r, p, v: ((p, v), {"young": torch.tensor(1)}), r"young: torch\.int64"),
+    "truth": (lambda r, p, v: ((p, v), {"young": True}), "young is a bool"),
+    "young of scenes": (
+        lambda r, p, v: ((p, v), {"young": torch.full((3,), 1e5, dtype=p.dtype)}),
+        r"young: \(3,\).*one value a scene is \(2, 1\)",
+    ),
+    "bad young": (
+        lambda r, p, v: ((p, v), {"young": torch.tensor([[1e5], [-1e5]], dtype=p.dtype)}),
+        r"young of cell 0 in scene 1 \(.*is -100000: expected a finite number above 0",
+    ),
+    "bad density": (lambda r, p, v: ((p, v), {"density": -1.0}), "density of cell 0 in scene 0"),
+    "nan positions": (lambda r, p, v: ((spoilt(p), v), {}), "positions of node 3 in scene 1"),
+    "nan velocities": (lambda r, p, v: ((p, spoilt(v)), {}), "velocities of node 3 in scene 1"),
+    "nan forces": (lambda r, p, v: ((p, v, spoilt(v)), {}), "forces of node 3 in scene 1"),
+}  # fmt: skip
+
+
+def spoilt(x):
+    """With one NaN, at node 3 of scene 1."""
+    out = x.clone()
+    out[1, 3, 2] = torch.nan
+    return out
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_calls_with_unusable_arguments_are_refused_by_name_and_change_nothing(what):
+    make, message = WRONG[what]
+    stepper = small_batch()
+    p, v = (x.detach() for x in inputs(stepper)[:2])
+    layer = pc.PDLayer(stepper)
+    arguments, named = make(stepper.rest_state(), p, v)
+    with pytest.raises(InputError, match=message):
+        layer(*arguments, **named)
+    expected, _ = pc.PDLayer(small_batch())(p, v)
+    assert torch.equal(layer(p, v)[0], expected)
+
+
+def test_a_failure_tells_its_step_and_the_scenes_statuses():
+    stepper = small_batch(max_iterations=30)
+    p, v, f = (x.detach() for x in inputs(stepper))
+    push = torch.zeros_like(f)
+    push[1] = 1e12
+    with pytest.raises(ConvergenceError) as caught:
+        pc.PDLayer(stepper, 3)(p, v, torch.stack([f, push, f]))
+    status = pc.PDLayer(stepper, 3, on_failure="zero")
+    status(p, v, torch.stack([f, push, f]))
+    expected = f"step 2 of 3: scene 1 ('scene') {status.statuses[1][1].value}. Expected"
+    assert expected in str(caught.value)
+    assert "scene 0" not in str(caught.value)
+
+
+def test_padded_cells_do_not_spoil_the_gradient_by_a_factor_on_the_material():
+    stepper = small_batch()
+    p, v, f = (x.detach() for x in inputs(stepper))
+    factor = torch.ones((), dtype=torch.float64, requires_grad=True)
+    after, _ = pc.PDLayer(stepper)(p, v, f, young=stepper.material[0] * factor)
+    after.square().sum().backward()
+    assert torch.isfinite(factor.grad)
+    assert factor.grad
+
+
+def test_calls_one_after_the_other_see_the_loads_of_their_time():
+    window = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81], "window": [0.02, 0.1]}]
+    stepper = pc.BatchStepper([pc.discretise(beam((2, 1, 1), loads=window))], 1e-9)
+    start = stepper.rest_state()
+    p, v = start.positions, start.velocities
+    expected, _ = pc.PDLayer(stepper, 4)(p, v)
+    layer, found, still = pc.PDLayer(stepper), (p, v), (p, v)
+    for k in range(4):
+        found = layer(*found, times=[k * stepper.time_step])
+        still = layer(*still)
+    torch.testing.assert_close(found[0], expected, rtol=0, atol=1e-12)
+    assert not torch.allclose(still[0], expected, rtol=0, atol=1e-6)
+
+
+def test_one_scenes_output_becomes_a_state():
+    problem = pc.discretise(beam((2, 1, 1)))
+    stepper = pc.BatchStepper([problem], 1e-9)
+    start = torch.as_tensor(problem.positions.copy())
+    out = pc.PDLayer(stepper)(start, torch.zeros_like(start))
+    with pytest.raises(InputError, match=r"forces: \(3,\); expected \(1, 12, 3"):
+        pc.PDLayer(stepper)(start, torch.zeros_like(start), start[0])
+    (state,) = stepper.states(out, [problem.time_step])
+    np.testing.assert_array_equal(state.positions, out[0])
+    assert pc.ProjectiveDynamics(problem)(state).status.ok
 
 
 # --- what is recorded, kept and left alone -------------------------------------------------------
@@ -419,7 +532,10 @@ def test_a_linear_system_that_is_not_solved_is_told(monkeypatch):
     layer(p, v, f)[0].sum().backward()
     assert layer.differentiable.all()
     assert layer.failed_derivatives == [(0, 0), (0, 1)]
-    with pytest.raises(ConvergenceError, match="the derivative of scenes 0"):
+    with pytest.raises(
+        ConvergenceError,
+        match=r"the derivative of step 1 of 1: scene 0 \('scene'\), whose step converged;",
+    ):
         pc.PDLayer(stepper)(p, v, f)[0].sum().backward()
 
 

@@ -9,7 +9,7 @@ loss(positions).backward()
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -19,11 +19,21 @@ from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from pdcorrect.batch.adjoint import BatchGradients
-from pdcorrect.batch.checks import check_nodal
-from pdcorrect.batch.material import NAMES, BatchMaterial, by_cell
+from pdcorrect.batch.checks import (
+    by_cell,
+    check_finite,
+    check_kind,
+    check_material,
+    check_nodal,
+    check_tensor,
+    scene_name,
+    start_times,
+)
+from pdcorrect.batch.material import NAMES, BatchMaterial
 from pdcorrect.batch.states import BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.solvers.implicit import positive, whole
 from pdcorrect.state import Status
 
 Mode = Literal["unrolled", "checkpointed", "detached"]
@@ -59,29 +69,38 @@ class _Call:
         h = self.layer.stepper.time_step
         return tuple(t + step * h for t in self.times)
 
-    def stepped(self, step: int, statuses: list[Status]) -> None:
-        """Record a step; those that are repeated for derivatives are recorded already."""
+    def stepped(
+        self, step: int, statuses: list[Status], inputs: Mapping[str, Tensor | None]
+    ) -> None:
+        """Record a step of some inputs; repeated ones are recorded already."""
         if step == len(self.statuses):
             self.statuses.append(statuses)
-        self._raise_for("the step", [s.ok for s in statuses])
+        if Status.NOT_FINITE in statuses and self.layer.on_failure == "raise":
+            for name, x in inputs.items():
+                if x is not None:
+                    check_finite(self.layer.stepper.problems, name, x)
+        told = [f" {s.value}" for s in statuses]
+        self._raise_for("", step, told, [s.ok for s in statuses])
 
-    def differentiated(self, step: int, ok: list[bool]) -> None:
+    def differentiated(self, step: int, statuses: list[Status], ok: list[bool]) -> None:
         """Record a step's derivative."""
         self.failures.extend((step, i) for i, fine in enumerate(ok) if not fine)
-        self._raise_for("the derivative", ok)
+        told = [f", whose step {s.value}" for s in statuses]
+        self._raise_for("the derivative of ", step, told, ok)
 
-    def _raise_for(self, what: str, ok: list[bool]) -> None:
+    def _raise_for(self, what: str, step: int, told: list[str], ok: list[bool]) -> None:
+        if all(ok) or self.layer.on_failure != "raise":
+            return
         problems = self.layer.stepper.problems
-        names = [
-            f"{i} ({p.scene.name!r})"
-            for i, (p, fine) in enumerate(zip(problems, ok, strict=True))
+        scenes = "; ".join(
+            f"scene {scene_name(problems, i)}{words}"
+            for i, (words, fine) in enumerate(zip(told, ok, strict=True))
             if not fine
-        ]
-        if names and self.layer.on_failure == "raise":
-            raise ConvergenceError(
-                f"{what} of scenes {', '.join(names)}: expected all to converge. Use smaller "
-                "steps, or on_failure='zero' to leave such scenes out."
-            )
+        )
+        raise ConvergenceError(
+            f"{what}step {step + 1} of {self.layer.steps}: {scenes}. Expected {what}every step "
+            "to converge: use smaller time steps, or on_failure='zero' to leave such scenes out."
+        )
 
 
 class PDLayer(nn.Module):
@@ -99,7 +118,9 @@ class PDLayer(nn.Module):
         state counts as given.
     on_failure : {"raise", "zero"}
         What happens when a scene's step, or the linear system of its derivative, fails:
-        `ConvergenceError` with the scenes' names, or no derivatives from that scene.
+        `ConvergenceError` with the step, the scenes' names and statuses, or no derivatives
+        from that scene.  So with a material out of its range and with numbers that are not
+        finite, which raise `InputError`.
         ``statuses`` and ``failed_derivatives`` tell in any case.
     tolerance : float
         Of the linear systems' residuals, relative.
@@ -135,15 +156,14 @@ class PDLayer(nn.Module):
             raise InputError(f"mode = {mode!r}: expected unrolled, checkpointed or detached.")
         if on_failure not in ("raise", "zero"):
             raise InputError(f"on_failure = {on_failure!r}: expected raise or zero.")
-        if isinstance(steps, bool) or not isinstance(steps, int) or steps < 1:
-            raise InputError(f"steps = {steps!r}: expected a whole number of at least 1.")
+        check_kind("stepper", stepper, BatchStepper, "a BatchStepper(problems)")
         if stepper.integrator in ("bdf2", "generalised-alpha"):
             raise InputError(
                 f"a layer with {stepper.integrator}, which needs a memory: expected "
                 "backward-euler, midpoint or quasi-static."
             )
-        self.stepper, self.steps, self.mode = stepper, steps, mode
-        self.on_failure, self.tolerance = on_failure, tolerance
+        self.stepper, self.steps, self.mode = stepper, whole("steps", steps, 1), mode
+        self.on_failure, self.tolerance = on_failure, positive("tolerance", tolerance)
         self.statuses: list[list[Status]] = []
         self.failed_derivatives: list[tuple[int, int]] = []
 
@@ -183,9 +203,11 @@ class PDLayer(nn.Module):
         forces : the same, optional
             Nodal forces besides the scenes' loads, N; (steps, B, N, 3) if they change.
         young, poisson, density : numbers or tensors that broadcast to (B, C), optional
-            Pa, dimensionless, kg/m3; those that the stepper has by default.
+            Pa, dimensionless, kg/m3; those that the stepper has by default.  One value a
+            scene is (B, 1).
         times : (B,) floats, optional
-            At the start, s; 0 by default.
+            At the start, s; 0 by default.  Loads and clamps that change in time need them
+            in every call but the first.
 
         Returns
         -------
@@ -194,9 +216,11 @@ class PDLayer(nn.Module):
         Raises
         ------
         InputError
-            If shapes, types or devices are not the stepper's.
+            If shapes, types or devices are not the stepper's; unless ``on_failure`` is
+            "zero", also if a material is out of its range, before any step, or a number is
+            not finite, after the step that fails by it.
         ConvergenceError
-            If a scene fails, unless ``on_failure`` is "zero".
+            If a scene fails otherwise, unless ``on_failure`` is "zero".
         """
         frame, _ = self._run(
             positions, velocities, forces, (young, poisson, density), times, keep=False
@@ -231,16 +255,18 @@ class PDLayer(nn.Module):
         keep: bool,
     ) -> tuple[Frame, list[Frame]]:
         """The last frame and, if they are to be kept, all."""
-        single = positions.ndim == 2
-        if single:
-            positions, velocities = positions[None], velocities[None]
-            forces = None if forces is None else forces.unsqueeze(-3)
-        cells = self.stepper.cells
+        stepper, cells = self.stepper, self.stepper.cells
+        one = stepper.batched(positions)
+        single = one is not positions
+        positions, velocities = one, stepper.batched(velocities)
         check_nodal(cells, "positions", positions)
         check_nodal(cells, "velocities", velocities)
-        pushes = self._pushes(forces)
+        pushes = self._pushes(forces, single)
         given = [by_cell(cells, n, m) for n, m in zip(NAMES, material, strict=True)]
-        call = _Call(self, self.stepper.with_material(given), self._start_times(times))
+        values = stepper.with_material(given)
+        if self.on_failure == "raise" and values is not stepper.present:
+            check_material(cells, stepper.problems, values)
+        call = _Call(self, values, start_times(cells, times))
         self.statuses, self.failed_derivatives = call.statuses, call.failures
         frame, frames = (positions, velocities), [(positions, velocities)]
         repeated = self.mode == "checkpointed" and torch.is_grad_enabled()
@@ -258,10 +284,12 @@ class PDLayer(nn.Module):
             frame = (frame[0][0], frame[1][0])
         return frame, frames
 
-    def _pushes(self, forces: Tensor | None) -> list[Tensor | None]:
-        """Extra forces of each step."""
+    def _pushes(self, forces: Tensor | None, single: bool) -> list[Tensor | None]:
+        """Extra forces of each step; ``single`` if they come without the scenes' dimension."""
         if forces is None:
             return [None] * self.steps
+        check_tensor(self.stepper.cells, "forces", forces)
+        forces = forces.unsqueeze(-3) if single and forces.ndim > 1 else forces
         each = list(forces) if forces.ndim == 4 else [forces] * self.steps
         if len(each) != self.steps:
             raise InputError(
@@ -271,15 +299,6 @@ class PDLayer(nn.Module):
         for push in each[: self.steps if forces.ndim == 4 else 1]:
             check_nodal(self.stepper.cells, "forces", push)
         return list(each)
-
-    def _start_times(self, times: Sequence[float] | None) -> tuple[float, ...]:
-        scenes = len(self.stepper.problems)
-        if times is None:
-            return (0.0,) * scenes
-        found = tuple(float(t) for t in times)
-        if len(found) != scenes or not all(map(math.isfinite, found)):
-            raise InputError(f"times = {found}: expected {scenes} finite numbers, one a scene.")
-        return found
 
 
 def _segment(
@@ -310,7 +329,8 @@ class _Step(torch.autograd.Function):
         stepper: BatchStepper = call.layer.stepper
         with stepper.using(call.material):
             result = stepper(BatchState(positions, velocities, call.times_before(step)), forces)
-        call.stepped(step, result.statuses)
+        inputs = {"positions": positions, "velocities": velocities, "forces": forces}
+        call.stepped(step, result.statuses, inputs)
         after = result.state
         modes = result.y[:, stepper.cells.sizes.nodes :].clone()
         ctx.call, ctx.step, ctx.statuses = call, step, result.statuses
@@ -329,7 +349,7 @@ class _Step(torch.autograd.Function):
                 stepper, before, Solved(y, ctx.statuses), grad_positions, grad_velocities,
                 forces=forces, tolerance=call.layer.tolerance,
             )  # fmt: skip
-        call.differentiated(ctx.step, gradients.ok.tolist())
+        call.differentiated(ctx.step, ctx.statuses, gradients.ok.tolist())
         ok = gradients.ok[:, None, None]
         found = []
         for name, needed in zip(_INPUTS, ctx.needs_input_grad[2:], strict=True):

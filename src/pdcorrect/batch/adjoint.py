@@ -8,12 +8,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.checks import check_nodal
+from pdcorrect.batch.checks import check_kind, check_nodal, check_step
 from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame_slopes
+from pdcorrect.solvers.implicit import positive
 from pdcorrect.solvers.linear import Linear
 
 
@@ -45,6 +46,12 @@ class BatchGradients:
         Whether the step had a result, not in smaller parts, and its linear system was solved.
     iterations : int
         Of the slowest scene.
+
+    Raises
+    ------
+    InputError
+        If an argument is of another kind, shape, type or device, or the result is not of a
+        step of the stepper from ``before``.
     """
 
     def __init__(
@@ -59,6 +66,10 @@ class BatchGradients:
         forces: Tensor | None = None,
         tolerance: float = 1e-6,
     ) -> None:
+        check_kind("stepper", stepper, BatchStepper, "a BatchStepper")
+        check_step(stepper.cells, before, result, stepper.time_step)
+        check_kind("grad_memory", {} if grad_memory is None else grad_memory, Mapping, "a dict")
+        tolerance = positive("tolerance", tolerance)
         self._stepper, self._before, self._y = stepper, before, result.y
         self._nodes = stepper.cells.sizes.nodes
         self._free = stepper.staging.free

@@ -1,21 +1,62 @@
-"""What the scenes of a batch must have in common, and what a step is given."""
+"""What a batch, its steps and its derivatives are given."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.material import BatchMaterial, in_range
+from pdcorrect.batch.states import BatchResult, BatchState, Solved
 from pdcorrect.errors import InputError
+from pdcorrect.fem.materials import RANGES
 from pdcorrect.fem.problem import Problem
+from pdcorrect.state import State
+
+_TIMES_DIFFER = 1e-6
+"""Of a step's length."""
+
+
+def scene_name(problems: Sequence[Problem], i: int) -> str:
+    """A scene's number and name."""
+    return f"{i} ({problems[i].scene.name!r})"
+
+
+def check_kind(name: str, value: object, kind: type, expected: str) -> None:
+    """Refuse what is not of a class."""
+    if not isinstance(value, kind):
+        raise wrong_kind(name, value, expected)
+
+
+def wrong_kind(name: str, value: object, expected: str) -> InputError:
+    """What to raise for a value of another kind than expected."""
+    return InputError(f"{name} is a {type(value).__name__}: expected {expected}.")
+
+
+def items(name: str, values: Any, kind: type, expected: str) -> tuple[Any, ...]:
+    """A sequence as a tuple; others, and other entries, are refused."""
+    check_kind(name, values, Iterable, f"a list, each {expected}")
+    found = tuple(values)
+    for i, value in enumerate(found):
+        check_kind(f"{name}[{i}]", value, kind, expected)
+    return found
+
+
+# --- scenes and options --------------------------------------------------------------------------
 
 
 def check_problems(
-    problems: tuple[Problem, ...], time_step: float | None, integrator: str | None
-) -> None:
-    """Refuse scenes that cannot step together, naming one and what differs.
+    problems: Sequence[Problem], time_step: float | None, integrator: str | None
+) -> tuple[Problem, ...]:
+    """The problems; scenes that cannot step together are refused, naming one and what differs.
 
     ``time_step`` and ``integrator`` are those asked for, or None for the scenes' own.
     """
+    problems = items("problems", problems, Problem, "pc.discretise(scene)")
     if not problems:
         raise InputError("no problems: expected one or more scenes.")
     first = problems[0]
@@ -38,27 +79,177 @@ def check_problems(
         for key, mine, theirs in pairs:
             if mine != theirs:
                 raise InputError(
-                    f"scene {i} ({scene.name!r}): {key} = {mine!r}, the first one's is "
+                    f"scene {scene_name(problems, i)}: {key} = {mine!r}, the first one's is "
                     f"{theirs!r}: expected the same. Make a batch of each kind."
                 )
         if scene.damping.stiffness:
             raise InputError(
-                f"scene {i} ({scene.name!r}): damping.stiffness is not available in batches: "
+                f"scene {scene_name(problems, i)}: damping.stiffness is not available in batches: "
                 "expected 0. Use ProjectiveDynamics."
             )
         if problem.clamps.moving and name in ("midpoint", "generalised-alpha"):
             raise InputError(
-                f"scene {i} ({scene.name!r}): moving clamps with {name} are not "
+                f"scene {scene_name(problems, i)}: moving clamps with {name} are not "
                 "available in batches. Use ProjectiveDynamics."
             )
+    return problems
+
+
+def usable_device(device: str | torch.device) -> torch.device:
+    """A device that torch has here."""
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        found = torch.device("meta")
+    if found.type not in ("cpu", "cuda"):
+        raise InputError(f"device = {device!r}: expected 'cpu', 'cuda', 'cuda:1', ...")
+    count = torch.cuda.device_count()
+    if found.type == "cuda" and (found.index or 0) >= count:
+        raise InputError(
+            f"device = {str(found)!r}: torch finds {count} CUDA devices here; expected one of "
+            "those, or 'cpu'."
+        )
+    return found
+
+
+def check_precision(name: str, dtype: torch.dtype) -> None:
+    """Refuse types in which no batch computes."""
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(f"{name} = {dtype!r}: expected torch.float32 or torch.float64.")
+
+
+# --- tensors -------------------------------------------------------------------------------------
+
+
+def check_tensor(cells: CellBatch, name: str, x: Tensor) -> None:
+    """Refuse what is no tensor of the batch's type on its device."""
+    check_kind(name, x, Tensor, "a tensor")
+    if x.dtype != cells.dtype or x.device != cells.rest.device:
+        raise InputError(
+            f"{name}: {x.dtype} on {x.device}; expected {cells.dtype} on {cells.rest.device}, "
+            "as the stepper: convert it, or make the stepper with other dtype= and device=."
+        )
 
 
 def check_nodal(cells: CellBatch, name: str, x: Tensor) -> None:
     """Refuse what is not (B, N, 3) of the batch's type on its device."""
+    check_tensor(cells, name, x)
     wanted = (cells.sizes.scenes, cells.sizes.nodes, 3)
-    device = cells.rest.device
-    if tuple(x.shape) != wanted or x.dtype != cells.dtype or x.device != device:
+    if tuple(x.shape) != wanted:
         raise InputError(
-            f"{name}: {tuple(x.shape)}, {x.dtype}, on {x.device}; expected {wanted}, "
-            f"{cells.dtype}, on {device}, as the stepper."
+            f"{name}: {tuple(x.shape)}; expected {wanted}: scenes, nodes of the largest one, 3."
         )
+
+
+def by_cell(cells: CellBatch, name: str, value: Tensor | float | None) -> Tensor | None:
+    """A number, or a tensor that broadcasts to (B, C), as (B, C).
+
+    Raises
+    ------
+    InputError
+        If it has another shape, type or device.
+    """
+    if value is None:
+        return None
+    shape = (cells.sizes.scenes, cells.sizes.cells)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        value = torch.tensor(float(value), dtype=cells.dtype, device=cells.rest.device)
+    if not isinstance(value, Tensor):
+        raise wrong_kind(name, value, "a number or a tensor")
+    check_tensor(cells, name, value)
+    try:
+        return value.expand(shape)
+    except RuntimeError:
+        raise InputError(
+            f"{name}: {tuple(value.shape)}; expected what broadcasts to {shape}, one value a "
+            f"cell of each scene: one value a scene is ({shape[0]}, 1)."
+        ) from None
+
+
+def check_material(cells: CellBatch, problems: Sequence[Problem], material: BatchMaterial) -> None:
+    """Refuse values out of their range, naming scene and cell."""
+    if material.sound.all():
+        return
+    fits = in_range(*material.values)
+    for (name, wanted), value, fine in zip(RANGES.items(), material.values, fits, strict=True):
+        bad = (~fine & cells.present_cells).nonzero()
+        if len(bad):
+            scene, cell = bad[0].tolist()
+            raise InputError(
+                f"{name} of cell {cell} in scene {scene_name(problems, scene)} is "
+                f"{float(value[scene, cell]):g}: expected a finite number {wanted}."
+            )
+
+
+def check_finite(problems: Sequence[Problem], name: str, x: Tensor) -> None:
+    """Refuse a nodal tensor with NaN or infinity, in padding too, naming scene and node."""
+    bad = (~torch.isfinite(x).all(dim=2)).nonzero()
+    if len(bad):
+        scene, node = bad[0].tolist()
+        raise InputError(
+            f"{name} of node {node} in scene {scene_name(problems, scene)} is "
+            f"{x[scene, node].tolist()}: expected finite numbers."
+        )
+
+
+# --- states and results --------------------------------------------------------------------------
+
+
+def check_states(cells: CellBatch, states: Sequence[State]) -> tuple[State, ...]:
+    """The states; refused where there is not one for each scene, or shapes are wrong."""
+    states = items("states", states, State, "a State(positions, velocities)")
+    if len(states) != len(cells.node_counts):
+        raise InputError(f"{len(states)} states: expected {len(cells.node_counts)}, one a scene.")
+    for i, (state, count) in enumerate(zip(states, cells.node_counts, strict=True)):
+        if len(state.positions) != count:
+            raise InputError(f"state {i} has {len(state.positions)} nodes: expected {count}.")
+    names = set(states[0].memory)
+    if any(set(s.memory) != names for s in states):
+        raise InputError("some states have a memory that others lack: expected all or none.")
+    return states
+
+
+def check_state(cells: CellBatch, state: BatchState, name: str = "state") -> None:
+    """Refuse what is no state of the batch."""
+    check_kind(name, state, BatchState, "stepper.state(states) or the state of a result")
+    check_nodal(cells, "positions", state.positions)
+    check_nodal(cells, "velocities", state.velocities)
+    finite_times(cells, state.times)
+    check_kind("memory", state.memory, Mapping, "a dict")
+    for name, x in state.memory.items():
+        check_nodal(cells, f"memory {name!r}", x)
+
+
+def start_times(cells: CellBatch, times: Sequence[float] | None) -> tuple[float, ...]:
+    """One time for each scene, s; zeros if there are none."""
+    return (0.0,) * cells.sizes.scenes if times is None else finite_times(cells, times)
+
+
+def finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
+    """One time for each scene, s; others are refused."""
+    scenes = cells.sizes.scenes
+    try:
+        found = tuple(float(t) for t in times)
+    except (TypeError, ValueError):
+        found = ()
+    if len(found) != scenes or not all(map(math.isfinite, found)):
+        raise InputError(f"times = {times!r}: expected {scenes} finite numbers, one a scene.")
+    return found
+
+
+def check_step(cells: CellBatch, before: BatchState, result: Solved, time_step: float) -> None:
+    """Refuse what is no step of the batch."""
+    check_state(cells, before, "before")
+    check_kind("result", result, Solved, "the result of stepper(before, forces)")
+    if result.y.shape != cells.rest.shape:
+        raise InputError(
+            f"result has configurations {tuple(result.y.shape)}: expected "
+            f"{tuple(cells.rest.shape)}, from a step of this stepper."
+        )
+    if isinstance(result, BatchResult):
+        for i, (start, end) in enumerate(zip(before.times, result.state.times, strict=True)):
+            if abs(end - start - time_step) > _TIMES_DIFFER * (time_step + abs(end)):
+                raise InputError(
+                    f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
+                    f"a step of {time_step:g} s from before."
+                )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame
@@ -79,36 +78,15 @@ def changed(
         omega = lam if rule.volume_weight == "published" else 3.0 * lam
         mu = shear if rule.has_shear_term else torch.zeros_like(shear)
         volume_weight = omega if rule.has_volume_term else torch.zeros_like(lam)
-    fits = (young > 0.0) & (poisson >= 0.0) & (poisson < 0.5) & (density > 0.0)
-    fits &= torch.isfinite(young) & torch.isfinite(density)
+    fits = torch.stack(in_range(young, poisson, density)).all(dim=0)
     sound = (fits | ~cells.present_cells).all(dim=1)
     return BatchMaterial(young, poisson, density, mu, volume_weight, sound)
 
 
-def by_cell(cells: CellBatch, name: str, value: Tensor | float | None) -> Tensor | None:
-    """A number, or a tensor that broadcasts to (B, C), as (B, C).
-
-    Raises
-    ------
-    InputError
-        If it has another shape, type or device.
-    """
-    if value is None:
-        return None
-    shape = (cells.sizes.scenes, cells.sizes.cells)
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        value = torch.tensor(float(value), dtype=cells.dtype, device=cells.rest.device)
-    if not isinstance(value, Tensor):
-        raise InputError(f"{name} is a {type(value).__name__}: expected a number or a tensor.")
-    if value.dtype != cells.dtype or value.device != cells.rest.device:
-        raise InputError(
-            f"{name}: {value.dtype} on {value.device}; expected {cells.dtype} on "
-            f"{cells.rest.device}, as the stepper."
-        )
-    try:
-        return value.expand(shape)
-    except RuntimeError:
-        raise InputError(
-            f"{name}: {tuple(value.shape)}; expected what broadcasts to {shape}, one value a "
-            "cell of each scene."
-        ) from None
+def in_range(young: Tensor, poisson: Tensor, density: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Which values have a meaning, see `pdcorrect.fem.materials.RANGES`."""
+    return (
+        (young > 0.0) & torch.isfinite(young),
+        (poisson >= 0.0) & (poisson < 0.5),
+        (density > 0.0) & torch.isfinite(density),
+    )

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.errors import InputError
 from pdcorrect.state import State, Status
 
 Array = NDArray[np.float64]
@@ -81,21 +80,8 @@ def in_one(statuses: Sequence[Status]) -> list[bool]:
 
 
 def together(cells: CellBatch, states: Sequence[State]) -> BatchState:
-    """States of the scenes of a batch together.
-
-    Raises
-    ------
-    InputError
-        If there is not one for each scene, or shapes are wrong.
-    """
-    if len(states) != len(cells.node_counts):
-        raise InputError(f"{len(states)} states: expected {len(cells.node_counts)}, one a scene.")
-    for i, (state, count) in enumerate(zip(states, cells.node_counts, strict=True)):
-        if len(state.positions) != count:
-            raise InputError(f"state {i} has {len(state.positions)} nodes: expected {count}.")
+    """States of the scenes of a batch together."""
     names = set(states[0].memory)
-    if any(set(s.memory) != names for s in states):
-        raise InputError("some states have a memory that others lack: expected all or none.")
 
     def nodal(arrays: Sequence[Array]) -> Tensor:
         return cells.nodal(arrays)[:, : cells.sizes.nodes]

@@ -14,15 +14,26 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.checks import check_nodal, check_problems
+from pdcorrect.batch.checks import (
+    by_cell,
+    check_material,
+    check_nodal,
+    check_precision,
+    check_problems,
+    check_state,
+    check_states,
+    start_times,
+    usable_device,
+)
 from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
-from pdcorrect.batch.material import NAMES, BatchMaterial, by_cell, changed, own_material
+from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
 from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import OneByOne
+from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.stage import BatchStage, BatchStaging
 from pdcorrect.batch.states import BatchResult, BatchState, apart, together
 from pdcorrect.batch.threads import one_thread
@@ -62,6 +73,7 @@ class BatchStepper:
         See `DenseInverse`; "auto" is "rest" for small meshes and "two-level" for others
         that are refined.
     max_iterations : int
+        At least 1.
     time_step : float, optional
         s; the first scene's by default.
     integrator : str, optional
@@ -69,12 +81,17 @@ class BatchStepper:
     device : str
         "cpu", "cuda", "cuda:1", ...
     dtype : torch.dtype
-        Of states, energies and gradients.
+        Of states, energies and gradients: ``torch.float64`` or ``torch.float32``.
     storage : torch.dtype
-        Of the inverses.
+        Of the inverses, which are preconditioners: one of the same.
     recover : bool
         Whether scenes that do not converge are tried again, one at a time, with
         `ProjectiveDynamics` and its fallbacks.
+
+    Raises
+    ------
+    InputError
+        If scenes cannot step together, or an option has no meaning here.
 
     Notes
     -----
@@ -96,23 +113,22 @@ class BatchStepper:
         storage: torch.dtype = torch.float32,
         recover: bool = True,
     ) -> None:
-        self.problems = tuple(problems)
-        check_problems(self.problems, time_step, integrator)
+        self.problems = check_problems(problems, time_step, integrator)
+        for name, kind in (("dtype", dtype), ("storage", storage)):
+            check_precision(name, kind)
         first = self.problems[0]
         time = first.scene.time
         self.tolerances = tuple(
-            p.scene.solver.tolerance if tolerance is None else float(tolerance)
+            positive("tolerance", p.scene.solver.tolerance if tolerance is None else tolerance)
             for p in self.problems
         )
-        positive("tolerance", min(self.tolerances))
-        self.time_step = first.time_step if time_step is None else float(time_step)
-        positive("time_step", self.time_step)
+        self.time_step = positive("time_step", first.time_step if time_step is None else time_step)
         self.integrator = time.integrator if integrator is None else integrator
         self.integrate = make_integrator(self.integrator, time.spectral_radius)
         self.first_hessian = chosen(first_hessian, self.problems)
         self._storage, self._recover = storage, recover
-        self._most = whole("max_iterations", max_iterations)
-        self.cells = CellBatch(self.problems, torch.device(device), dtype)
+        self._most = whole("max_iterations", max_iterations, 1)
+        self.cells = CellBatch(self.problems, usable_device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
         self.objective = BatchObjective(self.cells, self.problems)
         self._own = self._material = own_material(self.cells, self.problems)
@@ -147,16 +163,53 @@ class BatchStepper:
     # --- states -------------------------------------------------------------------------
 
     def state(self, states: Sequence[State]) -> BatchState:
-        """States of the scenes together, see `together`."""
-        return together(self.cells, states)
+        """States of the scenes, one each, together and padded.
+
+        Raises
+        ------
+        InputError
+            If there is not one for each scene, or shapes are wrong.
+        """
+        return together(self.cells, check_states(self.cells, states))
 
     def rest_state(self) -> BatchState:
         """All scenes at rest at time zero."""
         return self.state([p.rest_state() for p in self.problems])
 
-    def states(self, batch: BatchState) -> list[State]:
-        """The scenes' states one by one."""
+    def states(
+        self,
+        batch: BatchState | tuple[Tensor, Tensor],
+        times: Sequence[float] | None = None,
+    ) -> list[State]:
+        """The scenes' states one by one, without padding.
+
+        Parameters
+        ----------
+        batch : BatchState or (positions, velocities)
+            The pair is what `PDLayer` returns; (N, 3) each for a stepper of one scene.
+        times : (B,) floats, optional
+            Of a pair, s; 0 by default.
+        """
+        if isinstance(batch, (tuple, list)) and len(batch) == 2:
+            positions, velocities = map(self.batched, batch)
+            batch = BatchState(positions, velocities, start_times(self.cells, times))
+        check_state(self.cells, batch)
         return apart(self.cells, batch)
+
+    def batched(self, x: Tensor) -> Tensor:
+        """A nodal tensor (N, 3) of a stepper of one scene as (1, N, 3); others as they are."""
+        lone = len(self.problems) == 1 and isinstance(x, Tensor) and x.ndim == 2
+        return x[None] if lone else x
+
+    @property
+    def node_counts(self) -> tuple[int, ...]:
+        """Nodes of each scene; those from there on are padding."""
+        return tuple(self.cells.node_counts)
+
+    @property
+    def node_mask(self) -> Tensor:
+        """Which nodes (B, N) are a scene's own, bool; the others are padding."""
+        return self.cells.present_nodes.clone()
 
     # --- material --------------------------------------------------------------------------
 
@@ -173,19 +226,21 @@ class BatchStepper:
     ) -> None:
         """Material values from now on, each a number or a tensor that broadcasts to (B, C).
 
-        Those that are not given are the problems' own.  A scene with values out of their
-        range fails (`NOT_FINITE`), and no other does.  First Hessians stay those of the
+        Those that are not given are the problems' own.  First Hessians stay those of the
         problems: they are only preconditioners.
 
         Raises
         ------
         InputError
-            If a tensor has another type or device, or does not broadcast.
+            If a tensor has another type or device, does not broadcast, or has a value out of
+            its range.  Nothing has changed then.
         """
         pairs = zip(NAMES, (young, poisson, density), strict=True)
         with self.alone():
             given = [by_cell(self.cells, name, value) for name, value in pairs]
-            self._apply(self._with(self._own, given))
+            material = self._with(self._own, given)
+            check_material(self.cells, self.problems, material)
+            self._apply(material)
 
     def with_material(self, given: Sequence[Tensor | None]) -> BatchMaterial:
         """The present material with other values, each (B, C) or None, for `using`."""
@@ -239,7 +294,7 @@ class BatchStepper:
         Raises
         ------
         InputError
-            If a tensor has another shape, type or device than the stepper's.
+            If the state is not the stepper's, or a tensor has another shape, type or device.
         """
         with self.alone():
             result = self._step(state, forces)
@@ -263,16 +318,15 @@ class BatchStepper:
                 for s, ratio in zip(statuses, ratios, strict=True)
             ],
             after,
-            minimiser.iterations.cpu().numpy(),
-            minimiser.evaluations.cpu().numpy(),
+            minimiser.iterations.cpu().numpy().copy(),
+            minimiser.evaluations.cpu().numpy().copy(),
             minimiser.estimate.to("cpu", torch.float64).numpy() * stage.scheme.gain,
             ratios,
         )
 
     def prepare(self, state: BatchState, forces: Tensor | None = None) -> BatchStage:
         """Set up the step's objective and first Hessian."""
-        check_nodal(self.cells, "positions", state.positions)
-        check_nodal(self.cells, "velocities", state.velocities)
+        check_state(self.cells, state)
         if forces is not None:
             check_nodal(self.cells, "forces", forces)
         stage, objective = self.staging(state), self.objective
@@ -327,6 +381,9 @@ class BatchStepper:
 
     @property
     def expected_bytes(self) -> int:
-        """Expected peak memory on the device, see `expected_bytes`; after the first step."""
-        kinds = 0 if self._inverse is None else self._inverse.count
+        """Expected peak memory on the device, see `pdcorrect.batch.memory.expected_bytes`.
+
+        Also before the first step, in which it is taken.
+        """
+        kinds = len(Sharing(self.problems, torch.device("cpu")).distinct)
         return expected_bytes(self.cells.sizes, kinds, 3 if self.first_hessian == "rest" else 1)

@@ -97,7 +97,8 @@ class Materials:
         return new
 
 
-_RANGES = {"young": "above 0", "poisson": "in [0, 0.5)", "density": "above 0"}
+RANGES = {"young": "above 0", "poisson": "in [0, 0.5)", "density": "above 0"}
+"""Of values that have a meaning."""
 
 
 def _per_cell(name: str, value: float | Array, count: int) -> Array:
@@ -110,6 +111,6 @@ def _per_cell(name: str, value: float | Array, count: int) -> Array:
     if bad.any():
         cell = int(np.argmax(bad))
         raise InputError(
-            f"{name} of cell {cell} is {array[cell]}: expected a finite number {_RANGES[name]}."
+            f"{name} of cell {cell} is {array[cell]}: expected a finite number {RANGES[name]}."
         )
     return array

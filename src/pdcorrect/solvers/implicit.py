@@ -5,6 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
+from numbers import Real
 from typing import Any, Self
 
 import numpy as np
@@ -349,14 +350,16 @@ def quiet_blas() -> AbstractContextManager[Any]:
     return _threadpools().limit(limits=1, user_api="blas")
 
 
-def whole(name: str, value: int) -> int:
-    """``value`` if it is a whole number of at least 0."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-        raise InputError(f"{name} = {value!r}: expected a whole number of at least 0.")
+def whole(name: str, value: int, least: int = 0) -> int:
+    """``value`` if it is a whole number of at least ``least``."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} = {value!r}: expected a whole number of at least {least}.")
     return int(value)
 
 
-def positive(name: str, value: float) -> None:
-    """Refuse a number that is not positive."""
-    if not 0 < value < _LARGEST:
+def positive(name: str, value: float) -> float:
+    """``value`` if it is a positive number."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    if not number or not 0 < value < _LARGEST:
         raise InputError(f"{name} = {value!r}: expected a number between 0 and {_LARGEST:g}.")
+    return float(value)

@@ -174,7 +174,7 @@ def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
     """
     if name == "generalised-alpha":
         return Integrator(schemes.generalised_alpha(spectral_radius))
-    if name not in _SCHEMES:
+    if name not in INTEGRATORS:
         raise InputError(f"integrator {name!r}: expected {', '.join(INTEGRATORS)}.")
     return Integrator(_SCHEMES[name])
 

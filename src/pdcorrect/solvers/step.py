@@ -9,6 +9,7 @@ prescribed; gradients are zero there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -301,6 +302,11 @@ def check_input(problem: Problem, state: State, forces: Array | None) -> None:
         )
     named = {"positions": state.positions, "velocities": state.velocities}
     if forces is not None:
+        if not isinstance(forces, (np.ndarray, Sequence)):
+            raise InputError(
+                f"forces is a {type(forces).__name__}: expected an array of shape "
+                f"{problem.positions.shape}."
+            )
         named["forces"] = np.asarray(forces, dtype=np.float64)
     for name, array in named.items():
         if array.shape != problem.positions.shape:
