@@ -185,8 +185,9 @@ class BatchStepper:
 
         Parameters
         ----------
-        batch : BatchState or (positions, velocities)
-            The pair is what `PDLayer` returns; (N, 3) each for a stepper of one scene.
+        batch : BatchState or pair of (B, N, 3) tensors
+            The pair, positions and velocities, is what `PDLayer` returns; (N, 3) each for a
+            stepper of one scene.
         times : (B,) floats, optional
             Of a pair, s; 0 by default.
         """
