@@ -12,9 +12,11 @@ import pytest
 
 import pdcorrect as pc
 from dataset_configs import small
+from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import Workers, generate, make_engines
+from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
@@ -44,6 +46,19 @@ def generated(tmp_path_factory):
 def test_a_generated_data_set_passes_its_check(generated):
     _, folder = generated
     assert check_dataset(folder) == []
+
+
+def test_its_card_says_what_it_is_and_how_it_fares(generated, tmp_path):
+    config, folder = generated
+    text = dataset_card(folder, dataset_info(folder))
+    manifest = json.loads((folder / MANIFEST).read_text())
+    for words in (
+        "# small-torsion", "72 to 108 nodes", "`exact`", "seed 7", manifest["content_hash"],
+        "| training | `best` |", "| evaluation | `plain` |", "3 frames of 0.01 s",
+    ):  # fmt: skip
+        assert words in text
+    with pytest.raises(InputError, match=r"no manifest.json: expected a complete data set"):
+        dataset_card(tmp_path, dataset_info(folder))
 
 
 def test_its_runs_are_what_a_user_gets_from_the_scene(generated):

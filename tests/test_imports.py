@@ -133,6 +133,7 @@ ORDER = [
     "data.check",
     "data.info",
     "data.pictures",
+    "data.card",
     "environment",
     "data.generate",
     "report",

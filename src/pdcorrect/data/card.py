@@ -1,0 +1,193 @@
+"""The card of a data set: a page that says what it is, what it cost and what it is good for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from pdcorrect.data.config import DatasetConfig, ExtraSplit
+from pdcorrect.data.families import PUBLISHED
+from pdcorrect.data.folder import all_shards
+from pdcorrect.data.info import PLAIN, DatasetInfo, SplitInfo
+from pdcorrect.data.schema import CONFIG, MANIFEST
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.errors import InputError
+
+_BODIES = {
+    "beam": "beams of 2 x 2 cells' section, held at x = 0",
+    "cross": "a beam of 2 x 2 cells' section along x, held at x = 0, with two or four "
+    "perpendicular branches of the same section at a random place (CrossMesh, fig. 6.1)",
+    "weight": "a beam along x held at both ends, alone or crossed by a second one along y, and a "
+    "pendulum with an inflated part, all of random sizes (WeightMesh, fig. 6.2)",
+}
+_MOTIONS = {
+    "torsion": "the rotational field of eq. 6-1 to 6-3 about the axis of the beam along x, "
+    "constant in time, in either sense",
+    "impulse": "a force on the inflated part (or the last two cells) in a random direction during "
+    "the first {duration:g} s",
+    "stretch": "a force on the inflated part (or the last two cells) along the axis that leads "
+    "away from the clamps, with a transverse share, rising in {duration:g} s and constant then",
+}
+_SETTINGS = {
+    "as-published": "mass density times cell volume on every node, volume weight lambda, forces on "
+    "the coarse nodes of every mesh, the same element everywhere: the setting of the thesis as far "
+    "as it is described. Its coarse meshes are too heavy, and point loads have no limit under "
+    "refinement",
+    "exact": "lumped masses that sum to density times volume, volume weight 3 lambda, loads "
+    "integrated on each mesh, and in the reference the best coarse model's element and mass",
+}
+_LIMITS = (
+    "Backward Euler's own error is the same in all runs and is not seen in their distances"
+    " ({converged}).",
+    "Loads under which a run failed or turned a cell inside out were drawn again, so the errors "
+    "are those of survivable loads.",
+    "No contact, no gravity, one material a body.",
+)
+
+
+def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
+    """The card of a generated data set, Markdown.
+
+    Parameters
+    ----------
+    folder : path
+        With ``config.toml``, ``manifest.json`` and the files.
+    info : DatasetInfo
+        Of the folder.
+
+    Raises
+    ------
+    InputError
+        If the data set is not complete.
+    """
+    folder = Path(folder)
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+    except OSError:
+        raise InputError(f"{folder}: no {MANIFEST}: expected a complete data set.") from None
+    config = DatasetConfig.load(folder / CONFIG)
+    made_with = read_shard(all_shards(folder)[0], simulations=(), verify=False).provenance
+    sections = [
+        f"# {config.name}",
+        _what(config),
+        "## Sizes\n\n" + _sizes(config, info),
+        "## Errors of the models\n\n" + _errors(info),
+        "## Generation\n\n" + _generation(config, info, made_with, manifest["content_hash"]),
+        "## Evaluation\n\n" + _evaluation(config),
+        "## Known limits\n\n" + _limits(config),
+    ]
+    return "\n\n".join(sections) + "\n"
+
+
+def _what(config: DatasetConfig) -> str:
+    motion, material = config.motion, config.material
+    loads = _MOTIONS[motion.kind].format(duration=motion.duration)
+    nodes = config.coarse_nodes or PUBLISHED[config.family].coarse
+    return "\n".join((
+        "- **Equation**: elastodynamics with the corotated energy and a volume term, backward "
+        f"Euler, {config.frames} frames of {config.step:g} s from rest.",
+        f"- **Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
+        f"{config.cell_size:g} m.",
+        f"- **Loads**: {loads}; strength {_range(motion.strength)} "
+        f"{'m/s' if motion.kind == 'impulse' else 'm/s2'} times the density or the part's mass.",
+        f"- **Material**, one draw a mesh: E {_range(material.young)} Pa (log-uniform), Poisson's "
+        f"ratio {_range(material.poisson)}, density {_range(material.density)} kg/m3.",
+        f"- **Setting** `{config.setting}`: {_SETTINGS[config.setting]}.",
+        f"- **Reference**: {config.reference.solver.upper()} on cells cut into "
+        f"{config.reference.refine} x {config.reference.refine} x {config.reference.refine}, to "
+        f"{config.tolerance:g} of a cell in each step.",
+        "- Everything else is in `config.toml`; `docs/datasets.md` explains its keys and why "
+        "material and strength are drawn so.",
+    ))  # fmt: skip
+
+
+def _range(ends: tuple[float, float]) -> str:
+    return f"{ends[0]:g} to {ends[1]:g}"
+
+
+def _sizes(config: DatasetConfig, info: DatasetInfo) -> str:
+    refines = {extra.name: extra.refine for extra in config.extra}
+    rows = [
+        (
+            name, split.meshes, split.simulations, _whole(split.nodes),
+            refines.get(name) or config.reference.refine, f"{1e3 * split.displacement.median:.3g}",
+            f"{1e3 * split.displacement.largest:.3g}", f"{100 * split.rejection_rate:.3g}",
+        )
+        for name, split in info.splits.items()
+    ]  # fmt: skip
+    heads = (
+        "split", "meshes", "simulations", "nodes", "reference's cut", "displacement: median, mm",
+        "largest, mm", "loads rejected, %",
+    )  # fmt: skip
+    return _table(heads, rows) + f"\n\n{info.whole.bytes / 1e6:.3g} MB in all."
+
+
+def _whole(ends: tuple[float, float]) -> str:
+    return f"{ends[0]:.0f} – {ends[1]:.0f}"
+
+
+def _errors(info: DatasetInfo) -> str:
+    heads = (
+        "split", "run", "RMS, mm", "one step, mm", "Omega: mean", "median", "5 %", "worst",
+    )  # fmt: skip
+    rows = [row for name, split in info.splits.items() for row in _runs(name, split)]
+    return _table(heads, rows) + (
+        "\n\nDistances from the reference on the coarse nodes, means over simulations; Omega (eq. "
+        "7-3) is the share of the plain run's squared error that is gone, per cent."
+    )
+
+
+def _runs(name: str, split: SplitInfo) -> Iterable[tuple[object, ...]]:
+    for run, found in split.runs.items():
+        if found.rms_error is None and found.step_error is None:
+            continue
+        omega = found.omega
+        shares = (omega.mean, omega.median, omega.q05, omega.smallest) if omega else (None,) * 4
+        errors = (found.rms_error, found.step_error)
+        lengths = [None if e is None else 1e3 * e for e in errors]
+        yield (name, f"`{run}`", *("" if v is None else f"{v:.3g}" for v in (*lengths, *shares)))
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+
+
+def _generation(
+    config: DatasetConfig, info: DatasetInfo, made_with: Mapping[str, str], content: str
+) -> str:
+    where = made_with.get("device", "cpu")
+    machine = made_with.get("processor", "?") if where == "cpu" else where
+    return (
+        f"`pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}: "
+        f"{info.whole.seconds['total']:.3g} s of computing time in all, begun on "
+        f"{made_with.get('date', '?')} with pdcorrect {made_with.get('pdcorrect', '?')} on "
+        f"{machine}.\n\nSHA-256 of all files' contents: `{content}`. On another processor or "
+        "device numbers agree to the solver's tolerance, and the hash differs."
+    )
+
+
+def _evaluation(config: DatasetConfig) -> str:
+    lines = [
+        "Omega of rollouts from rest on the split `evaluation`, in the mean over simulations, with "
+        f"`{PLAIN}` as zero; choices while developing are made on `validation`. Splits are by mesh."
+    ]
+    lines += [f"- `{extra.name}`: {_difference(extra)}." for extra in config.extra]
+    return "\n".join(lines)
+
+
+def _difference(extra: ExtraSplit) -> str:
+    """What a split changes against the data set."""
+    keys = ("family", "young", "poisson", "refine")
+    told = [f"{key} {getattr(extra, key)}" for key in keys if getattr(extra, key) is not None]
+    factors = {"strength": extra.strength_factor, "step": extra.step_factor}
+    factors["frames"] = extra.frames_factor
+    told += [f"{name} times {factor:g}" for name, factor in factors.items() if factor != 1]
+    return ", ".join(told).replace("refine", "reference cut into") or "the same distribution"
+
+
+def _limits(config: DatasetConfig) -> str:
+    converged = "the run `time-converged` in the evaluation split shows it"
+    text = "\n".join(f"- {line}" for line in _LIMITS)
+    return text.format(converged=converged if config.converged_steps else "no run here shows it")
