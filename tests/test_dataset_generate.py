@@ -49,7 +49,7 @@ def test_a_generated_data_set_passes_its_check(generated):
 
 
 def test_its_card_says_what_it_is_and_how_it_fares(generated, tmp_path):
-    config, folder = generated
+    _, folder = generated
     text = dataset_card(folder, dataset_info(folder))
     manifest = json.loads((folder / MANIFEST).read_text())
     for words in (
