@@ -22,6 +22,7 @@ CONFIG = {
     "motion": {"kind": "torsion", "strength": (10.0, 20.0)},
     "training": {"meshes": 3, "simulations": 6},
     "evaluation": {"meshes": 1, "simulations": 2},
+    "reference": {"refine": 2},
     "validation_share": 0.34,
 }
 """Two training meshes, one of validation and one of evaluation, with two simulations each."""
@@ -50,16 +51,16 @@ def sample_shard(config, mesh):
         poisson=np.full(count, mesh.poisson),
         density=np.full(count, mesh.density),
         simulations=tuple(
-            sample_simulation(problem, mesh.frames, np.random.default_rng((*mesh.stream, 99, k)))
-            for k in range(mesh.simulations)
+            sample_simulation(config, mesh, problem, k) for k in range(mesh.simulations)
         ),
         provenance={"pdcorrect": "0", "date": "2026-01-01"},
     )  # fmt: skip
 
 
-def sample_simulation(problem, frames, rng):
+def sample_simulation(config, mesh, problem, number):
     """A reference, a plain run with half its displacement and a better one with 0.9 of it."""
-    motion = smooth_motion(problem, frames, rng)
+    rng = np.random.default_rng((*mesh.stream, 99, number))
+    motion = smooth_motion(problem, mesh.frames, rng)
     rest = problem.positions
     return Simulation(
         forces=rng.normal(size=motion[1:].shape),
@@ -70,7 +71,7 @@ def sample_simulation(problem, frames, rng):
             ),
             "best": sample_run(rest + 0.9 * motion, rng, refine=1),
         },
-        scene_toml='name = "made up, ν = 0.4"\n',
+        scene_toml=draw_scene(config, mesh, number, attempt=1).to_toml(),
         attempt=1,
         rejected=("reference, cells inverted at step 3",),
         seconds={"reference": 4.0, "plain": 0.25, "plain steps": 0.5},

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,10 +19,12 @@ from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import Workers, generate, make_engines
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST
+from pdcorrect.data.schema import MANIFEST, clear_parts, part_of_process
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
+
+distributed = pytest.importorskip("distributed")
 
 
 def all_shards(folder):
@@ -200,7 +203,6 @@ def test_loads_that_are_never_accepted_are_an_error():
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):
-    pytest.importorskip("distributed")
     config, folder = generated
     assert generate(config, tmp_path / "two", Workers(2))
     assert hashes(tmp_path / "two") == hashes(folder)
@@ -236,32 +238,103 @@ def test_another_configuration_may_not_use_the_folder(generated):
         generate(small(), folder, splits=["nonsense"])
 
 
-def interrupted(config, folder, delay):
-    """Start the generation in a process of its own and kill it."""
-    folder.mkdir(exist_ok=True)
+def test_files_of_others_are_never_overwritten(generated, tmp_path, monkeypatch):
+    config, folder = generated
+    foreign = tmp_path / "foreign"
+    shutil.copytree(folder, foreign)
+    (foreign / "config.toml").unlink()
+    with pytest.raises(InputError, match="holds files of meshes but no config.toml"):
+        generate(config, foreign)
+    other = small(seed=8)
+    (foreign / "config.toml").write_text(other.to_toml())
+    with pytest.raises(InputError, match=r"mesh-0000.h5 is of another data set"):
+        generate(other, foreign)
+    monkeypatch.setattr("pdcorrect.data.seal.VERSION", 0)
+    with pytest.raises(FileFormatError, match="written by a newer pdcorrect"):
+        generate(config, folder)
+
+
+def test_processes_write_to_places_of_their_own_and_clear_up_after_dead_ones(tmp_path):
+    path = tmp_path / "training" / "mesh-0000.h5"
+    path.parent.mkdir()
+    own, again = part_of_process(path), part_of_process(path)
+    assert own != again
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    dead = own.with_name(own.name.replace(f".{os.getpid()}.", f".{ended.pid}."))
+    strange = path.with_name("mesh-0000.h5.part")
+    for part in (own, dead, strange):
+        part.write_bytes(b"half")
+    clear_parts(tmp_path)
+    assert own.exists()
+    assert strange.exists()
+    assert not dead.exists()
+
+
+def slow_work(config, folder, plans, device):
+    """In place of the computation, on a worker in this process; the second one joins now."""
+    SEEN.add(distributed.get_worker().address)
+    CLUSTERS[-1].scale(2)
+    time.sleep(0.3)
+    return plans
+
+
+SEEN, CLUSTERS = set(), []
+
+
+def test_workers_that_join_later_are_used(tmp_path, monkeypatch):
+    config = small(frames=1, coarse_nodes=[72, 150], training={"meshes": 9, "simulations": 9})
+    options = {"n_workers": 1, "threads_per_worker": 1, "processes": False}
+    monkeypatch.setattr("pdcorrect.data.generate._work", slow_work)
+    with distributed.LocalCluster(**options, dashboard_address=":0") as cluster:
+        CLUSTERS.append(cluster)
+        workers = Workers(scheduler=cluster.scheduler_address)
+        assert not generate(config, tmp_path, workers)  # for nothing was written
+    assert len(SEEN) == 2
+
+
+def test_an_unknown_device_is_refused(tmp_path):
+    with pytest.raises(InputError, match="device 'gpu': expected cpu, cuda or cuda:N"):
+        generate(small(), tmp_path / "set", Workers(device="gpu"))
+    assert not (tmp_path / "set").exists()
+
+
+def interrupted(config, folder, delay, workers):
+    """Start the generation in processes of its own and kill them; whether it was running."""
     path = folder.parent / "set.toml"
     path.write_text(config.to_toml())
-    command = [sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", path, "-o", folder]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    command = [
+        sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", path, "-o", folder,
+        "--workers", str(workers),
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     try:
         process.wait(timeout=delay)
     except subprocess.TimeoutExpired:
-        os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+        os.killpg(process.pid, signal.SIGKILL)
+    return process.wait() == -signal.SIGKILL
 
 
 @pytest.mark.slow
-def test_killed_twenty_times_it_ends_with_the_same_files(generated, tmp_path):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_killed_twenty_times_it_ends_with_the_same_files(generated, tmp_path, workers):
     config, folder = generated
     rng = np.random.default_rng(0)
     target = tmp_path / "killed"
     started = time.perf_counter()
-    interrupted(config, tmp_path / "whole", 600)
+    assert not interrupted(config, tmp_path / "whole", 600, workers)
     whole = time.perf_counter() - started
+    killed = 0
     for _ in range(20):
-        interrupted(config, target, rng.uniform(0.3, 1.0) * whole)
-        for path in target.rglob("*.h5"):
+        done = sorted(target.rglob("*.h5"))
+        for path in done:
             read_shard(path)
+        if done:  # so that there always is something to do
+            done[rng.integers(len(done))].unlink()
+        killed += interrupted(config, target, rng.uniform(0.3, 0.9) * whole, workers)
+    assert killed >= 10
     assert generate(config, target)
     assert not list(target.rglob("*.part"))
     assert hashes(target) == hashes(folder)

@@ -150,7 +150,12 @@ def test_extra_splits_leave_the_training_distribution_as_told():
         ({"material": {"young": [2.0, 1.0], "poisson": [0.3, 0.3], "density": [1.0, 1.0]}},
          "low <= high"),
         ({"material": {"young": [1.0, 2.0], "poisson": [0.3, 0.5], "density": [1.0, 1.0]}},
-         "poisson below 0.5"),
+         "material.poisson.1"),
+        ({"extra": [{"name": "a", "meshes": 1, "simulations": 1, "poisson": [0.3, 0.6]}]},
+         "extra.0.poisson.1"),
+        ({"extra": [{"name": "a", "meshes": 1, "simulations": 1, "young": [2.0, 1.0]}]},
+         "low <= high"),
+        ({"motion": {"kind": "torsion", "strength": [2.0, 1.0]}}, "low <= high"),
         ({"extra": [{"name": "training", "meshes": 1, "simulations": 1}]}, "a name of its own"),
         ({"name": "../up"}, "name"),
         ({"setting": "nearly"}, "setting"),
@@ -162,6 +167,16 @@ def test_wrong_configurations_are_refused_by_name(change, message):
     data = {**small().model_dump(mode="json", exclude_none=True), **change}
     with pytest.raises(pc.errors.InputError, match=re.escape(message)):
         DatasetConfig.from_toml(tomli_w.dumps(data))
+
+
+def test_mirrored_bodies_count_as_the_same():
+    rng = RNG(0)
+    designs = [draw("weight", (237, 471), rng) for _ in range(40)]
+    for design in designs:
+        start, width = design.shape["pendulum_start"], design.shape["support_cells"][0] - 2
+        mirrored = replace(design, shape={**design.shape, "pendulum_start": width - start})
+        assert mirrored.key() == design.key()
+    assert len({design.key() for design in designs}) > 30
 
 
 def test_more_meshes_than_a_family_has_bodies_are_refused():

@@ -31,6 +31,10 @@ class FileFormatError(InputError):
     """A file is damaged or is not what it was taken for."""
 
 
+class FileVersionError(FileFormatError):
+    """A file is whole, but of a version of its format that this code does not read."""
+
+
 class OutputError(PdcorrectError, OSError):
     """A result could not be written."""
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards, shard_number
-from pdcorrect.data.plan import MeshPlan, make_plan
+from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
 from pdcorrect.data.schema import (
     CONFIG,
     MANIFEST,
@@ -26,9 +26,11 @@ from pdcorrect.data.schema import (
     Simulation,
 )
 from pdcorrect.data.shard_reader import read_shard, stored_hash
+from pdcorrect.data.simulate import models
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import HexMesh
+from pdcorrect.fem.problem import discretise
 
 Severity = Literal["error", "warning"]
 _OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
@@ -206,8 +208,8 @@ class _Check:
             yield f"its content is not that of which {MANIFEST} has the hash"
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"
-        if plan is not None:
-            yield from _plan_faults(plan, shard)
+        if plan is not None and self.config is not None:
+            yield from _plan_faults(self.config, plan, shard)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
@@ -314,12 +316,33 @@ def _unlike_runs(shard: Shard) -> Iterator[str]:
             yield f"simulation {k:04d} has no run {missing[0]!r}, unlike others"
 
 
-def _plan_faults(plan: MeshPlan, shard: Shard) -> Iterator[str]:
+def _plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator[str]:
+    """Where a file is not the mesh, the material, the loads and the runs that it should be."""
     if len(shard.simulations) != plan.simulations:
         yield f"{len(shard.simulations)} simulations: expected {plan.simulations}"
+    problem = discretise(draw_scene(config, plan, 0))
+    arrays: tuple[tuple[str, Array], ...] = (
+        ("points", problem.positions),
+        ("cells", problem.cells),
+        ("free", problem.free),
+        ("mass", problem.mass),
+        ("young", problem.materials.young),
+        ("poisson", problem.materials.poisson),
+        ("density", problem.materials.density),
+    )
+    for name, wanted in arrays:
+        found = getattr(shard, name)
+        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
+            yield f"its {name} are not those of config.toml"
     for k, simulation in enumerate(shard.simulations):
         if simulation.steps != plan.frames:
             yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
+        if simulation.scene_toml != draw_scene(config, plan, k, simulation.attempt).to_toml():
+            yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
+        named = {n for n, model in models(config, plan).items() if k == 0 or not model.sample}
+        missing = sorted(named - set(simulation.runs))
+        if missing:
+            yield f"simulation {k:04d} has no run {missing[0]!r}"
 
 
 # --- comparison of files -------------------------------------------------------------------

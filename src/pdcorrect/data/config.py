@@ -9,16 +9,26 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from pdcorrect.errors import InputError
-from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
+from pdcorrect.scene.regions import Count, NonNegative, Poisson, Positive, PositiveCount, Strict
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
-Range = tuple[Positive, Positive]
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if ends[0] > ends[1]:
+        raise ValueError("expected [low, high] with low <= high")
+    return ends
+
+
+Range = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+Span = Annotated[tuple[NonNegative, NonNegative], AfterValidator(_ordered)]
+PoissonRange = Annotated[tuple[Poisson, Poisson], AfterValidator(_ordered)]
 Share = Annotated[float, Field(strict=True, ge=0, lt=1)]
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9.-]*$", max_length=80)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=80)]
 
 TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
 """The splits that every data set has."""
@@ -38,18 +48,8 @@ class MaterialRange(Strict):
     """
 
     young: Range
-    poisson: tuple[NonNegative, NonNegative]
+    poisson: PoissonRange
     density: Range
-
-    @model_validator(mode="after")
-    def _ordered(self) -> MaterialRange:
-        for name in ("young", "poisson", "density"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f"expected {name} = [low, high] with low <= high")
-        if self.poisson[1] >= 0.5:
-            raise ValueError("expected poisson below 0.5")
-        return self
 
 
 class MotionRange(Strict):
@@ -78,9 +78,9 @@ class MotionRange(Strict):
     kind: MotionName
     strength: Range
     duration: Positive = 0.01
-    attraction: tuple[NonNegative, NonNegative] = (0.0, 0.5)
-    stretch: tuple[NonNegative, NonNegative] = (0.5, 1.5)
-    transverse: tuple[NonNegative, NonNegative] = (0.0, 0.3)
+    attraction: Span = (0.0, 0.5)
+    stretch: Span = (0.5, 1.5)
+    transverse: Span = (0.0, 0.3)
 
 
 class Reference(Strict):
@@ -127,7 +127,7 @@ class ExtraSplit(Split):
     name: Name
     family: FamilyName | None = None
     young: Range | None = None
-    poisson: tuple[NonNegative, NonNegative] | None = None
+    poisson: PoissonRange | None = None
     strength_factor: Positive = 1.0
     step_factor: Positive = 1.0
     frames_factor: PositiveCount = 1

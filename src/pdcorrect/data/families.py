@@ -45,8 +45,12 @@ class Design:
     axis: tuple[float, float, float]
 
     def key(self) -> str:
-        """Equal for equal bodies."""
-        return repr(sorted(self.shape.items()))
+        """Equal for equal bodies, and for mirrored ones that are held in the same way."""
+        shape = dict(self.shape)
+        if shape["shape"] == "weight":
+            width = shape["support_cells"][0] - shape["pendulum_cells"][0]
+            shape["pendulum_start"] = min(shape["pendulum_start"], width - shape["pendulum_start"])
+        return repr(sorted(shape.items()))
 
 
 class NodeRange(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,15 +20,31 @@ import numba
 
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import OneByOne
+from pdcorrect.data.folder import all_shards
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import CONFIG, MANIFEST, SUFFIX, write_shard
+from pdcorrect.data.schema import (
+    CONFIG,
+    MANIFEST,
+    SUFFIX,
+    clear_parts,
+    part_of_process,
+    write_shard,
+)
 from pdcorrect.data.shard_reader import read_shard, stored_hash
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.environment import environment
-from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
-from pdcorrect.replacement import part_of, replacing
+from pdcorrect.errors import (
+    FileFormatError,
+    FileVersionError,
+    InputError,
+    OutputError,
+    require_extra,
+)
+from pdcorrect.replacement import replacing
 
 LARGEST_BATCHED = 40_000
+_PATIENCE = 600
+"""Seconds to wait for the first worker of a scheduler."""
 OnFile = Callable[[str, int, int], None]
 """Called with a finished file's name, and how many simulations of how many are there now."""
 
@@ -94,7 +111,9 @@ def generate(
         If a file cannot be written.
     """
     folder = Path(folder)
+    check_device(workers.device)
     _claim(config, folder)
+    clear_parts(folder)
     plans = make_plan(config)
     chosen = _chosen(plans, splits)
     missing = [plan for plan in chosen if not is_done(config, folder, plan)]
@@ -110,16 +129,25 @@ def generate(
 
 
 def is_done(config: DatasetConfig, folder: Path, plan: MeshPlan) -> bool:
-    """Whether a mesh's file is there, whole, and of this configuration."""
+    """Whether a mesh's file is there and whole; a damaged one is to be made again.
+
+    Raises
+    ------
+    InputError
+        If there is a whole file of something else.
+    """
     path = folder / f"{plan.name}{SUFFIX}"
-    part_of(path).unlink(missing_ok=True)  # of a writer that was killed
     if not path.exists():
         return False
     try:
-        found = read_shard(path, simulations=())
-    except FileFormatError:  # made again
+        found = read_shard(path, simulations=()).attributes["config_hash"]
+    except FileVersionError:
+        raise
+    except FileFormatError:
         return False
-    return found.attributes["config_hash"] == config.hash()
+    if found != config.hash():
+        raise InputError(f"{path} is of another data set: move it, or use another folder.")
+    return True
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:
@@ -132,9 +160,11 @@ def _claim(config: DatasetConfig, folder: Path) -> None:
                 "data set was begun in."
             )
         return
+    if all_shards(folder):
+        raise InputError(f"{folder} holds files of meshes but no {CONFIG}: use another folder.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as part:
+        with replacing(path, part_of_process(path)) as part:
             part.write_text(config.to_toml(), encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
@@ -178,6 +208,12 @@ def produce(
         path = folder / f"{plan.name}{SUFFIX}"
         write_shard(path, replace(shard, provenance=provenance), config.dtype)
     return plans
+
+
+def check_device(device: str) -> None:
+    """Refuse what is neither the CPU nor a CUDA device."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise InputError(f"device {device!r}: expected cpu, cuda or cuda:N.")
 
 
 def make_engines(config: DatasetConfig, device: str) -> Engines:
@@ -230,20 +266,20 @@ def _distributed(
     distributed = require_extra("distributed", "cluster")
     folder = folder.resolve()
     with _client(distributed, workers) as client, client.as_current():
-        threads = client.nthreads()
-        if not threads:
-            raise InputError(f"the scheduler at {workers.scheduler} has no workers: start some.")
+        client.wait_for_workers(1, timeout=_PATIENCE)
         waiting = iter(units)
         running = distributed.as_completed(raise_errors=True)
 
         def hand_out() -> None:
-            unit = None if _over(deadline) else next(waiting, None)
-            if unit is not None:
+            """Keep every worker busy, also those that have joined since."""
+            while running.count() < sum(client.nthreads().values()):
+                unit = None if _over(deadline) else next(waiting, None)
+                if unit is None:
+                    return
                 call = client.submit(_work, config, folder, unit, workers.device, pure=False)
                 running.add(call)
 
-        for _ in range(sum(threads.values())):
-            hand_out()
+        hand_out()
         for future in running:
             yield future.result()
             hand_out()
@@ -308,6 +344,7 @@ def _write_manifest(config: DatasetConfig, folder: Path, plans: Sequence[MeshPla
         "content_hash": whole,
         "files": hashes,
     }
-    with replacing(folder / MANIFEST) as part:
+    path = folder / MANIFEST
+    with replacing(path, part_of_process(path)) as part:
         part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return True

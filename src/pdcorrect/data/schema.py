@@ -30,6 +30,9 @@ from __future__ import annotations
 import hashlib
 import io
 import os
+import re
+import secrets
+import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -161,6 +164,31 @@ ATTRIBUTES = {
 """Attributes of a `Shard` and their types."""
 
 
+def part_of_process(path: Path) -> Path:
+    """Where this process writes what is to become a file, unlike any other's place."""
+    host = re.sub(r"[^A-Za-z0-9]+", "-", socket.gethostname())
+    return path.with_name(f"{path.name}.{host}.{os.getpid()}.{secrets.token_hex(4)}.part")
+
+
+def clear_parts(folder: Path) -> None:
+    """Delete what processes of this machine that are no more have left unfinished."""
+    host = re.sub(r"[^A-Za-z0-9]+", "-", socket.gethostname())
+    for part in folder.rglob("*.part"):
+        fields = part.name.split(".")
+        if len(fields) > 4 and fields[-4] == host and not _alive(int(fields[-3])):
+            part.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
 def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
     """Write a file whole or not at all; returns the hash of its content.
 
@@ -185,7 +213,7 @@ def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
     seal(image.getbuffer())
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as part, open(part, "wb") as stream:
+        with replacing(path, part_of_process(path)) as part, open(part, "wb") as stream:
             stream.write(image.getbuffer())
             stream.flush()
             os.fsync(stream.fileno())
@@ -200,7 +228,7 @@ def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
     for name, wanted in ATTRIBUTES.items():
         file.attrs[name] = wanted(shard.attributes[name])
     for name, (place, kind, _) in MESH.items():
-        file[place] = np.asarray(getattr(shard, name), dtype=kind)
+        _array(file, place, np.asarray(getattr(shard, name)), np.dtype(kind))
     for k, simulation in enumerate(shard.simulations):
         group = file.create_group(f"simulations/{k:04d}")
         group.attrs["attempt"] = simulation.attempt
@@ -220,10 +248,11 @@ def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
         if getattr(run, name) is not None:
             _array(group, name, getattr(run, name), dtype)
     for name, values in run.statistics.items():
-        group[name] = np.asarray(values, dtype=STATISTICS[name])
+        _array(group, name, np.asarray(values), np.dtype(STATISTICS[name]))
 
 
 def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) -> None:
+    """One compressed chunk with a checksum of its own, for readers that skip the file's."""
     group.create_dataset(
         name, data=np.asarray(values, dtype=dtype), chunks=values.shape, compression="gzip",
         shuffle=True, fletcher32=True,

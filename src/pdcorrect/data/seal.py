@@ -23,7 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from pdcorrect.errors import FileFormatError
+from pdcorrect.errors import FileFormatError, FileVersionError
 
 FORMAT = "pdcorrect-dataset"
 VERSION = 1
@@ -127,9 +127,9 @@ def _strange(block: bytes) -> str:
 def _check_version(path: Path, found: dict[str, bytes]) -> None:
     version = int(found["version"])
     if version > VERSION:
-        raise FileFormatError(
+        raise FileVersionError(
             f"{path}: written by a newer pdcorrect, in format version {version}; this one reads "
             f"version {VERSION}: update pdcorrect."
         )
     if version < VERSION:
-        raise FileFormatError(f"{path}: format version {version}: expected {VERSION}.")
+        raise FileVersionError(f"{path}: format version {version}: expected {VERSION}.")
