@@ -6,6 +6,7 @@ import pickle
 import shutil
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 
@@ -182,6 +183,21 @@ def test_damaged_files_are_refused_by_name(folder, tmp_path):
     path.write_bytes(whole[:-2000])
     with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: .*truncated"):
         dataset[0]
+
+
+def test_a_changed_bit_in_any_array_is_found_without_the_seal(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "set")
+    path = tmp_path / "set" / "training" / "mesh-0000.h5"
+    whole = path.read_bytes()
+    for place in ("material/young", "mesh/points", "mesh/cells", "mesh/mass"):
+        with h5py.File(path) as file:
+            chunk = file[place].id.get_chunk_info(0)
+        changed = bytearray(whole)
+        changed[chunk.byte_offset + chunk.size // 2] ^= 4
+        path.write_bytes(changed)
+        with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: damaged"):
+            opened(tmp_path / "set")[0]
+        path.write_bytes(whole)
 
 
 # --- batches ---------------------------------------------------------------------------
