@@ -27,9 +27,16 @@ def terminable() -> Iterator[None]:
     sys.unraisablehook = _insist
     try:
         yield
+    except Terminated:
+        hook = _silent  # the process ends
+        raise
     finally:
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, handler)
+
+
+def _silent(lost: Any) -> None:
+    """Nothing: what was half made when the signal came may fail to be deleted."""
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
@@ -38,9 +45,13 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _insist(lost: Any) -> None:
-    """Signal again if Python dropped the exception, as it does in destructors and callbacks."""
+    """Signal again if Python dropped the exception, as it does in destructors and callbacks.
+
+    Other errors in destructors after the signal are those of objects whose making it cut short.
+    """
     if lost.exc_type is not Terminated:
-        sys.__unraisablehook__(lost)
+        if signal.getsignal(signal.SIGTERM) is not signal.SIG_IGN:
+            sys.__unraisablehook__(lost)
         return
     signal.signal(signal.SIGTERM, _terminate)
     again = threading.Timer(_PAUSE, signal.raise_signal, [signal.SIGTERM])
