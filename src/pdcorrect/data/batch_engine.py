@@ -27,9 +27,7 @@ class Batched:
     tolerance : float
         Of the coarse cell size.
     most : int
-        Problems that are stepped together; single steps of small problems are taken
-        for several frames at once, up to this number of nodes over that of the largest
-        problem of a rollout.
+        Single steps that are taken together: those of several frames of each problem.
     """
 
     solver = "pd"

@@ -9,8 +9,8 @@ from pathlib import Path
 from pdcorrect.data.config import DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.info import PLAIN, DatasetInfo, SplitInfo
-from pdcorrect.data.schema import CONFIG, MANIFEST
+from pdcorrect.data.info import DatasetInfo, SplitInfo
+from pdcorrect.data.schema import CONFIG, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.data.graph import velocities
-from pdcorrect.data.schema import REFERENCE, SUFFIX, Run, Shard, Simulation, write_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Run, Shard, Simulation, write_shard
 from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.fem.hexahedron import (
     VTK_CORNERS,
@@ -30,7 +30,6 @@ from pdcorrect.state import State, Trajectory
 
 Array = NDArray[Any]
 
-PLAIN = "plain"
 SETTING = "imported"
 _AT_REST = 1e-6
 """Of a cell's shortest edge: how far frame 0 may be from the rest shape."""

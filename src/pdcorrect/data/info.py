@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.schema import REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
@@ -19,8 +19,6 @@ from pdcorrect.metrics import error_corrected, largest_displacement, mean_square
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-PLAIN = "plain"
-"""The run that others are to correct."""
 Range = tuple[float, float]
 
 

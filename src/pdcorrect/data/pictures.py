@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdcorrect.data.info import PLAIN, MeasuredMesh, dataset_files, measure_dataset
-from pdcorrect.data.schema import REFERENCE, Array
+from pdcorrect.data.info import MeasuredMesh, dataset_files, measure_dataset
+from pdcorrect.data.schema import PLAIN, REFERENCE, Array
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, require_extra
 from pdcorrect.figures.files import Image, replacing, write_png

@@ -46,7 +46,8 @@ from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import OutputError
 from pdcorrect.replacement import replacing
 
-REFERENCE = "reference"
+REFERENCE, PLAIN = "reference", "plain"
+"""Runs: the truth, and the coarse model that is to be corrected."""
 SUFFIX = ".h5"
 CONFIG, MANIFEST, NORMALISATION = "config.toml", "manifest.json", "statistics.json"
 """Files of a data set besides those of its meshes."""

@@ -12,13 +12,12 @@ import numpy as np
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.state import State
 
-PLAIN = "plain"
 MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
 
