@@ -28,7 +28,7 @@ from pdcorrect.data.schema import (
     content_of,
     write_shard,
 )
-from pdcorrect.data.shard_reader import read_shard, stored_hash
+from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.io.trajectory import save_trajectory
 
@@ -779,7 +779,7 @@ def test_a_short_simulation_is_found(dataset):
 
 def test_a_content_other_than_the_manifest_has_is_found(dataset):
     names = [plan.name for plan in make_plan(sample_config())]
-    hashes = {name: stored_hash(dataset / f"{name}.h5") for name in names}
+    hashes = {name: stored_hashes(dataset / f"{name}.h5")[1] for name in names}
     (dataset / "manifest.json").write_text(json.dumps({"files": hashes}))
     assert findings(dataset) == []
     changed(dataset / FIRST, lambda s: with_simulation(s, 1, scene_toml="another"))

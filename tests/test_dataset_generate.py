@@ -20,10 +20,11 @@ from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import Workers, generate, make_engines
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST, clear_parts, part_of_process
+from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
+from pdcorrect.replacement import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")

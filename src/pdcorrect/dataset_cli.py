@@ -210,14 +210,9 @@ def card(
 
 
 def _write(path: Path, text: str) -> None:
-    from pdcorrect.errors import OutputError
-    from pdcorrect.replacement import replacing
+    from pdcorrect.replacement import write_text
 
-    try:
-        with replacing(path) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    write_text(path, text)
     typer.echo(f"wrote {path}")
 
 

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import re
+import secrets
+import socket
 from collections.abc import Iterator
 from pathlib import Path
+
+from pdcorrect.errors import OutputError
 
 
 @contextlib.contextmanager
@@ -25,3 +31,46 @@ def replacing(path: Path, part: Path | None = None) -> Iterator[Path]:
 def part_of(path: Path) -> Path:
     """Where what is to replace a file is written."""
     return path.with_name(path.name + ".part")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all, whoever else writes it at the time.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path, part_of_process(path)) as part:
+            part.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+
+
+def part_of_process(path: Path) -> Path:
+    """Where this process writes what is to become a file, unlike any other's place."""
+    return path.with_name(f"{path.name}.{_host()}.{os.getpid()}.{secrets.token_hex(4)}.part")
+
+
+def clear_parts(folder: Path) -> None:
+    """Delete what processes of this machine that are no more have left unfinished."""
+    for part in folder.rglob("*.part"):
+        fields = part.name.split(".")
+        if len(fields) > 4 and fields[-4] == _host() and not _alive(int(fields[-3])):
+            part.unlink(missing_ok=True)
+
+
+def _host() -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", socket.gethostname())
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -25,7 +25,7 @@ from pdcorrect.data.schema import (
     Shard,
     Simulation,
 )
-from pdcorrect.data.shard_reader import read_shard, stored_hash
+from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.data.simulate import models
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
@@ -204,7 +204,7 @@ class _Check:
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
         name = self._short(path).removesuffix(SUFFIX)
-        if self.hashes is not None and self.hashes.get(name) != stored_hash(path):
+        if self.hashes is not None and self.hashes.get(name) != stored_hashes(path)[1]:
             yield f"its content is not that of which {MANIFEST} has the hash"
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"

@@ -18,7 +18,7 @@ from pdcorrect.data.schema import REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
-from pdcorrect.replacement import replacing
+from pdcorrect.replacement import replacing, write_text
 from pdcorrect.state import Trajectory
 
 NORMAL, HANDLE = 0, 3
@@ -88,7 +88,7 @@ def export_meshgraphnet(
         if meta == common:
             continue
         path = target / ("meta.json" if common is None else f"meta-{name}.json")
-        _write_text(path, json.dumps(meta, indent=1) + "\n")
+        write_text(path, json.dumps(meta, indent=1) + "\n")
         written.append(path)
         common = common or meta
     return written
@@ -267,11 +267,3 @@ def _make(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from None
-
-
-def _write_text(path: Path, text: str) -> None:
-    try:
-        with replacing(path) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None

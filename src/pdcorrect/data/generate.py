@@ -11,7 +11,7 @@ import hashlib
 import json
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,21 +26,18 @@ from pdcorrect.data.schema import (
     CONFIG,
     MANIFEST,
     SUFFIX,
-    clear_parts,
-    part_of_process,
     write_shard,
 )
-from pdcorrect.data.shard_reader import read_shard, stored_hash
+from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.environment import environment
 from pdcorrect.errors import (
     FileFormatError,
     FileVersionError,
     InputError,
-    OutputError,
     require_extra,
 )
-from pdcorrect.replacement import replacing
+from pdcorrect.replacement import clear_parts, write_text
 
 LARGEST_BATCHED = 40_000
 _PATIENCE = 600
@@ -116,7 +113,8 @@ def generate(
     clear_parts(folder)
     plans = make_plan(config)
     chosen = _chosen(plans, splits)
-    missing = [plan for plan in chosen if not is_done(config, folder, plan)]
+    hashes = {plan.name: finished(config, folder, plan) for plan in chosen}
+    missing = [plan for plan in chosen if hashes[plan.name] is None]
     units = _units(missing, workers)
     deadline = None if seconds is None else time.monotonic() + seconds
     total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
@@ -125,11 +123,14 @@ def generate(
             left -= plan.simulations
             if on_file:
                 on_file(plan.name, total - left, total)
-    return _write_manifest(config, folder, plans)
+    for plan in plans:
+        if hashes.get(plan.name) is None:
+            hashes[plan.name] = finished(config, folder, plan)
+    return _write_manifest(config, folder, hashes)
 
 
-def is_done(config: DatasetConfig, folder: Path, plan: MeshPlan) -> bool:
-    """Whether a mesh's file is there and whole; a damaged one is to be made again.
+def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
+    """The hash of a mesh's file; None if there is none, or a damaged one to be made again.
 
     Raises
     ------
@@ -138,16 +139,16 @@ def is_done(config: DatasetConfig, folder: Path, plan: MeshPlan) -> bool:
     """
     path = folder / f"{plan.name}{SUFFIX}"
     if not path.exists():
-        return False
+        return None
     try:
-        found = read_shard(path, simulations=()).attributes["config_hash"]
+        config_hash, content_hash = stored_hashes(path)
     except FileVersionError:
         raise
     except FileFormatError:
-        return False
-    if found != config.hash():
+        return None
+    if config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
-    return True
+    return content_hash
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:
@@ -162,12 +163,7 @@ def _claim(config: DatasetConfig, folder: Path) -> None:
         return
     if all_shards(folder):
         raise InputError(f"{folder} holds files of meshes but no {CONFIG}: use another folder.")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(path, part_of_process(path)) as part:
-            part.write_text(config.to_toml(), encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+    write_text(path, config.to_toml())
 
 
 def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[MeshPlan]:
@@ -332,19 +328,16 @@ def _device_name(device: str) -> str:
     return str(torch.cuda.get_device_name(device))
 
 
-def _write_manifest(config: DatasetConfig, folder: Path, plans: Sequence[MeshPlan]) -> bool:
+def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> bool:
     """List the files' hashes if all are there."""
-    if not all(is_done(config, folder, plan) for plan in plans):
+    if None in hashes.values():
         return False
-    hashes = {p.name: stored_hash(folder / f"{p.name}{SUFFIX}") for p in plans}
     whole = hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
     content = {
         "dataset": config.name,
         "config_hash": config.hash(),
         "content_hash": whole,
-        "files": hashes,
+        "files": dict(hashes),
     }
-    path = folder / MANIFEST
-    with replacing(path, part_of_process(path)) as part:
-        part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / MANIFEST, json.dumps(content, indent=1) + "\n")
     return True

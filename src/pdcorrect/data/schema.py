@@ -30,9 +30,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import re
-import secrets
-import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,7 +41,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import OutputError
-from pdcorrect.replacement import replacing
+from pdcorrect.replacement import part_of_process, replacing
 
 REFERENCE, PLAIN = "reference", "plain"
 """Runs: the truth, and the coarse model that is to be corrected."""
@@ -163,31 +160,6 @@ ATTRIBUTES = {
     "time_step": float, "tolerance": float,
 }  # fmt: skip
 """Attributes of a `Shard` and their types."""
-
-
-def part_of_process(path: Path) -> Path:
-    """Where this process writes what is to become a file, unlike any other's place."""
-    host = re.sub(r"[^A-Za-z0-9]+", "-", socket.gethostname())
-    return path.with_name(f"{path.name}.{host}.{os.getpid()}.{secrets.token_hex(4)}.part")
-
-
-def clear_parts(folder: Path) -> None:
-    """Delete what processes of this machine that are no more have left unfinished."""
-    host = re.sub(r"[^A-Za-z0-9]+", "-", socket.gethostname())
-    for part in folder.rglob("*.part"):
-        fields = part.name.split(".")
-        if len(fields) > 4 and fields[-4] == host and not _alive(int(fields[-3])):
-            part.unlink(missing_ok=True)
-
-
-def _alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:

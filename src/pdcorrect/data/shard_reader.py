@@ -107,8 +107,8 @@ def opened(path: Path, verify: bool) -> Iterator[h5py.File]:
         raise FileFormatError(f"{path}: damaged, HDF5 cannot read it ({reason}).") from error
 
 
-def stored_hash(path: Path) -> str:
-    """The hash of its content that a file holds, after comparing the file with its seal.
+def stored_hashes(path: Path) -> tuple[str, str]:
+    """The hashes of its configuration and its content that a file holds, if its seal is right.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def stored_hash(path: Path) -> str:
         As `read_shard`.
     """
     with opened(path, verify=True) as file:
-        return str(file.attrs[HASH])
+        return str(file.attrs["config_hash"]), str(file.attrs[HASH])
 
 
 @contextlib.contextmanager

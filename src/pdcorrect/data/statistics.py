@@ -22,8 +22,8 @@ from pdcorrect.data.shard_arrays import (
     read_arrays,
     read_header,
 )
-from pdcorrect.errors import FileFormatError, InputError, OutputError
-from pdcorrect.replacement import replacing
+from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.replacement import write_text
 
 VERSION = 1
 
@@ -132,11 +132,7 @@ class Statistics:
             "shards": dict(self.shards),
             "quantities": {name: m.to_json() for name, m in self.quantities.items()},
         }
-        try:
-            with replacing(path) as part:
-                part.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+        write_text(path, json.dumps(content, indent=1) + "\n")
         return path
 
 
