@@ -17,6 +17,7 @@ from motion import trajectory
 from pdcorrect.data import seal
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import (
@@ -495,7 +496,7 @@ def findings(folder, severity="error"):
 FIRST = "training/mesh-0000.h5"
 
 
-PLAN = re.compile(r"those of config.toml|that config.toml draws|has no run '\w+'$")
+PLAN = re.compile(r"(that|what) config.toml draws|has no run '\w+'$")
 """What `check_dataset` says of files that differ from what the configuration draws."""
 
 
@@ -684,8 +685,14 @@ def body_of(shard, other):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: dataclasses.replace(s, young=7 * s.young), "its young are not those of config"),
-        (lambda s: dataclasses.replace(s, mass=3 * s.mass), "its mass are not those of config"),
+        (
+            lambda s: dataclasses.replace(s, young=7 * s.young),
+            "its young is not what config",
+        ),
+        (
+            lambda s: dataclasses.replace(s, mass=3 * s.mass),
+            "its mass is not what config",
+        ),
         (
             lambda s: with_simulation(s, 1, scene_toml="nonsense"),
             "simulation 0001: its scene is not the one that config.toml draws",
@@ -775,6 +782,17 @@ def test_a_short_simulation_is_found(dataset):
 
     changed(dataset / FIRST, spoil)
     assert one(dataset) == "simulation 0001 has 3 frames: expected 5"
+
+
+def test_files_made_by_different_code_are_pointed_out(dataset):
+    paths = all_shards(dataset)
+    for path, code in zip(paths, ["a" * 64] * 2 + ["b" * 64] * 2, strict=True):
+        changed(path, lambda s, code=code: dataclasses.replace(s, provenance={"code": code}))
+    found = check_dataset(dataset)
+    assert [(f.path, f.severity) for f in found] == [(paths[2], "warning")]
+    assert f"made by other code than {paths[0].relative_to(dataset)} (SHA-256 bbbbbbbbbbbb)" in str(
+        found[0]
+    )
 
 
 def test_a_content_other_than_the_manifest_has_is_found(dataset):

@@ -69,7 +69,7 @@ def simulate(
 ) -> None:
     """Run one scene and write its trajectory, frame by frame."""
     from pdcorrect.io.trajectory import load_trajectory
-    from pdcorrect.report import make_folder
+    from pdcorrect.replacement import make_folder
     from pdcorrect.scene import Scene
 
     if resume and overwrite:
@@ -108,6 +108,7 @@ def compare(
 
     from pdcorrect import evaluate, report
     from pdcorrect.errors import require_extra
+    from pdcorrect.replacement import make_folder
     from pdcorrect.scene import Scene
 
     if figures:
@@ -115,7 +116,7 @@ def compare(
         require_extra("matplotlib", "view")
     loaded = Scene.load(scene)
     count = frames or loaded.time.frames
-    report.make_folder(output)
+    make_folder(output)
     with _progress() as progress:
         tasks = {
             c.label: progress.add_task(c.label, total=count, start=False) for c in evaluate.CASES

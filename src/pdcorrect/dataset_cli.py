@@ -106,7 +106,7 @@ def info(
         _write(json, found.to_json() + "\n")
     if figures:
         from pdcorrect.data.pictures import histograms, thumbnails
-        from pdcorrect.report import make_folder
+        from pdcorrect.replacement import make_folder
 
         make_folder(figures)
         typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")

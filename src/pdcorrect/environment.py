@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import importlib.metadata
 import importlib.util
 import os
 import platform
 from dataclasses import dataclass
+from pathlib import Path
 
+import pdcorrect
 from pdcorrect import __version__
 
 _PACKAGES = (
@@ -57,6 +61,20 @@ def environment() -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         **present,
     }
+
+
+@functools.cache
+def code_digest() -> str:
+    """SHA-256 of the package's own modules, names and contents, in hexadecimal digits.
+
+    Tells two states of the code apart that have the same version number.
+    """
+    digest = hashlib.sha256()
+    root = Path(pdcorrect.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        for content in (path.relative_to(root).as_posix().encode(), path.read_bytes()):
+            digest.update(len(content).to_bytes(8, "little") + content)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)

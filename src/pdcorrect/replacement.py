@@ -42,11 +42,26 @@ def write_text(path: Path, text: str) -> None:
         If it cannot be written.
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, part_of_process(path)) as part:
             part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+
+
+def make_folder(folder: str | Path) -> Path:
+    """Create a folder for files, and those above it, if it is not there.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be created.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be created ({error.strerror or error}).") from None
+    return folder
 
 
 def part_of_process(path: Path) -> Path:

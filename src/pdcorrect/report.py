@@ -14,10 +14,9 @@ import numpy as np
 
 import pdcorrect.figures as figures
 from pdcorrect.environment import environment
-from pdcorrect.errors import OutputError
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
-from pdcorrect.replacement import replacing
+from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.state import Status, Trajectory
 
 HEADINGS = (
@@ -180,34 +179,13 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
         If the folder cannot be written.
     """
     folder = make_folder(folder)
-    try:
-        _put(folder / "report.csv", to_csv(comparison))
-        _put(folder / "report.json", to_json(comparison))
-        _put(folder / "report.md", to_markdown(comparison, []))
-        if draw:
-            pictures = draw_figures(comparison, folder)
-            _put(folder / "report.md", to_markdown(comparison, pictures))
-    except OSError as error:
-        raise _not_written(folder, error) from error
+    write_text(folder / "report.csv", to_csv(comparison))
+    write_text(folder / "report.json", to_json(comparison))
+    write_text(folder / "report.md", to_markdown(comparison, []))
+    if draw:
+        pictures = draw_figures(comparison, folder)
+        write_text(folder / "report.md", to_markdown(comparison, pictures))
     return folder / "report.md"
-
-
-def _put(path: Path, text: str) -> None:
-    with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
-
-
-def make_folder(folder: str | Path) -> Path:
-    """Create the folder of a report, or say why it cannot be."""
-    try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _not_written(Path(folder), error) from error
-    return Path(folder)
-
-
-def _not_written(folder: Path, error: OSError) -> OutputError:
-    return OutputError(f"{folder}: the report cannot be written ({error.strerror or error}).")
 
 
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:

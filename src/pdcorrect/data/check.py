@@ -115,6 +115,8 @@ class _Check:
         First file with a mesh, and with a mesh and its material, by their digests.
     forces : dict of str to str
         Where forces on a mesh came first.
+    origins : dict of str to Path
+        First file made by each state of the code.
     """
 
     folder: Path
@@ -125,6 +127,7 @@ class _Check:
     meshes: dict[str, Path] = field(default_factory=dict)
     bodies: dict[str, Path] = field(default_factory=dict)
     forces: dict[str, str] = field(default_factory=dict)
+    origins: dict[str, Path] = field(default_factory=dict)
 
     def error(self, path: Path, message: str) -> None:
         """Note an error."""
@@ -187,6 +190,7 @@ class _Check:
             self.error(path, message)
         for message in self._config_faults(path, shard):
             self.error(path, message)
+        self._origin(path, shard)
         self._repetitions(path, shard)
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
@@ -210,6 +214,18 @@ class _Check:
             yield "config.toml does not ask for it"
         if plan is not None and self.config is not None:
             yield from _plan_faults(self.config, plan, shard)
+
+    def _origin(self, path: Path, shard: Shard) -> None:
+        """A change of the code between files, where they tell."""
+        code = shard.provenance.get("code")
+        if code is None:
+            return
+        known = code in self.origins
+        first = self.origins.setdefault(code, path)
+        oldest = next(iter(self.origins.values()))
+        if not known and first != oldest:
+            text = f"made by other code than {self._short(oldest)} (SHA-256 {code:.12})"
+            self.findings.append(Finding(path, "warning", text))
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
@@ -333,7 +349,7 @@ def _plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterato
     for name, wanted in arrays:
         found = getattr(shard, name)
         if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
-            yield f"its {name} are not those of config.toml"
+            yield f"its {name} is not what config.toml draws"
     for k, simulation in enumerate(shard.simulations):
         if simulation.steps != plan.frames:
             yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"

@@ -6,8 +6,9 @@ rollout or single steps from given states, on chosen nodes only.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -87,17 +88,18 @@ class OneByOne:
         out = []
         steppers: dict[int, Any] = {}
         for job in jobs:
-            stepper = self._stepper(steppers, job.problem, divisor)
-            state = job.problem.rest_state()
             log = _Log(job.nodes)
+            with log.timed():
+                stepper = self._stepper(steppers, job.problem, divisor)
+            state = job.problem.rest_state()
             for _ in range(steps):
-                started = time.perf_counter()
                 worst = log.begin()
-                for _ in range(divisor):
-                    result = stepper(state, _forces(job.problem, state, stepper.time_step))
-                    worst = worst.with_result(result)
-                    state = result.state
-                log.add(worst, state, time.perf_counter() - started)
+                with log.timed():
+                    for _ in range(divisor):
+                        result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                        worst = worst.with_result(result)
+                        state = result.state
+                log.add(worst, state)
                 if log.failure:
                     break
             out.append(log.steps())
@@ -108,14 +110,13 @@ class OneByOne:
         out = []
         steppers: dict[int, Any] = {}
         for job, starts in zip(jobs, states, strict=True):
-            stepper = self._stepper(steppers, job.problem, 1)
             log = _Log(job.nodes)
+            with log.timed():
+                stepper = self._stepper(steppers, job.problem, 1)
             for state in starts:
-                started = time.perf_counter()
-                result = stepper(state, _forces(job.problem, state, stepper.time_step))
-                log.add(
-                    log.begin().with_result(result), result.state, time.perf_counter() - started
-                )
+                with log.timed():
+                    result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                log.add(log.begin().with_result(result), result.state)
                 if log.failure:
                     break
             out.append(log.steps())
@@ -178,8 +179,14 @@ class _Log:
     def begin() -> _Worst:
         return _Worst()
 
-    def add(self, row: _Worst, state: State, seconds: float) -> None:
-        self._seconds += seconds
+    @contextlib.contextmanager
+    def timed(self) -> Iterator[None]:
+        """Charge what is done within, setting up included."""
+        started = time.perf_counter()
+        yield
+        self._seconds += time.perf_counter() - started
+
+    def add(self, row: _Worst, state: State) -> None:
         self._rows.append(row)
         self._states.append((state.positions[self._nodes], state.velocities[self._nodes]))
         if row.failure and not self.failure:

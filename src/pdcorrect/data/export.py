@@ -18,7 +18,7 @@ from pdcorrect.data.schema import REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
-from pdcorrect.replacement import replacing, write_text
+from pdcorrect.replacement import make_folder, replacing, write_text
 from pdcorrect.state import Trajectory
 
 NORMAL, HANDLE = 0, 3
@@ -75,7 +75,7 @@ def export_meshgraphnet(
         If ``target`` cannot be written.
     """
     target, written = Path(target), []
-    _make(target)
+    make_folder(target)
     splits = sorted(splits_of(folder), key=lambda name: (name not in _SPLITS, name))
     if TRAINING in splits:
         splits.insert(0, splits.pop(splits.index(TRAINING)))
@@ -260,10 +260,3 @@ def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path)
     return write_vtu_series(
         trajectory, target, name=name, point_data=points, cell_data=lambda frame: moduli
     )
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from None

@@ -30,14 +30,14 @@ from pdcorrect.data.schema import (
 )
 from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.environment import environment
+from pdcorrect.environment import code_digest, environment
 from pdcorrect.errors import (
     FileFormatError,
     FileVersionError,
     InputError,
     require_extra,
 )
-from pdcorrect.replacement import clear_parts, write_text
+from pdcorrect.replacement import clear_parts, make_folder, write_text
 
 LARGEST_BATCHED = 40_000
 _PATIENCE = 600
@@ -163,6 +163,7 @@ def _claim(config: DatasetConfig, folder: Path) -> None:
         return
     if all_shards(folder):
         raise InputError(f"{folder} holds files of meshes but no {CONFIG}: use another folder.")
+    make_folder(folder)
     write_text(path, config.to_toml())
 
 
@@ -317,7 +318,13 @@ def one_thread() -> Iterator[None]:
 
 def _provenance(device: str) -> dict[str, str]:
     date = time.strftime("%Y-%m-%d", time.gmtime())
-    return {**environment(), "threads": "1", "device": _device_name(device), "date": date}
+    return {
+        **environment(),
+        "code": code_digest(),
+        "threads": "1",
+        "device": _device_name(device),
+        "date": date,
+    }
 
 
 def _device_name(device: str) -> str:
