@@ -72,6 +72,7 @@ ORDER = [
     "batch",
     "batch.decomposition",
     "batch.energies",
+    "batch.fused",
     "batch.points",
     "batch.narrowing",
     "batch.cells",

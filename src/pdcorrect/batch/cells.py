@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.fused import rows_of, sums_of_rows
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
 from pdcorrect.fem.problem import Problem
@@ -224,14 +225,13 @@ class CellBatch:
     def local(self, u: Tensor) -> Tensor:
         """A configuration's values in each cell, (B, C, L, 3)."""
         n = self.sizes
-        return u.reshape(-1, 3)[self._cells].reshape(n.scenes, n.cells, n.width, 3)
+        return rows_of(u.reshape(-1, 3), self._cells).reshape(n.scenes, n.cells, n.width, 3)
 
     def summed(self, local: Tensor) -> Tensor:
         """Values (B, C, L, 3) of cells summed into configurations (B, U, 3), in a fixed order."""
         n = self.sizes
         flat = local.reshape(n.scenes * n.cells * n.width, 3)
-        flat = torch.cat([flat, flat.new_zeros(1, 3)])
-        return flat[self._slots].sum(dim=1).reshape(n.scenes, n.unknowns, 3)
+        return sums_of_rows(flat, self._slots).reshape(n.scenes, n.unknowns, 3)
 
     @property
     def _rows(self) -> tuple[int, ...]:

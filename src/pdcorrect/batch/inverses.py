@@ -25,6 +25,7 @@ from torch import Tensor
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.coarse import CoarseCorrection
 from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.fused import small_products
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.tall import tall_product
@@ -212,7 +213,7 @@ class DenseInverse:
         local = self._cells.local(r)
         nodes = self._solved.shape[-1] // self._width
         modes = self._flat(local[:, :, nodes:])
-        back = self._unflat(self._solved.transpose(-1, -2) @ modes)
+        back = self._unflat(small_products(self._solved.transpose(-1, -2), modes))
         return r - self._cells.summed(torch.cat([back, local[:, :, nodes:] * 0.0], dim=2))
 
     def _recovered(self, x: Tensor, r: Tensor) -> Tensor:
@@ -221,7 +222,9 @@ class DenseInverse:
         nodes = self._solved.shape[-1] // self._width
         modes = self._flat(self._cells.local(r)[:, :, nodes:])
         moved = self._flat(self._cells.local(whole)[:, :, :nodes])
-        found = self._unflat(self._mode_inverse @ modes - self._solved @ moved)
+        found = self._unflat(
+            small_products(self._mode_inverse, modes) - small_products(self._solved, moved)
+        )
         zeros = found.new_zeros(n.scenes, n.cells, nodes, 3)
         return whole + self._cells.summed(torch.cat([zeros, found], dim=2))
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.fused import small_products
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.fem.problem import Problem
 
@@ -60,7 +61,7 @@ class BatchMass:
         return (self._blocks.sum(dim=-1) * self._local(columns)[..., 0]).sum(dim=2)
 
     def _by_cell(self, x: Tensor) -> Tensor:
-        return self._blocks @ self._local(x)
+        return small_products(self._blocks, self._local(x))
 
     def _local(self, x: Tensor) -> Tensor:
         return self._cells.local(x)[:, :, : self._blocks.shape[-1]]

@@ -7,7 +7,6 @@ is the most of it, is a function of its own, so that it is compiled once.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import torch
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from pdcorrect.batch import energies
 from pdcorrect.batch.decomposition import nearest_volume, product, signed_svd, transposed
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.fem.hyperelasticity import COROTATED
 
 Tangent = tuple[Tensor, Tensor, Tensor]
@@ -37,7 +37,7 @@ class Points:
 
     def __init__(self, model: int, first: int, points: int, compiled: bool) -> None:
         self._model, self._first, self._points = model, first, points
-        self._call = _compiled if compiled else _plain
+        self._compiled = compiled
 
     def stress(self, F: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Psi (M,) and P (9, M) for F (9, M) and the weights of both terms (2, M)."""
@@ -67,6 +67,9 @@ class Points:
         out: Tensor = self._call(_rotate)(*self.decomposed(torch.nan_to_num(F)))
         return out
 
+    def _call(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        return as_kernel(function, self._compiled)
+
     def _nearest(self, s: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Nearest volume-preserving stretches v (3, M) and k (M,), where there is such a term."""
         if self._model != COROTATED or self._first >= self._points:
@@ -81,15 +84,6 @@ class Points:
         v[..., self._first :] = found[0].reshape(part.shape)
         k[..., self._first :] = found[1].reshape(part.shape[1:])
         return v.reshape(3, -1), k.reshape(-1)
-
-
-def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    return function
-
-
-@cache
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    return torch.compile(function, dynamic=True)
 
 
 def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -37,12 +37,15 @@ class Design:
         The part that impulse and stretch loads act on.
     axis : (x, y, z)
         Away from the clamps, along the beam that carries that part.
+    nodes : int
+        Of the coarse mesh.
     """
 
     shape: Shape = field(hash=False)
     clamps: tuple[Box, ...]
     loaded: Box
     axis: tuple[float, float, float]
+    nodes: int
 
     def key(self) -> str:
         """Equal for equal bodies, and for mirrored ones that are held in the same way."""
@@ -156,7 +159,8 @@ def _beam(size: Size, rng: np.random.Generator) -> Design:
     (length,) = size
     shape = {"shape": "beam", "cells": [length, 2, 2]}
     tip: Box = ((length - 2.0, 0.0, 0.0), (float(length), 2.0, 2.0))
-    return Design(shape, (((0.0, 0.0, 0.0), (0.0, 2.0, 2.0)),), tip, (1.0, 0.0, 0.0))
+    clamp: Box = ((0.0, 0.0, 0.0), (0.0, 2.0, 2.0))
+    return Design(shape, (clamp,), tip, (1.0, 0.0, 0.0), _count("beam", size, 1))
 
 
 def _cross(size: Size, rng: np.random.Generator) -> Design:
@@ -167,7 +171,8 @@ def _cross(size: Size, rng: np.random.Generator) -> Design:
         "arm_width": 2, "arm_length": out,
     }  # fmt: skip
     tip: Box = ((length - 2.0, 0.0, 0.0), (float(length), 2.0, 2.0))
-    return Design(shape, (((0.0, 0.0, 0.0), (0.0, 2.0, 2.0)),), tip, (1.0, 0.0, 0.0))
+    clamp: Box = ((0.0, 0.0, 0.0), (0.0, 2.0, 2.0))
+    return Design(shape, (clamp,), tip, (1.0, 0.0, 0.0), _count("cross", size, 1))
 
 
 def _weight(size: Size, rng: np.random.Generator) -> Design:
@@ -187,7 +192,7 @@ def _weight(size: Size, rng: np.random.Generator) -> Design:
     half = (wide - 2) / 2
     top = float(-below)
     inflated: Box = ((left - half, -half, top - high), (right + half, 2.0 + half, top))
-    return Design(shape, tuple(ends), inflated, (0.0, 0.0, -1.0))
+    return Design(shape, tuple(ends), inflated, (0.0, 0.0, -1.0), _count("weight", size, 1))
 
 
 _PLACES = {"beam": _beam, "cross": _cross, "weight": _weight}

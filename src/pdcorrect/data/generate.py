@@ -178,9 +178,14 @@ def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[Mes
 
 
 def _units(plans: Sequence[MeshPlan], workers: Workers) -> list[list[MeshPlan]]:
-    """What is computed together: a mesh on a CPU, some meshes of one split on a GPU."""
+    """What is computed together: a mesh on a CPU, some meshes of one split on a GPU.
+
+    There meshes of like size, since a batch is padded to its largest.
+    """
     if workers.device == "cpu":
         return [[plan] for plan in plans]
+    splits = list(dict.fromkeys(plan.split for plan in plans))
+    plans = sorted(plans, key=lambda plan: (splits.index(plan.split), plan.design.nodes))
     units: list[list[MeshPlan]] = []
     count = 0
     for plan in plans:
