@@ -1,0 +1,1 @@
+"""A graph network that corrects a coarse solver's steps, and the hybrid that they make."""

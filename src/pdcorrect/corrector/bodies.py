@@ -1,0 +1,160 @@
+"""`BodyGraph`: what a corrector knows of bodies before they move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pdcorrect.corrector.frames import cell_axes
+from pdcorrect.data.graph import mesh_edges, node_means
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class BodyGraph:
+    """The meshes of B bodies as one graph: n nodes, E directed edges, c cells in all.
+
+    Attributes
+    ----------
+    rest : (n, 3)
+        m.
+    free : (n, 3) bool
+        Components that may move.
+    mass, young, poisson, density : (n,)
+        kg; means over the cells of a node: Pa, dimensionless, kg/m3.
+    edge_index : (2, E) int64
+        Each edge of a cell once in both directions, ordered by the first row, which is the
+        receiver.
+    cells : (c, 8) int64
+        VTK order.
+    graph : (n,) int64
+        The body of each node.
+    cell_size, time_step : (B,)
+        m and s.
+    """
+
+    rest: Tensor
+    free: Tensor
+    mass: Tensor
+    young: Tensor
+    poisson: Tensor
+    density: Tensor
+    edge_index: Tensor
+    cells: Tensor
+    graph: Tensor
+    cell_size: Tensor
+    time_step: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        problems: Sequence[Problem],
+        time_step: float | None = None,
+        *,
+        device: str | torch.device = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> BodyGraph:
+        """The coarse meshes of some problems; ``time_step`` (s) is the first one's by default.
+
+        Raises
+        ------
+        InputError
+            If there is none, or cells have more than their eight corners as nodes.
+        """
+        if not problems:
+            raise InputError("problems: expected one or more.")
+        bodies = [_one(problem) for problem in problems]
+        joined = {name: np.concatenate([b[name] for b in bodies]) for name in _NODAL}
+        counts = [len(b["rest"]) for b in bodies]
+        first = np.cumsum([0, *counts[:-1]])
+        step = problems[0].time_step if time_step is None else time_step
+
+        def tensor(array: Any) -> Tensor:
+            found = torch.as_tensor(np.ascontiguousarray(array), device=device)
+            return found.to(dtype) if found.is_floating_point() else found
+
+        offset = list(zip(bodies, first, strict=True))
+        return cls(
+            **{name: tensor(values) for name, values in joined.items()},
+            edge_index=tensor(np.concatenate([b["edge_index"] + o for b, o in offset], axis=1)),
+            cells=tensor(np.concatenate([b["cells"] + o for b, o in offset])),
+            graph=tensor(np.repeat(np.arange(len(bodies)), counts)),
+            cell_size=tensor(np.array([p.cell_size for p in problems])),
+            time_step=tensor(np.full(len(problems), step)),
+        )
+
+    @classmethod
+    def of_batch(cls, batch: Any) -> BodyGraph:
+        """The bodies of a batch of `pdcorrect.data.reader.MeshSample`."""
+        return cls(
+            **{name: getattr(batch, name) for name in _NODAL},
+            edge_index=batch.edge_index,
+            cells=batch.cells,
+            graph=batch.batch,
+            cell_size=_cell_sizes(batch.rest, batch.cells, batch.batch, batch.num_graphs),
+            time_step=batch.time_step,
+        )
+
+    @property
+    def bodies(self) -> int:
+        """B."""
+        return len(self.cell_size)
+
+    def by_node(self, values: Tensor) -> Tensor:
+        """Values (B, ...) of bodies at their nodes, (n, ...)."""
+        return values[self.graph]
+
+    def node_sums(self, values: Tensor) -> Tensor:
+        """Sums (B, ...) over the nodes of each body of values (n, ...)."""
+        out = values.new_zeros(self.bodies, *values.shape[1:])
+        return out.index_add(0, self.graph, values)
+
+    def body_means(self, values: Tensor) -> Tensor:
+        """Means (B, ...) over the nodes of each body of values (n, ...)."""
+        counts = torch.bincount(self.graph, minlength=self.bodies).to(values.dtype)
+        return self.node_sums(values) / counts.reshape(-1, *[1] * (values.ndim - 1))
+
+    def to(
+        self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
+    ) -> BodyGraph:
+        """The same elsewhere or in another precision."""
+        moved = {}
+        for field in fields(self):
+            value: Tensor = getattr(self, field.name)
+            moved[field.name] = value.to(device, dtype if value.is_floating_point() else None)
+        return BodyGraph(**moved)
+
+
+_NODAL = ("rest", "free", "mass", "young", "poisson", "density")
+
+
+def _one(problem: Problem) -> dict[str, Any]:
+    if problem.cells.shape[1] != 8:
+        raise InputError(
+            f"scene {problem.scene.name!r}: cells with {problem.cells.shape[1]} nodes: the "
+            "corrector expects 8, their corners."
+        )
+    materials, nodes = problem.materials, len(problem.positions)
+    means = {
+        name: node_means(getattr(materials, name), problem.cells, nodes)
+        for name in ("young", "poisson", "density")
+    }
+    return {
+        "rest": problem.positions, "free": problem.free, "mass": problem.mass, **means,
+        "edge_index": mesh_edges(problem.cells), "cells": problem.cells.astype(np.int64),
+    }  # fmt: skip
+
+
+def _cell_sizes(rest: Tensor, cells: Tensor, graph: Tensor, bodies: int) -> Tensor:
+    """Cube root of the mean cell volume of each body, m."""
+    volumes = torch.linalg.det(cell_axes(rest, cells))
+    owner = graph[cells[:, 0]]
+    sums = volumes.new_zeros(bodies).index_add(0, owner, volumes)
+    counts = torch.bincount(owner, minlength=bodies).to(volumes.dtype)
+    return torch.pow(sums / counts, 1.0 / 3.0)

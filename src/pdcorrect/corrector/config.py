@@ -1,0 +1,94 @@
+"""`CorrectorConfig`: everything that determines a corrector but its weights; presets."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from pdcorrect.corrector import features
+from pdcorrect.errors import InputError
+from pdcorrect.scene.regions import Positive, PositiveCount, Strict
+
+Placement = Literal["state", "force", "guess"]
+
+
+class CorrectorConfig(Strict):
+    """A corrector's architecture.
+
+    Attributes
+    ----------
+    node_features, edge_features
+        Names from `pdcorrect.corrector.features`.
+    layers, width, mlp_layers, norm, shared
+        See `pdcorrect.corrector.network.MeshGraphNetwork`.
+    output
+        "world": a vector in the scene's axes, in units of the training targets' deviation.
+        "frame": in the node's frame, in units of that times cell size and deformation: it
+        vanishes at rest and under rigid motion, and turns with the scene.
+    clip
+        Normalised inputs bend towards this bound; None leaves them as they are.
+    momentum_neutral
+        Whether the correction's own linear and angular momentum are taken out.
+    placement
+        What is corrected: "state", the coarse solver's answer; "force", its loads;
+        "guess", only where its iteration begins.
+    """
+
+    node_features: tuple[str, ...]
+    edge_features: tuple[str, ...]
+    layers: PositiveCount
+    width: PositiveCount
+    mlp_layers: Annotated[int, Field(strict=True, ge=2)]
+    norm: Literal["hidden", "all", "none"] = "hidden"
+    shared: bool = False
+    output: Literal["world", "frame"] = "frame"
+    clip: Positive | None = 10.0
+    momentum_neutral: bool = False
+    placement: Placement = "state"
+
+    @model_validator(mode="after")
+    def _known(self) -> CorrectorConfig:
+        try:
+            features.width(features.NODE_FEATURES, self.node_features)
+            features.width(features.EDGE_FEATURES, self.edge_features)
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+
+_FRAME_NODES = (
+    "node-type", "stiffness", "poisson", "deformation", "strain", "acceleration", "load",
+)  # fmt: skip
+_FRAME_EDGES = ("rest-edge", "stretch", "motion", "turn")
+
+PRESETS: dict[str, CorrectorConfig] = {
+    "thesis": CorrectorConfig(
+        node_features=("young", "poisson", "velocity", "force", "node-type"),
+        edge_features=("rest-position", "position"),
+        layers=15, width=128, mlp_layers=4, output="world", clip=None,
+    ),
+    "equivariant": CorrectorConfig(
+        node_features=_FRAME_NODES, edge_features=_FRAME_EDGES, layers=10, width=128, mlp_layers=3,
+    ),
+    "compact": CorrectorConfig(
+        node_features=_FRAME_NODES, edge_features=_FRAME_EDGES, layers=4, width=48, mlp_layers=2,
+    ),
+}  # fmt: skip
+"""Architectures by name."""
+
+
+def preset(name: str, **changes: object) -> CorrectorConfig:
+    """A preset, some of its values changed.
+
+    Raises
+    ------
+    InputError
+        If there is no such preset, or a value is wrong.
+    """
+    if name not in PRESETS:
+        raise InputError(f"preset {name!r}: expected one of {', '.join(PRESETS)}.")
+    try:
+        return CorrectorConfig(**{**PRESETS[name].model_dump(), **changes})
+    except ValueError as error:
+        raise InputError(f"preset {name!r}: {error}") from None

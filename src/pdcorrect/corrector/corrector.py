@@ -1,0 +1,99 @@
+"""`Corrector`: features, network and built-in physics, from a snapshot to a correction."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from pdcorrect.corrector import features
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
+from pdcorrect.corrector.frames import turned, turned_back
+from pdcorrect.corrector.network import MeshGraphNetwork
+from pdcorrect.corrector.normaliser import Normaliser
+
+
+class Corrector(nn.Module):
+    """Displacements (n, 3), m, that are to be added to a coarse step.
+
+    Clamped components get none.  With output "frame" it is exactly zero where the body is
+    not deformed, however it has moved.
+
+    Parameters
+    ----------
+    config : CorrectorConfig
+
+    Attributes
+    ----------
+    normaliser : Normaliser
+        To be fitted before the first call; see `pdcorrect.corrector.fitting`.
+    network : MeshGraphNetwork
+    """
+
+    def __init__(self, config: CorrectorConfig) -> None:
+        super().__init__()
+        self.config = config
+        nodes = {name: NODE_FEATURES[name][0] for name in config.node_features}
+        edges = {name: EDGE_FEATURES[name][0] for name in config.edge_features}
+        self.normaliser = Normaliser({**nodes, **edges})
+        self.network = MeshGraphNetwork(
+            sum(nodes.values()), sum(edges.values()), layers=config.layers, width=config.width,
+            mlp_layers=config.mlp_layers, norm=config.norm, shared=config.shared,
+        )  # fmt: skip
+
+    def forward(self, bodies: BodyGraph, snapshot: Snapshot) -> Tensor:
+        """The correction in the snapshot's precision; the network works in its own."""
+        return self.of_view(View(bodies, snapshot))
+
+    def of_view(self, view: View) -> Tensor:
+        """The same for a view that exists already."""
+        nodes, edges = self.inputs(view)
+        weight = self.network.decoder[0].weight
+        assert isinstance(weight, Tensor)
+        x = self.network(nodes.to(weight.dtype), edges.to(weight.dtype), view.bodies.edge_index)
+        return self.in_metres(view, x.to(view.bodies.rest.dtype))
+
+    def inputs(self, view: View) -> tuple[Tensor, Tensor]:
+        """Normalised features of nodes (n, a) and edges (E, b)."""
+        config = self.config
+        nodes = features.values(NODE_FEATURES, config.node_features, view)
+        edges = features.values(EDGE_FEATURES, config.edge_features, view)
+        joined = self.normaliser.joined
+        return joined(nodes, config.clip), joined(edges, config.clip)
+
+    def in_metres(self, view: View, x: Tensor) -> Tensor:
+        """The network's output (n, 3) as a correction."""
+        x = x * self.normaliser.output_scale.to(x)
+        if self.config.output == "frame":
+            size = view.size * view.bodies.by_node(view.deformation)[:, None]
+            x = size * turned(view.frames, x)
+        x = torch.where(view.bodies.free, x, 0.0)
+        return without_momentum(view, x) if self.config.momentum_neutral else x
+
+    def target(self, view: View, correction: Tensor) -> Tensor:
+        """What the network should give, before the output's scale, for a correction (n, 3)."""
+        if self.config.output == "world":
+            return correction
+        return turned_back(view.frames, correction) / (view.size * view.scale)
+
+
+def without_momentum(view: View, correction: Tensor) -> Tensor:
+    """The correction less that rigid motion of the free nodes which has its momenta."""
+    bodies = view.bodies
+    free = bodies.free.to(correction.dtype)
+    mass = bodies.mass[:, None] * free.amin(dim=1, keepdim=True)
+    total = bodies.node_sums(mass).clamp_min(1e-300)
+    centre = bodies.node_sums(mass * view.snapshot.proposed) / total
+    r = view.snapshot.proposed - bodies.by_node(centre)
+    mean = bodies.node_sums(mass * correction) / total
+    x = correction - bodies.by_node(mean)
+    spin = bodies.node_sums(mass * torch.linalg.cross(r, x))
+    identity = torch.eye(3, dtype=r.dtype, device=r.device)
+    outer = r[:, :, None] * r[:, None, :]
+    moments = (r.square().sum(dim=1)[:, None, None] * identity - outer) * mass[..., None]
+    inertia = bodies.node_sums(moments)
+    inertia = inertia + 1e-12 * inertia.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * identity
+    turn = torch.linalg.solve(inertia, spin)
+    x = x - torch.linalg.cross(bodies.by_node(turn), r)
+    return torch.where(bodies.free.all(dim=1, keepdim=True), x, correction)

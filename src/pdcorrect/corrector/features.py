@@ -1,0 +1,237 @@
+"""What a corrector's network sees: features of nodes and edges, each by name.
+
+*World* features are those of the thesis (sections 4.4 and 5.2), in SI units and the
+scene's axes.  *Frame* features are lengths over the cell size, times over the time step,
+in each node's own frame (`pdcorrect.corrector.frames`), and those that vanish with the
+deformation are divided by its size s.  So they do not change when the scene is turned,
+moved, renumbered or written in other units, nor, for small deformations, with its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.frames import (
+    node_axes,
+    polar_rotations,
+    rotation_vectors,
+    turned_back,
+)
+from pdcorrect.errors import InputError
+
+STILL = 1e-9
+"""Deformation (dimensionless) below which a body counts as not deformed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """A step of the bodies of a graph, as far as it is known when the network is asked.
+
+    Attributes
+    ----------
+    positions, velocities : (n, 3)
+        Before the step, m and m/s.
+    proposed : (n, 3)
+        After it: what the coarse solver found, or, before it was asked, the positions that
+        inertia and loads alone would lead to, m.
+    forces : (n, 3)
+        Loads during the step, N.
+    correction : (n, 3) or None
+        Of the step before, m; None counts as zero.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    proposed: Tensor
+    forces: Tensor
+    correction: Tensor | None = None
+
+
+class View:
+    """A snapshot of bodies, and what features need of it, computed when first asked for."""
+
+    def __init__(self, bodies: BodyGraph, snapshot: Snapshot) -> None:
+        self.bodies, self.snapshot = bodies, snapshot
+        self.size = bodies.by_node(bodies.cell_size)[:, None]
+        self.step = bodies.by_node(bodies.time_step)[:, None]
+        self.receiver, self.sender = bodies.edge_index
+
+    @cached_property
+    def rest_axes(self) -> Tensor:
+        """(n, 3, 3), over the cell size."""
+        return node_axes(self.bodies.rest, self.bodies.cells) / self.size[..., None]
+
+    @cached_property
+    def rest_frames(self) -> Tensor:
+        """Rotations (n, 3, 3)."""
+        return polar_rotations(self.rest_axes)
+
+    @cached_property
+    def axes(self) -> Tensor:
+        """(n, 3, 3), over the cell size, after the step."""
+        return node_axes(self.snapshot.proposed, self.bodies.cells) / self.size[..., None]
+
+    @cached_property
+    def frames(self) -> Tensor:
+        """Rotations (n, 3, 3), after the step."""
+        return polar_rotations(self.axes)
+
+    @cached_property
+    def strain(self) -> Tensor:
+        """Stretch of the axes beyond that at rest, in the node's frame, (n, 3, 3)."""
+        now = self.frames.transpose(1, 2) @ self.axes
+        return now - self.rest_frames.transpose(1, 2) @ self.rest_axes
+
+    @cached_property
+    def deformation(self) -> Tensor:
+        """Root mean square of the strain over each body, (B,); exactly 0 below `STILL`."""
+        squares = self.bodies.body_means(self.strain.square().sum(dim=(1, 2)))
+        moved = squares > STILL**2
+        return torch.where(moved, torch.where(moved, squares, 1.0).sqrt(), 0.0)
+
+    @cached_property
+    def scale(self) -> Tensor:
+        """Deformation at nodes, (n, 1), at least `STILL`."""
+        return self.bodies.by_node(self.deformation.clamp_min(STILL))[:, None]
+
+    def edge_change(self, field: Tensor) -> Tensor:
+        """Difference of a nodal field (n, 3) along edges, sender minus receiver, (E, 3)."""
+        return field[self.sender] - field[self.receiver]
+
+    def in_frame(self, x: Tensor) -> Tensor:
+        """Nodal vectors (n, 3) in the node's frame, over cell size and deformation."""
+        return turned_back(self.frames, x) / (self.size * self.scale)
+
+    def in_receiver_frame(self, x: Tensor) -> Tensor:
+        """Vectors (E, 3) of edges in the receiver's frame, over cell size and deformation."""
+        unit = (self.size * self.scale)[self.receiver]
+        return turned_back(self.frames[self.receiver], x) / unit
+
+
+Feature = tuple[int, Callable[[View], Tensor]]
+"""Number of components, and the values (n, k) or (E, k)."""
+
+
+def _fixed(view: View) -> Tensor:
+    fixed = ~view.bodies.free.all(dim=1)
+    return torch.stack([~fixed, fixed], dim=1).to(view.bodies.rest.dtype)
+
+
+def _acceleration(view: View) -> Tensor:
+    """What the coarse solver adds to the motion by inertia."""
+    state = view.snapshot
+    return view.in_frame(state.proposed - state.positions - view.step * state.velocities)
+
+
+def _load(view: View) -> Tensor:
+    return view.in_frame(view.step**2 * view.snapshot.forces / view.bodies.mass[:, None])
+
+
+def _correction(view: View) -> Tensor:
+    previous = view.snapshot.correction
+    if previous is None:
+        return torch.zeros_like(view.snapshot.positions)
+    return view.in_frame(previous)
+
+
+def _stiffness(view: View) -> Tensor:
+    """Logarithm of the squared number of cells that a wave crosses in a step."""
+    body = view.bodies
+    waves = body.young[:, None] * view.step**2 / (body.density[:, None] * view.size**2)
+    return torch.log(waves)
+
+
+def _strain(view: View) -> Tensor:
+    rows, columns = (0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 0, 1)
+    return view.strain[:, rows, columns] / view.scale
+
+
+def _rest_edge(view: View) -> Tensor:
+    x = view.edge_change(view.bodies.rest) / view.size[view.receiver]
+    return _with_length(turned_back(view.rest_frames[view.receiver], x))
+
+
+def _stretch(view: View) -> Tensor:
+    """Edge in the receiver's frame, minus that at rest in the frame at rest."""
+    unit = view.size[view.receiver]
+    now = turned_back(view.frames[view.receiver], view.edge_change(view.snapshot.proposed))
+    rest = turned_back(view.rest_frames[view.receiver], view.edge_change(view.bodies.rest))
+    return (now - rest) / (unit * view.scale[view.receiver])
+
+
+def _motion(view: View) -> Tensor:
+    """Relative motion during the step."""
+    state = view.snapshot
+    return view.in_receiver_frame(view.edge_change(state.proposed - state.positions))
+
+
+def _turn(view: View) -> Tensor:
+    """Rotation between the frames of an edge's ends, beyond that at rest."""
+    here, there = view.receiver, view.sender
+
+    def between(frames: Tensor) -> Tensor:
+        return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
+
+    return (between(view.frames) - between(view.rest_frames)) / view.scale[here]
+
+
+def _with_length(x: Tensor) -> Tensor:
+    return torch.cat([x, x.norm(dim=1, keepdim=True)], dim=1)
+
+
+NODE_FEATURES: dict[str, Feature] = {
+    "young": (1, lambda view: view.bodies.young[:, None]),
+    "poisson": (1, lambda view: view.bodies.poisson[:, None]),
+    "density": (1, lambda view: view.bodies.density[:, None]),
+    "time-step": (1, lambda view: view.step),
+    "velocity": (3, lambda view: (view.snapshot.proposed - view.snapshot.positions) / view.step),
+    "force": (3, lambda view: view.snapshot.forces),
+    "node-type": (2, _fixed),
+    "acceleration": (3, _acceleration),
+    "load": (3, _load),
+    "previous-correction": (3, _correction),
+    "stiffness": (1, _stiffness),
+    "strain": (6, _strain),
+    "deformation": (1, lambda view: torch.log(view.scale)),
+}
+"""By name: of the thesis in world axes and SI units (the first seven), then in frames."""
+
+EDGE_FEATURES: dict[str, Feature] = {
+    "rest-position": (4, lambda view: _with_length(view.edge_change(view.bodies.rest))),
+    "position": (4, lambda view: _with_length(view.edge_change(view.snapshot.proposed))),
+    "rest-edge": (4, _rest_edge),
+    "stretch": (3, _stretch),
+    "motion": (3, _motion),
+    "turn": (3, _turn),
+}
+"""By name: of the thesis (the first two), then in frames."""
+
+UNSCALED = frozenset({"node-type"})
+"""Features that are not normalised."""
+
+
+def width(features: dict[str, Feature], names: Sequence[str]) -> int:
+    """Components of some features together.
+
+    Raises
+    ------
+    InputError
+        If one is unknown, or named twice.
+    """
+    for name in names:
+        if name not in features:
+            raise InputError(f"feature {name!r}: expected one of {', '.join(features)}.")
+    if len(set(names)) < len(names):
+        raise InputError(f"features {', '.join(names)}: expected each one once.")
+    return sum(features[name][0] for name in names)
+
+
+def values(features: dict[str, Feature], names: Sequence[str], view: View) -> dict[str, Tensor]:
+    """Some features of a view by name."""
+    return {name: features[name][1](view) for name in names}

@@ -1,0 +1,120 @@
+"""`MeshGraphNetwork`: encoder, message passing and decoder (Pfaff et al. 2021)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from pdcorrect.errors import require_extra
+
+require_extra("torch_geometric", "learn")
+
+from torch_geometric.nn import MessagePassing  # noqa: E402
+
+Normalisation = Literal["hidden", "all", "none"]
+
+
+class MLP(nn.Sequential):
+    """Linear layers with ReLU between them, and a LayerNorm at the end if asked for."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, layers: int, norm: bool) -> None:
+        sizes = [inputs, *[width] * (layers - 1), outputs]
+        parts: list[nn.Module] = []
+        for before, after in pairwise(sizes):
+            parts += [nn.Linear(before, after), nn.ReLU()]
+        parts.pop()
+        if norm:
+            parts.append(nn.LayerNorm(outputs))
+        super().__init__(*parts)
+
+
+class MessageLayer(MessagePassing):  # type: ignore[misc]
+    """One round: edges from their ends, then nodes from the sums of their edges; residual.
+
+    The first linear map of the edges' network is applied to nodes and edges apart and
+    added up, which is the same as applying it to all three side by side, and cheaper as
+    there are more edges than nodes.
+    """
+
+    def __init__(self, width: int, layers: int, norm: bool) -> None:
+        super().__init__(aggr="sum", flow="target_to_source")
+        self.of_edge = nn.Linear(width, width)
+        self.of_receiver = nn.Linear(width, width, bias=False)
+        self.of_sender = nn.Linear(width, width, bias=False)
+        self.edge_rest = nn.Sequential(nn.ReLU(), *MLP(width, width, width, layers - 1, norm))
+        self.node = MLP(2 * width, width, width, layers, norm)
+        for part in (self.of_edge, self.of_receiver, self.of_sender):
+            bound = (3 * width) ** -0.5  # as one map from all three
+            nn.init.uniform_(part.weight, -bound, bound)
+
+    def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
+        """New values of nodes (n, w) and edges (E, w)."""
+        e = e + self.edge_updater(
+            edge_index, e=self.of_edge(e), to=self.of_receiver(x), start=self.of_sender(x)
+        )
+        summed = self.propagate(edge_index, e=e, size=(len(x), len(x)))
+        return x + self.node(torch.cat([x, summed], dim=1)), e
+
+    def edge_update(self, e: Tensor, to_i: Tensor, start_j: Tensor) -> Tensor:
+        """Change of the edges."""
+        return self.edge_rest(e + to_i + start_j)
+
+    def message(self, e: Tensor) -> Tensor:
+        """What a node receives along an edge."""
+        return e
+
+
+class MeshGraphNetwork(nn.Module):
+    """Features of nodes and edges to one vector a node.
+
+    Parameters
+    ----------
+    node_features, edge_features : int
+        Components.
+    outputs : int
+    layers : int
+        Rounds of message passing.
+    width : int
+        Of all hidden layers.
+    mlp_layers : int
+        Linear layers of each network.
+    norm : {"hidden", "all", "none"}
+        LayerNorm on the output of each network but the decoder, also of the decoder, or of none.
+    shared : bool
+        Whether all rounds have the same weights.
+    """
+
+    def __init__(
+        self,
+        node_features: int,
+        edge_features: int,
+        outputs: int = 3,
+        *,
+        layers: int,
+        width: int,
+        mlp_layers: int,
+        norm: Normalisation = "hidden",
+        shared: bool = False,
+    ) -> None:
+        super().__init__()
+        hidden = norm != "none"
+        self.node_encoder = MLP(node_features, width, width, mlp_layers, hidden)
+        self.edge_encoder = MLP(edge_features, width, width, mlp_layers, hidden)
+        count = 1 if shared else layers
+        self.rounds = nn.ModuleList(MessageLayer(width, mlp_layers, hidden) for _ in range(count))
+        self.decoder = MLP(width, width, outputs, mlp_layers, norm == "all")
+        self._layers = layers
+
+    def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> Tensor:
+        """Outputs (n, k) for features (n, a) of nodes and (E, b) of edges.
+
+        The first row of ``edge_index`` (2, E) is the receiver.
+        """
+        x, e = self.node_encoder(x), self.edge_encoder(e)
+        for i in range(self._layers):
+            x, e = self.rounds[i % len(self.rounds)](x, e, edge_index)
+        out: Tensor = self.decoder(x)
+        return out

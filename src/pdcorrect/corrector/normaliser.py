@@ -1,0 +1,119 @@
+"""`Normaliser`: features and targets to zero mean and unit deviation, and their ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from pdcorrect.corrector.features import UNSCALED
+
+_LEAST_DEVIATION = 1e-8
+"""Of the largest magnitude; below it a component counts as constant."""
+
+
+class Moments:
+    """Mean, mean square and range of values that come in parts.
+
+    Attributes
+    ----------
+    count : int
+    mean, square, low, high : (k,)
+        float64.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.mean = self.square = torch.zeros(0, dtype=torch.float64)
+        self.low = self.high = self.mean
+
+    def add(self, values: Tensor) -> None:
+        """Take in values (m, k); those that are not finite are an error of the caller."""
+        values = values.detach().to("cpu", torch.float64)
+        if not len(values):
+            return
+        parts = values.mean(dim=0), values.square().mean(dim=0), values.amin(dim=0)
+        high = values.amax(dim=0)
+        if not self.count:
+            self.count = len(values)
+            (self.mean, self.square, self.low), self.high = parts, high
+            return
+        share = len(values) / (self.count + len(values))
+        self.mean = self.mean + share * (parts[0] - self.mean)
+        self.square = self.square + share * (parts[1] - self.square)
+        self.low, self.high = torch.minimum(self.low, parts[2]), torch.maximum(self.high, high)
+        self.count += len(values)
+
+    @property
+    def deviation(self) -> Tensor:
+        """Root mean squared distance from the mean, (k,)."""
+        return (self.square - self.mean.square()).clamp_min(0.0).sqrt()
+
+
+class Normaliser(nn.Module):
+    """Affine maps by feature name, and the scale of the output; buffers, not trained.
+
+    Parameters
+    ----------
+    widths : mapping of str to int
+        Components of each feature.
+
+    Attributes
+    ----------
+    output_scale : () tensor
+        Root mean square of the training targets, a component.
+    fitted : bool
+        Whether it has seen data.
+    """
+
+    output_scale: Tensor
+
+    def __init__(self, widths: Mapping[str, int]) -> None:
+        super().__init__()
+        self.names = tuple(widths)
+        for name, k in widths.items():
+            for part, value in (("mean", 0.0), ("deviation", 1.0), ("low", 0.0), ("high", 0.0)):
+                self.register_buffer(_key(name, part), torch.full((k,), value, dtype=torch.float64))
+        self.register_buffer("output_scale", torch.zeros((), dtype=torch.float64))
+
+    @property
+    def fitted(self) -> bool:
+        return bool(self.output_scale > 0)
+
+    def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
+        """Take over the moments of features, and of targets (m, 1)."""
+        for name in self.names:
+            moments = features[name]
+            largest = torch.maximum(moments.low.abs(), moments.high.abs())
+            constant = moments.deviation <= _LEAST_DEVIATION * largest
+            deviation = torch.where(constant, largest, moments.deviation)
+            deviation = torch.where(deviation > 0.0, deviation, 1.0)
+            if name not in UNSCALED:
+                self._part(name, "mean").copy_(moments.mean)
+                self._part(name, "deviation").copy_(deviation)
+            self._part(name, "low").copy_(moments.low)
+            self._part(name, "high").copy_(moments.high)
+        self.output_scale.copy_(target.square.mean().sqrt())
+
+    def joined(self, values: Mapping[str, Tensor], clip: float | None) -> Tensor:
+        """Normalised features (m, k1 + k2 + ...), bent towards -clip and clip."""
+        parts = [
+            (x - self._part(name, "mean").to(x)) / self._part(name, "deviation").to(x)
+            for name, x in values.items()
+        ]
+        out = torch.cat(parts, dim=1)
+        return out if clip is None else clip * torch.tanh(out / clip)
+
+    def excess(self, name: str, x: Tensor) -> Tensor:
+        """How far components (m, k) lie outside the range seen, in deviations, at least 0."""
+        low, high, unit = (self._part(name, p).to(x) for p in ("low", "high", "deviation"))
+        return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
+
+    def _part(self, name: str, part: str) -> Tensor:
+        found: Tensor = getattr(self, _key(name, part))
+        return found
+
+
+def _key(name: str, part: str) -> str:
+    return f"{name.replace('-', '_')}__{part}"
