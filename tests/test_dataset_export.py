@@ -15,14 +15,11 @@ import pytest
 import pdcorrect as pc
 import reader_samples as samples
 from conftest import beam, box_mesh
+from pdcorrect.data.check import check_dataset
 from pdcorrect.data.export import export_meshgraphnet, export_vtu
 from pdcorrect.data.graph import node_means, tetrahedra
-from pdcorrect.data.importing import (
-    Motion,
-    import_trajectories,
-    shard_from_arrays,
-    shard_from_trajectories,
-)
+from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
+from pdcorrect.data.importing import Motion, shard_from_arrays
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError, MeshError
@@ -321,6 +318,22 @@ def test_an_npz_file_is_imported(tmp_path):
     assert not other.forces.any()
     with pytest.raises(InputError, match="exists already"):
         import_trajectories([source], tmp_path / "set", split="validation", number=3)
+
+
+def test_an_imported_set_without_forces_passes_the_check(tmp_path):
+    moved = np.asarray(arguments()["motions"][0].reference).copy()
+    moved[1:] += 0.01 * (moved[1:] - moved[0])
+    still = np.zeros((len(moved) - 1, *moved.shape[1:]))
+    first = arguments()["motions"][0].reference
+    free = np.ones_like(arguments()["free"])
+    motions = [Motion(first, forces=still), Motion(moved, forces=still)]
+    path = tmp_path / "set" / "training" / "mesh-0000.h5"
+    write_shard(path, shard_from_arrays(**arguments(motions=motions, free=free)))
+    assert check_dataset(tmp_path / "set") == []
+    twice = [Motion(first, forces=still)] * 2
+    write_shard(path, shard_from_arrays(**arguments(motions=twice, free=free)))
+    (finding,) = check_dataset(tmp_path / "set")
+    assert "simulation 0001 has the mesh and the forces of simulation 0000" in finding.message
 
 
 def test_wrong_npz_files_are_refused_by_name(tmp_path):

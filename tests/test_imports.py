@@ -127,7 +127,9 @@ ORDER = [
     "data.reader",
     "data.statistics",
     "data.export",
+    "data.import_checks",
     "data.importing",
+    "data.import_files",
     "data.engines",
     "data.batch_engine",
     "data.simulate",
@@ -146,6 +148,7 @@ ORDER = [
     "corrector.network",
     "corrector.corrector",
     "report",
+    "progress",
     "dataset_cli",
     "cli",
 ]

@@ -108,6 +108,7 @@ def compare(
 
     from pdcorrect import evaluate, report
     from pdcorrect.errors import require_extra
+    from pdcorrect.progress import progress_bar
     from pdcorrect.replacement import make_folder
     from pdcorrect.scene import Scene
 
@@ -117,7 +118,7 @@ def compare(
     loaded = Scene.load(scene)
     count = frames or loaded.time.frames
     make_folder(output)
-    with _progress() as progress:
+    with progress_bar() as progress:
         tasks = {
             c.label: progress.add_task(c.label, total=count, start=False) for c in evaluate.CASES
         }
@@ -224,6 +225,7 @@ def _run(
 ) -> StepLog:
     """Step to frame ``count`` and write each frame; an interruption ends the program."""
     from pdcorrect.io.trajectory import TrajectoryWriter
+    from pdcorrect.progress import progress_bar
     from pdcorrect.solvers.resume import continue_from
     from pdcorrect.solvers.rollout import StepLog, march, run_attributes
 
@@ -237,7 +239,7 @@ def _run(
     else:
         state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
         writer = TrajectoryWriter.resume(output, earlier)
-    with writer, _progress(hidden=done >= count) as progress:
+    with writer, progress_bar(hidden=done >= count) as progress:
         task = progress.add_task(problem.scene.name, total=count, completed=done)
         try:
             for result, elapsed in march(stepper, max(0, count - done), state=state):
@@ -289,22 +291,6 @@ def _other_work(stats: dict[str, Any]) -> str:
     named = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
     sums = {text: stats[name].sum() for name, text in named.items() if stats[name].any()}
     return "".join(f", {text} {total:.4g} J" for text, total in sums.items())
-
-
-def _progress(hidden: bool = False) -> Any:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("left"), TimeRemainingColumn(), disable=hidden,
-    )  # fmt: skip
 
 
 def _say(text: str) -> None:

@@ -158,7 +158,7 @@ def import_(
     moved: Annotated[bool, typer.Option(help=".npz: frame 0 need not be the rest shape.")] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
-    from pdcorrect.data.importing import import_trajectories
+    from pdcorrect.data.import_files import import_trajectories
 
     if "/" in split or split in ("", ".", ".."):
         raise InputError(f"--split {split!r}: expected a name.")
@@ -171,22 +171,9 @@ def import_(
 @contextlib.contextmanager
 def _simulations() -> Iterator[Callable[[str, int, int], None]]:
     """A bar with the time that is left, on a terminal or in a log."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from pdcorrect.progress import progress_bar
 
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("simulations"), TimeElapsedColumn(), TextColumn("left"),
-        TimeRemainingColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with progress_bar("simulations", apart=True) as progress:
         task = progress.add_task("generating", total=None)
 
         def on_file(name: str, done: int, total: int) -> None:
@@ -219,9 +206,8 @@ def _write(path: Path, text: str) -> None:
 @contextlib.contextmanager
 def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
     """A bar on the terminal; gives what to call after each of ``count`` files."""
-    from rich.console import Console
-    from rich.progress import Progress
+    from pdcorrect.progress import progress_bar
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    with progress_bar("files", apart=True) as progress:
         task = progress.add_task(title, total=count)
         yield lambda path: progress.advance(task)
