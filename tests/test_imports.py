@@ -68,6 +68,7 @@ ORDER = [
     "solvers.step_solution",
     "solvers.adjoint_solve",
     "solvers.adjoint_terms",
+    "solvers.gradients",
     "solvers.adjoint",
     "batch",
     "batch.decomposition",

@@ -1,0 +1,295 @@
+"""`Gradients`: an adjoint solution, and what each derivative makes of it when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.fem.sensitivities import weight_slopes
+from pdcorrect.scene.materials import lame_slopes
+from pdcorrect.solvers.adjoint_solve import (
+    AdjointSolution,
+    AdjointSolver,
+    solve_adjoint,
+    spectral_radius,
+)
+from pdcorrect.solvers.adjoint_terms import (
+    DampingTerm,
+    FirstAccelerationTerm,
+    follower_slope,
+    gravity_slope,
+    mass_slope,
+)
+from pdcorrect.solvers.implicit import ImplicitStepper
+from pdcorrect.solvers.integrators import Integrator
+from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
+from pdcorrect.state import State
+
+Array = NDArray[np.float64]
+
+_STEP = 1e-3
+"""Of the time step, for differences of fourth order at fixed y."""
+
+
+@dataclass(frozen=True, eq=False)
+class TakenStep:
+    """One step that was taken, and how to solve for its adjoint.
+
+    ``state`` is as the step used it, ``remembered`` the names in the memory it was given;
+    ``integrate`` keeps to the step's scheme.
+    """
+
+    stepper: ImplicitStepper
+    state: State
+    remembered: tuple[str, ...]
+    forces: Array | None
+    time_step: float
+    integrate: Integrator
+    solver: AdjointSolver
+    tolerance: float
+
+    def objective(self, time_step: float) -> StepObjective:
+        return self.stepper.objective(self.state, self.forces, time_step, self.integrate)
+
+    def global_solver(self, objective: StepObjective) -> GlobalSolver:
+        """G^-1 for the thesis's G, whatever the stepper's first Hessian is."""
+        return self.stepper.global_solver(objective.factors, volume_scale=1.0)
+
+    def solve(
+        self, H: HessianOperator, y: Array, g: Array, solver: AdjointSolver, tolerance: float
+    ) -> AdjointSolution:
+        """X with H x = g for the Hessian H at y."""
+        return solve_adjoint(
+            H,
+            g,
+            solver,
+            lambda: self.stepper.preconditioner(H.objective, y),
+            lambda: self.global_solver(H.objective),
+            tolerance,
+        )
+
+
+class Gradients:
+    """Derivatives of a loss by the inputs of one step; made by `adjoint`.
+
+    Those that take more than the adjoint state are computed when first asked for.
+
+    Attributes
+    ----------
+    x : (N + B, 3)
+        The adjoint state: the loss's derivative by a force on each node (and mode).
+    solver : str
+        What solved for it.
+    iterations : int
+    residual : float
+        Of its linear system, relative.
+    """
+
+    def __init__(self, step: TakenStep, after: Mapping[str, Array], y: Array) -> None:
+        self._step, self._after, self._y = step, after, y
+        self._problem = step.stepper.problem
+        self._objective = step.objective(step.time_step)
+        self._scheme = step.integrate.scheme(step.state, step.time_step)
+        self._sums: dict[str, Array] = {}
+        self._pull(self._scheme.positions, None, after["positions"])
+        self._pull(self._scheme.velocities, self._scheme.clamped_velocities, after["velocities"])
+        for name, rows in self._scheme.memory.items():
+            if name in after:
+                self._pull(*rows, after[name])
+        by_y = self._sums.pop("y")
+        self._H = self._objective.hessian_operator(y)
+        g = self._problem.extended(by_y) * self._objective.free
+        found = step.solve(self._H, y, g, step.solver, step.tolerance)
+        self.x, self.solver, self.iterations = found.x, found.solver, found.iterations
+        self.residual = found.residual
+        self._nodal = self.x[: len(by_y)]
+        self._damping: DampingTerm | None = None
+        if self._objective.damping is not None:
+            self._damping = DampingTerm(self._problem, self._objective.damping, y, self.x)
+        self._pull_stage(by_y)
+        self._first: FirstAccelerationTerm | None = None
+        if "accelerations" in self._sums and "accelerations" not in step.state.memory:
+            by_first = self._sums.pop("accelerations")
+            self._first = FirstAccelerationTerm(self._problem, step.state, step.forces, by_first)
+
+    def __repr__(self) -> str:
+        return (
+            f"Gradients(by {self.solver}, {self.iterations} iterations, relative residual "
+            f"{self.residual:.1g})"
+        )
+
+    # --- by the state and what acts on it ------------------------------------------------
+
+    @cached_property
+    def positions(self) -> Array:
+        """By the positions at the start of the step, (N, 3), 1/m."""
+        out = self._sum("positions")
+        for term in (self._damping, self._first):
+            if term is not None:
+                out = out + term.positions
+        return out
+
+    @cached_property
+    def velocities(self) -> Array:
+        """By the velocities at the start of the step, (N, 3), s/m."""
+        out = self._sum("velocities")
+        return out if self._first is None else out + self._first.velocities
+
+    @cached_property
+    def forces(self) -> Array:
+        """By nodal forces during the step, (N, 3), 1/N."""
+        return self._nodal if self._first is None else self._nodal + self._first.forces
+
+    @cached_property
+    def clamped_positions(self) -> Array:
+        """By the prescribed positions at the end of the step, (N, 3), 1/m; 0 where free.
+
+        The clamps' velocities and accelerations, where an integrator uses them, are held.
+        """
+        return self._sum("prescribed") * ~self._problem.free
+
+    @property
+    def memory(self) -> dict[str, Array]:
+        """By the entries of `State.memory` at the start of the step, each (N, 3).
+
+        Zero where the step was not the stepper's own, for it went without them.
+        """
+        return {name: self._sum(name) for name in self._step.remembered}
+
+    @cached_property
+    def time_step(self) -> float:
+        """By the time step, 1/s, everything that is given as a function of time included.
+
+        Everything at the start of the step is held, its time and memory too, and so is the
+        scheme: for BDF2 the step before gets longer with this one.  With loads and clamps
+        that do not change in time the sum over all steps is the derivative by the length
+        that they share.  By differences of fourth order of the step's equation at fixed y.
+        """
+        h, e = self._step.time_step, _STEP * self._step.time_step
+        f = self._lagrangian
+        return (8.0 * (f(h + e) - f(h - e)) - (f(h + 2 * e) - f(h - 2 * e))) / (12.0 * e)
+
+    # --- by the material ----------------------------------------------------------------
+
+    @property
+    def mu(self) -> Array:
+        """By each cell's mu, (C,), 1/Pa."""
+        return self._weights[0]
+
+    @property
+    def lam(self) -> Array:
+        """By each cell's lambda, (C,), 1/Pa; the volume weight is a multiple of it."""
+        published = self._problem.scene.material.volume_weight == "published"
+        return self._weights[1] * (1.0 if published else 3.0)
+
+    @property
+    def young(self) -> Array:
+        """By each cell's Young's modulus at fixed Poisson's ratio, (C,), 1/Pa."""
+        (mu, lam), _ = self._moduli_slopes
+        return self.mu * mu + self.lam * lam
+
+    @property
+    def poisson(self) -> Array:
+        """By each cell's Poisson's ratio at fixed Young's modulus, (C,)."""
+        _, (mu, lam) = self._moduli_slopes
+        return self.mu * mu + self.lam * lam
+
+    @cached_property
+    def density(self) -> Array:
+        """By each cell's density, (C,), m3/kg; gravity included."""
+        stage, problem, x = self._objective.stage, self._problem, self._nodal
+        offset = self._y[: len(x)] - stage.target
+        out = gravity_slope(problem, x, *stage.loads_over)
+        out -= stage.inertia * mass_slope(problem, x, offset)
+        for term in (self._damping, self._first):
+            if term is not None:
+                out = out + term.density
+        return out
+
+    # --- how good they are ----------------------------------------------------------------
+
+    @cached_property
+    def spectral_radius(self) -> float:
+        """Of G^-1 (G - H), the convergence factor of the thesis's fixed point (eq. 3-30)."""
+        return spectral_radius(self._H, self._step.global_solver(self._objective))
+
+    def estimated_errors(self) -> dict[str, float]:
+        """How much the gradients change in one Newton step from y, relative.
+
+        An estimate of their error that is due to a forward step that was not solved
+        exactly; first order in what it left.
+        """
+        _, gradient = self._objective.value_and_gradient(self._y)
+        found = self._step.solve(self._H, self._y, gradient, "auto", 1e-6)
+        better = Gradients(self._step, self._after, self._y - found.x)
+        out = {}
+        for name in ("positions", "velocities", "forces", "young", "poisson", "density"):
+            new = getattr(better, name)
+            size = float(np.linalg.norm(new))
+            out[name] = float(np.linalg.norm(new - getattr(self, name))) / size if size else 0.0
+        return out
+
+    # --- internals --------------------------------------------------------------------------
+
+    def _pull(self, on_free: Linear, on_clamped: Linear | None, g: Array) -> None:
+        """Add g's share to the derivatives by what a linear combination is made of."""
+        if on_clamped is None:
+            on_free.transpose(g, self._sums)
+            return
+        free = self._problem.free
+        on_free.transpose(g * free, self._sums)
+        on_clamped.transpose(g * ~free, self._sums)
+
+    def _pull_stage(self, by_y: Array) -> None:
+        scheme, stage, problem, x = self._scheme, self._objective.stage, self._problem, self._nodal
+        if scheme.inertia:
+            by_target = scheme.inertia * problem.mass_times(x)
+            self._pull(scheme.target, scheme.clamped_target, by_target)
+        if self._damping is not None:
+            self._pull(scheme.origin, scheme.clamped_origin, self._damping.origin)
+        held = ~problem.free
+        if held.any():
+            back = (by_y - self._H.product(self.x)[: len(x)]) * held
+            scheme.clamped.transpose(back, self._sums)
+        if any(load.pull is not None for load in problem.loads):
+            slope = follower_slope(problem, x, stage.loads_at, *stage.loads_over)
+            scheme.loads_at.transpose(slope, self._sums)
+
+    def _sum(self, name: str) -> Array:
+        found = self._sums.get(name)
+        return np.zeros_like(self._problem.positions) if found is None else found
+
+    @cached_property
+    def _weights(self) -> tuple[Array, Array]:
+        """By each cell's mu and omega, 0 for a term that the energy does not have."""
+        problem = self._problem
+        parts = [weight_slopes(problem, self._y, -self.x)]
+        parts += [term.weights for term in (self._damping, self._first) if term is not None]
+        rule = problem.scene.material
+        by_mu = np.sum([part[0] for part in parts], axis=0)
+        by_omega = np.sum([part[1] for part in parts], axis=0)
+        return by_mu * rule.has_shear_term, by_omega * rule.has_volume_term
+
+    @property
+    def _moduli_slopes(self) -> tuple[tuple[Array, Array], ...]:
+        materials = self._problem.materials
+        return lame_slopes(materials.young, materials.poisson)
+
+    def _lagrangian(self, h: float) -> float:
+        """L's linear part less x . r at fixed free y, for a step of h."""
+        objective = self._step.objective(h)
+        stage, count = objective.stage, len(self._problem.positions)
+        y = np.where(objective.free, self._y, self._problem.extended(stage.start))
+        _, residual = objective.balance(y)
+        end = stage.finish(y[:count])
+        value = np.vdot(self._after["positions"], end.positions)
+        value += np.vdot(self._after["velocities"], end.velocities)
+        for name in self._scheme.memory:
+            if name in self._after:
+                value += np.vdot(self._after[name], end.memory[name])
+        return float(value - np.vdot(self.x, residual))
