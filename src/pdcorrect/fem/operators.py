@@ -6,6 +6,7 @@ corners; both are converted here and nowhere else.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -125,13 +126,19 @@ class Space:
         if rule == "per-node":
             share = self.volumes()[:, None] / np.bincount(self.cells.ravel())[self.cells]
             return share[:, :, None] * np.eye(self.cells.shape[1])
-        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
-        values = np.stack([np.asarray(basis.basis[k][0])[0] for k in self._to_vtk])
-        consistent = np.einsum("cq,kq,lq->ckl", basis.dx, values, values, optimize=True)
+        consistent = self._consistent_cell_masses
         if rule == "consistent":
             return consistent
-        diagonal = consistent.sum(axis=2)[:, :, None] * np.eye(len(values))
+        diagonal = consistent.sum(axis=2)[:, :, None] * np.eye(self.cells.shape[1])
         return diagonal if rule == "lumped" else 0.5 * (consistent + diagonal)
+
+    @cached_property
+    def _consistent_cell_masses(self) -> Array:
+        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
+        values = np.stack([np.asarray(basis.basis[k][0])[0] for k in self._to_vtk])
+        masses = np.einsum("cq,kq,lq->ckl", basis.dx, values, values, optimize=True)
+        masses.flags.writeable = False
+        return masses
 
     def cell_products(self, a: Array, b: Array, rule: str) -> Array:
         """Derivatives of a . M b by the cells' densities, (C,), for nodal fields (N, 3)."""
