@@ -145,6 +145,8 @@ ORDER = [
     "corrector.normaliser",
     "corrector.network",
     "corrector.corrector",
+    "corrector.cost",
+    "corrector.model_io",
     "report",
     "dataset_cli",
     "cli",
