@@ -20,7 +20,7 @@ NODAL = ("rest", "free", "mass", "young", "poisson", "density")
 
 
 def tensor(array):
-    return torch.as_tensor(np.ascontiguousarray(array))
+    return torch.tensor(np.asarray(array))
 
 
 def body(cells=(3, 2, 1), seed=0, distortion=0.15, clamped=True, size=SIZE, mesh=None):

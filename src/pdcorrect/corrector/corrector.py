@@ -79,10 +79,9 @@ class Corrector(nn.Module):
 
 
 def without_momentum(view: View, correction: Tensor) -> Tensor:
-    """The correction less the rigid motion of the wholly free nodes that has its momenta.
+    """The correction less the rigid motion of the wholly free nodes that has their momenta.
 
-    Bodies without such a node keep theirs.  About an axis on which all of them lie, they
-    cannot turn, and what the others have about it stays.
+    Nodes with a held component keep theirs: clamps take up what they have.
     """
     bodies = view.bodies
     carries = bodies.free.all(dim=1, keepdim=True)
@@ -92,7 +91,7 @@ def without_momentum(view: View, correction: Tensor) -> Tensor:
     r = view.snapshot.proposed - bodies.by_node(
         bodies.node_sums(mass * view.snapshot.proposed) / total
     )
-    impulse = bodies.mass[:, None] * correction
+    impulse = mass * correction
     mean = bodies.node_sums(impulse) / total
     spin = bodies.node_sums(torch.linalg.cross(r, impulse))
     identity = torch.eye(3, dtype=r.dtype, device=r.device)
