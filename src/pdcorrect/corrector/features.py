@@ -18,7 +18,6 @@ from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.frames import (
-    node_axes,
     node_gradients,
     polar_rotations,
     rotation_vectors,
@@ -66,15 +65,16 @@ class View:
         self.step = bodies.by_node(bodies.time_step)[:, None]
         self.receiver, self.sender = bodies.edge_index
 
-    @cached_property
+    @property
     def rest_frames(self) -> Tensor:
         """Rotations (n, 3, 3)."""
-        return polar_rotations(node_axes(self.bodies.rest, self.bodies.cells))
+        return self.bodies.rest_frames
 
     @cached_property
     def gradients(self) -> Tensor:
         """Deformation gradients F (n, 3, 3), after the step."""
-        return node_gradients(self.snapshot.proposed, self.bodies.rest, self.bodies.cells)
+        bodies = self.bodies
+        return node_gradients(self.snapshot.proposed, bodies.rest_inverses, bodies.cells)
 
     @cached_property
     def turns(self) -> Tensor:
@@ -85,6 +85,11 @@ class View:
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
         return self.turns @ self.rest_frames
+
+    @cached_property
+    def receiver_frames(self) -> Tensor:
+        """Frames of the edges' receivers, (E, 3, 3)."""
+        return self.frames[self.receiver]
 
     @cached_property
     def strain(self) -> Tensor:
@@ -116,7 +121,7 @@ class View:
     def in_receiver_frame(self, x: Tensor) -> Tensor:
         """Vectors (E, 3) of edges in the receiver's frame, over cell size and deformation."""
         unit = (self.size * self.scale)[self.receiver]
-        return turned_back(self.frames[self.receiver], x) / unit
+        return turned_back(self.receiver_frames, x) / unit
 
 
 Feature = tuple[int, Callable[[View], Tensor]]
@@ -158,16 +163,13 @@ def _strain(view: View) -> Tensor:
 
 
 def _rest_edge(view: View) -> Tensor:
-    x = view.edge_change(view.bodies.rest) / view.size[view.receiver]
-    return _with_length(turned_back(view.rest_frames[view.receiver], x))
+    return _with_length(view.bodies.rest_edges / view.size[view.receiver])
 
 
 def _stretch(view: View) -> Tensor:
     """Edge in the receiver's frame, minus that at rest in the frame at rest."""
-    unit = view.size[view.receiver]
-    now = turned_back(view.frames[view.receiver], view.edge_change(view.snapshot.proposed))
-    rest = turned_back(view.rest_frames[view.receiver], view.edge_change(view.bodies.rest))
-    return (now - rest) / (unit * view.scale[view.receiver])
+    now = turned_back(view.receiver_frames, view.edge_change(view.snapshot.proposed))
+    return (now - view.bodies.rest_edges) / (view.size * view.scale)[view.receiver]
 
 
 def _motion(view: View) -> Tensor:
@@ -178,12 +180,8 @@ def _motion(view: View) -> Tensor:
 
 def _turn(view: View) -> Tensor:
     """Rotation between the frames of an edge's ends, beyond that at rest."""
-    here, there = view.receiver, view.sender
-
-    def between(frames: Tensor) -> Tensor:
-        return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
-
-    return (between(view.frames) - between(view.rest_frames)) / view.scale[here]
+    now = rotation_vectors(view.receiver_frames.transpose(1, 2) @ view.frames[view.sender])
+    return (now - view.bodies.rest_turns) / view.scale[view.receiver]
 
 
 def _with_length(x: Tensor) -> Tensor:
