@@ -148,6 +148,8 @@ ORDER = [
     "corrector.normaliser",
     "corrector.network",
     "corrector.corrector",
+    "corrector.cost",
+    "corrector.model_io",
     "report",
     "progress",
     "dataset_cli",
