@@ -83,6 +83,7 @@ ORDER = [
     "batch.elimination",
     "batch.dense",
     "batch.levels",
+    "batch.grid",
     "batch.multigrid",
     "batch.inverses",
     "batch.objective",

@@ -124,3 +124,34 @@ def _interpolation(
     row, place = np.nonzero(weights)
     entries = (weights[row, place], (row, numbers[row, place]))
     return sp.csr_matrix(entries, shape=(count, int(parents.max()) + 1))
+
+
+# --- as tables, which torch reads ----------------------------------------------------------------
+
+
+def places(cells: Numbers, count: int) -> Numbers:
+    """Where each node occurs in the raveled cells, (N, most), filled up with -1."""
+    flat = cells.ravel()
+    order = np.argsort(flat, kind="stable")
+    return _rows(flat[order], order, count, -1)[0]
+
+
+def table(P: sp.csr_matrix | None, transposed: bool) -> tuple[Numbers, Array]:
+    """Columns and weights of the rows of P, or of P^T, filled up with zeros."""
+    assert P is not None
+    matrix = sp.coo_matrix(P.T if transposed else P)
+    order = np.argsort(matrix.row, kind="stable")
+    rows, columns = matrix.row[order], matrix.col[order].astype(np.int64)
+    numbers, places = _rows(rows, columns, matrix.shape[0], 0)
+    weights = np.zeros(numbers.shape)
+    weights[rows, places] = matrix.data[order]
+    return numbers, weights
+
+
+def _rows(rows: Numbers, values: Numbers, count: int, fill: int) -> tuple[Numbers, Numbers]:
+    """Values by sorted rows as a table (count, most), and the place of each in its row."""
+    counts = np.bincount(rows, minlength=count)
+    places = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
+    out = np.full((count, counts.max()), fill, dtype=np.int64)
+    out[rows, places] = values
+    return out, places

@@ -25,6 +25,7 @@ from pdcorrect.batch.checks import (
     start_times,
     usable_device,
 )
+from pdcorrect.batch.elimination import alike_cells
 from pdcorrect.batch.inverses import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
@@ -386,5 +387,10 @@ class BatchStepper:
 
         Also before the first step, in which it is taken.
         """
-        kinds = len(Sharing(self.problems, torch.device("cpu")).distinct)
-        return expected_bytes(self.cells.sizes, kinds, 3 if self.first_hessian == "rest" else 1)
+        distinct = Sharing(self.problems, torch.device("cpu")).distinct
+        sizes, kinds = self.cells.sizes, len(distinct)
+        if self.first_hessian != "multigrid":
+            return expected_bytes(sizes, kinds, 3 if self.first_hessian == "rest" else 1)
+        coarse = max(len(p.mesh.coarse_nodes) for p in distinct)
+        alike = all(map(alike_cells, distinct))
+        return expected_bytes(sizes, kinds, 3, coarse, 0 if alike else kinds * sizes.cells)
