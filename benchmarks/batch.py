@@ -191,7 +191,7 @@ def main() -> None:
     if gpu:
         record["fine, other first Hessians"] = [
             measure(8, FINE, 4, device, "G-scaled"),
-            measure(8, FINE, 4, device, "two-level", shared=True),
+            measure(8, FINE, 4, device, shared=True),
         ]
         record["newton"] = newton_bound()
     path = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("batch.json")

@@ -42,7 +42,7 @@ def sums_of_rows(values: Tensor, numbers: Tensor) -> Tensor:
 
     A number of L stands for nothing.
     """
-    out: Tensor = as_kernel(_sums, values.is_cuda)(values, numbers)
+    out: Tensor = as_kernel(sums, values.is_cuda)(values, numbers)
     return out
 
 
@@ -55,7 +55,8 @@ def _rows(u: Tensor, numbers: Tensor) -> Tensor:
     return u[numbers]
 
 
-def _sums(values: Tensor, numbers: Tensor) -> Tensor:
+def sums(values: Tensor, numbers: Tensor) -> Tensor:
+    """`sums_of_rows` as part of a larger kernel."""
     count = len(values)
     terms = []
     for column in numbers.unbind(dim=1):

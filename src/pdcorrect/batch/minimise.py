@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.history import BatchHistory
-from pdcorrect.batch.inverses import DenseInverse
+from pdcorrect.batch.inverses import FirstHessian
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
 from pdcorrect.batch.recording import Recorder
@@ -51,7 +51,7 @@ class BatchMinimiser:
     Parameters
     ----------
     objective : BatchObjective
-    inverse : DenseInverse
+    inverse : FirstHessian
     tolerance : (B,)
         m, of each scene's estimated largest displacement from its minimum.
     max_iterations : int
@@ -68,7 +68,7 @@ class BatchMinimiser:
     def __init__(
         self,
         objective: BatchObjective,
-        inverse: DenseInverse,
+        inverse: FirstHessian,
         tolerance: Tensor,
         max_iterations: int,
     ) -> None:

@@ -25,7 +25,8 @@ from pdcorrect.batch.checks import (
     start_times,
     usable_device,
 )
-from pdcorrect.batch.inverses import BatchHessian, DenseInverse, chosen
+from pdcorrect.batch.elimination import alike_cells
+from pdcorrect.batch.inverses import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
@@ -69,8 +70,8 @@ class BatchStepper:
     problems : sequence of Problem
     tolerance : float, optional
         Of each scene's coarse cell size; each scene's own by default.
-    first_hessian : {"auto", "G", "G-scaled", "two-level", "rest"}
-        See `DenseInverse`; "auto" is "rest" for small meshes and "two-level" for others
+    first_hessian : {"auto", "G", "G-scaled", "multigrid", "rest"}
+        See `FirstHessian`; "auto" is "rest" for small meshes and "multigrid" for others
         that are refined.
     max_iterations : int
         At least 1.
@@ -141,7 +142,7 @@ class BatchStepper:
         """Make what is not kept in copies of the stepper, or anew when it is first needed."""
         self._lock = threading.RLock()
         self._minimiser: BatchMinimiser | None = None
-        self._inverse: DenseInverse | None = None
+        self._inverse: FirstHessian | None = None
         self._one_by_one = OneByOne(
             self.cells, self._problem_now, self.tolerances, self.time_step, self.integrator
         )
@@ -346,7 +347,7 @@ class BatchStepper:
 
     def _make_minimiser(self, gain: float) -> None:
         self._minimiser = self._inverse = None  # whose memory is needed
-        self._inverse = DenseInverse(
+        self._inverse = FirstHessian(
             self.cells, self.problems, self.objective.factors, self.first_hessian, self._storage
         )
         pairs = zip(self.tolerances, self.problems, strict=True)
@@ -386,5 +387,10 @@ class BatchStepper:
 
         Also before the first step, in which it is taken.
         """
-        kinds = len(Sharing(self.problems, torch.device("cpu")).distinct)
-        return expected_bytes(self.cells.sizes, kinds, 3 if self.first_hessian == "rest" else 1)
+        distinct = Sharing(self.problems, torch.device("cpu")).distinct
+        sizes, kinds = self.cells.sizes, len(distinct)
+        if self.first_hessian != "multigrid":
+            return expected_bytes(sizes, kinds, 3 if self.first_hessian == "rest" else 1)
+        coarse = max(len(p.mesh.coarse_nodes) for p in distinct)
+        alike = all(map(alike_cells, distinct))
+        return expected_bytes(sizes, kinds, 3, coarse, 0 if alike else kinds * sizes.cells)

@@ -39,7 +39,12 @@ from pdcorrect.errors import (
 )
 from pdcorrect.replacement import clear_parts, make_folder, write_text
 
-LARGEST_BATCHED = 40_000
+LARGEST_BATCHED = 150_000
+"""Nodes of the largest mesh that is stepped in batches.
+
+A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.memory`), so a batch of 32
+such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
+"""
 _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
 OnFile = Callable[[str, int, int], None]
@@ -221,8 +226,8 @@ def check_device(device: str) -> None:
 def make_engines(config: DatasetConfig, device: str) -> Engines:
     """The engines for a device.
 
-    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, whose dense inverses
-    would not fit, step one problem after the other on the CPU.
+    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, of which a batch might
+    not fit, step one problem after the other on the CPU.
     """
     alone = OneByOne("pd", config.tolerance)
     newton = config.reference.solver == "newton"

@@ -1,0 +1,153 @@
+"""Matrices of cells, and their internal modes eliminated from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, cat
+
+from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.fused import small_products
+from pdcorrect.batch.narrowing import with_rows
+from pdcorrect.fem.assembly import Assembly
+from pdcorrect.fem.problem import Problem
+
+Array = NDArray[np.float64]
+
+_DIGITS = 11
+"""To which numbers of different cells count as equal."""
+
+
+def alike_cells(problem: Problem) -> bool:
+    """Whether shape functions and material are the same in all cells of a body."""
+    materials, quadrature = problem.materials, problem.quadrature
+    return all(
+        np.allclose(a, a[:1], rtol=0.0, atol=10.0**-_DIGITS * np.abs(a[0]).max())
+        for a in (
+            quadrature.lanes, quadrature.weights, quadrature.volume_weights,
+            materials.mu, materials.volume_weight, materials.density,
+        )
+    )  # fmt: skip
+
+
+def scalar_blocks(problem: Problem, stiffness: float, volume_scale: float, alike: bool) -> Array:
+    """The elastic part of G of each cell, (C, L, L), N/m; of one cell if they are alike."""
+    few = slice(1) if alike else slice(None)
+    weights, lanes = problem.point_weights[few], problem.quadrature.lanes[few]
+    coefficient = stiffness * (2.0 * weights[:, 0] + volume_scale * weights[:, 1])
+    rows = lanes.reshape(*lanes.shape[:2], -1)
+    scaled = (lanes * coefficient[:, None, None, :]).reshape(rows.shape)
+    return np.asarray(rows @ scaled.swapaxes(1, 2))
+
+
+def rest_blocks(problem: Problem, stiffness: float, alike: bool) -> Array:
+    """The rest Hessian of each cell, (C, 3 L, 3 L), N/m; of one cell if they are alike."""
+    tangent = problem.linearise(problem.extended(problem.positions), project=True)
+    if alike:
+        quadrature = tangent.quadrature
+        tangent = replace(
+            tangent,
+            assembly=Assembly(tangent.assembly.cells[:1], problem.unknowns),
+            quadrature=replace(quadrature, lanes=quadrature.lanes[:1]),
+            left=tangent.left[:1],
+            right=tangent.right[:1],
+            tangent=tangent.tangent[:1],
+        )
+    blocks = stiffness * tangent.blocks()
+    count, width = blocks.shape[:2]
+    return np.ascontiguousarray(blocks.swapaxes(2, 3)).reshape(count, 3 * width, 3 * width)
+
+
+class Elimination:
+    """The internal modes of cells, eliminated from a system and found afterwards.
+
+    Parameters
+    ----------
+    cells : CellBatch
+    blocks : sequence of (C or 1, w L, w L)
+        Of each distinct problem's cells; one stands for all.
+    owners : (B,) tensor
+        Which of them each scene has.
+    nodes : int
+        Of a cell, K; its other shape functions are modes.
+    width : int
+        Unknowns a node, w: 1 where the blocks are the same for all coordinates, or 3.
+
+    Attributes
+    ----------
+    blocks : list of (C or 1, w K, w K)
+        Of the nodes, with the modes eliminated.
+    """
+
+    def __init__(
+        self, cells: CellBatch, blocks: Sequence[Array], owners: Tensor, nodes: int, width: int
+    ) -> None:
+        self._cells, self._nodes, self._width = cells, nodes, width
+        if not cells.sizes.modes:
+            self.blocks = list(blocks)
+            return
+        parts = [_eliminated(b, width * self._nodes) for b in blocks]
+        self.blocks = [kept for kept, _, _ in parts]
+        self._inverse = self._stored([inverse for _, inverse, _ in parts])[owners]
+        self._solved = self._stored([solved for _, _, solved in parts])[owners]
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> Elimination:
+        """Of some scenes, with their cells."""
+        names = ("_inverse", "_solved") if cells.sizes.modes else ()
+        return with_rows(self, rows, *names, _cells=cells)
+
+    def reduced(self, r: Tensor) -> Tensor:
+        """Right-hand side (B, N, 3) of the nodes for that of configurations (B, U, 3)."""
+        n = self._cells.sizes
+        if not n.modes:
+            return r
+        local = self._cells.local(r)
+        back = self._times(self._solved.transpose(-1, -2), local[:, :, self._nodes :])
+        out = r - self._cells.summed(cat([back, 0.0 * local[:, :, self._nodes :]], dim=2))
+        return out[:, : n.nodes]
+
+    def recovered(self, x: Tensor, r: Tensor) -> Tensor:
+        """The whole solution (B, U, 3) for that of the nodes (B, N, 3) and right-hand side r."""
+        n = self._cells.sizes
+        if not n.modes:
+            return x
+        whole = cat([x, x.new_zeros(n.scenes, n.modes, 3)], dim=1)
+        modes = self._cells.local(r)[:, :, self._nodes :]
+        nodes = self._cells.local(whole)[:, :, : self._nodes]
+        found = self._times(self._inverse, modes) - self._times(self._solved, nodes)
+        return whole + self._cells.summed(cat([0.0 * nodes, found], dim=2))
+
+    def _stored(self, arrays: Sequence[Array]) -> Tensor:
+        """(K, m, n) where all cells of each problem are alike, else (K, C, m, n)."""
+        if all(len(a) == 1 for a in arrays):
+            return self._cells.tensor(np.concatenate(arrays))
+        count = self._cells.sizes.cells
+        every = [np.broadcast_to(a, (count, *a.shape[1:])) if len(a) == 1 else a for a in arrays]
+        return self._cells.tensor(padded(every, (count, *every[0].shape[1:])))
+
+    def _times(self, matrices: Tensor, local: Tensor) -> Tensor:
+        """Matrices times the values (B, C, k, 3) in each cell."""
+        if self._width == 3:
+            flat = local.reshape(*local.shape[:2], -1, 1)
+            return cellwise(matrices, flat).reshape(*local.shape[:2], -1, 3)
+        return cellwise(matrices, local)
+
+
+def cellwise(matrices: Tensor, x: Tensor) -> Tensor:
+    """A x for each cell, (B, m, n) or (B, C, m, n) times (B, C, n, k)."""
+    if matrices.ndim == 4:
+        return small_products(matrices, x)
+    scenes, cells, n, k = x.shape
+    rows = x.transpose(2, 3).reshape(scenes, cells * k, n) @ matrices.transpose(1, 2)
+    return rows.reshape(scenes, cells, k, -1).transpose(2, 3)
+
+
+def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
+    """Blocks of the nodes with the modes eliminated, K_bb^-1 and K_bb^-1 K_bu."""
+    inverse = np.asarray(np.linalg.inv(blocks[:, nodes:, nodes:]), dtype=np.float64)
+    solved = inverse @ blocks[:, nodes:, :nodes]
+    kept = blocks[:, :nodes, :nodes] - blocks[:, :nodes, nodes:] @ solved
+    return np.ascontiguousarray(kept), inverse, solved

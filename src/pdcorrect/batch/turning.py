@@ -1,0 +1,56 @@
+"""How nodes have turned since rest: the frame in which the rest Hessian is applied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.narrowing import with_rows
+from pdcorrect.fem.problem import Problem
+
+
+class Turning:
+    """How nodes and modes have turned since rest, as `first_hessian.Rotations`."""
+
+    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
+        self._cells = cells
+        n = cells.sizes
+        shares = [
+            p.quadrature.weights / p.quadrature.weights.sum(axis=1, keepdims=True) for p in problems
+        ]
+        self._shares = cells.tensor(padded(shares, (n.cells, n.points)))
+        held = [~p.free.all(axis=1) for p in problems]
+        self._held = cells.nodal([np.where(h, 1.0, 0.0) for h in held]) > 0.5
+        self._nodes = problems[0].cells.shape[1]
+
+    def narrowed(self, cells: CellBatch, rows: Tensor) -> Turning:
+        """Of some scenes, with their cells."""
+        return with_rows(self, rows, "_shares", "_held", _cells=cells)
+
+    def since_rest(self, y: Tensor) -> list[Tensor]:
+        """Rotations of nodes and modes, nine tensors (B, U)."""
+        cells, n = self._cells, self._cells.sizes
+        u = y - cells.rest
+        u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
+        F = cells.gradients(u, 1.0).reshape(9, n.scenes, n.cells, n.points)
+        mean = (F * self._shares).sum(dim=-1).reshape(9, -1)
+        turns = cells.rotations(mean).T.reshape(n.scenes, n.cells, 1, 9)
+        by_cell = turns.expand(-1, -1, n.width, -1)
+        sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
+        total = torch.cat(sums, dim=-1)  # (B, U, 9)
+        identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
+        still = self._held | (total.abs().sum(dim=-1) == 0.0)
+        total = torch.where(still[..., None], identity, total)
+        out = cells.rotations(total.reshape(-1, 9).T.contiguous())
+        return list(out.reshape(9, n.scenes, n.unknowns))
+
+
+def rotated(R: list[Tensor], x: Tensor) -> Tensor:
+    """R x at each node, nine (B, U) and (B, U, 3)."""
+    a, b, c = x.unbind(-1)
+    rows = [R[3 * i] * a + R[3 * i + 1] * b + R[3 * i + 2] * c for i in range(3)]
+    return torch.stack(rows, dim=-1)
