@@ -454,6 +454,8 @@ def test_scenes_that_take_long_go_on_in_a_smaller_batch(element, first_hessian, 
     hard = [{"kind": "gravity", "acceleration": [0.0, 0.0, strength]}]
     problems[3] = pc.discretise(unlike(0, element, loads=hard), refine)
     states = moving_states(problems)
+    if refine > 1:  # noise of the same size would turn small cells inside out
+        states = [replace(s, velocities=0.2 * s.velocities) for s in states]
     found = []
     for few in (minimise._FEW, 10**9):
         monkeypatch.setattr(minimise, "_FEW", few)
