@@ -54,6 +54,13 @@ class Case:
     reference: Array
     runs: Mapping[str, Array]
     predictions: Mapping[str, Array]
+    _energies: dict[str, EnergyBalance] = field(default_factory=dict, repr=False)
+
+    def reference_energies(self, base: str) -> EnergyBalance:
+        """Of the reference by a coarse model; kept, for all runs are compared with them."""
+        if base not in self._energies:
+            self._energies[base] = energies(self.problems[base], self.reference)
+        return self._energies[base]
 
     @property
     def steps(self) -> int:
@@ -237,7 +244,7 @@ def _of_rollout(
 
 def _of_physics(case: Case, positions: Array, base: str | None) -> dict[str, float | None]:
     own = case.problems[base or PLAIN]
-    ours, truth = energies(own, positions), energies(own, case.reference)
+    ours, truth = energies(own, positions), case.reference_energies(base or PLAIN)
     size = float(truth.total.max())
     largest = float(ours.total.max())
     closed = not own.clamps.moving and not any(own.scene.damping.model_dump().values())

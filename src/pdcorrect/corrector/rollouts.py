@@ -134,7 +134,7 @@ def single_steps(
             np.zeros(x.shape[1:]) if y is None or not t else x[t] - y[t - 1]
             for x, y, t in zip(references, coarse, frames, strict=True)
         ])  # fmt: skip
-        previous = torch.as_tensor(before, dtype=stepper.dtype, device=stepper.device)
+        previous = torch.as_tensor(before, device=stepper.device)
         result = hybrid(state, previous)
         found.append(_where(_fine(result), result.state.positions, state.positions))
     positions = torch.stack(found).to("cpu", torch.float64).numpy()
