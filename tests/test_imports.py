@@ -147,6 +147,8 @@ ORDER = [
     "corrector.normaliser",
     "corrector.network",
     "corrector.corrector",
+    "corrector.cost",
+    "corrector.model_io",
     "corrector.placements",
     "corrector.batch_bodies",
     "corrector.batch_hybrid",

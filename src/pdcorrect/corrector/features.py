@@ -19,6 +19,7 @@ from torch import Tensor
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.frames import (
     node_axes,
+    node_gradients,
     polar_rotations,
     rotation_vectors,
     turned_back,
@@ -26,7 +27,10 @@ from pdcorrect.corrector.frames import (
 from pdcorrect.errors import InputError
 
 STILL = 1e-9
-"""Deformation (dimensionless) below which a body counts as not deformed."""
+"""Deformation (dimensionless) below which a body counts as not deformed.
+
+Above the rounding errors of states in float64, but not of those in float32.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,30 +67,31 @@ class View:
         self.receiver, self.sender = bodies.edge_index
 
     @cached_property
-    def rest_axes(self) -> Tensor:
-        """(n, 3, 3), over the cell size."""
-        return node_axes(self.bodies.rest, self.bodies.cells) / self.size[..., None]
-
-    @cached_property
     def rest_frames(self) -> Tensor:
         """Rotations (n, 3, 3)."""
-        return polar_rotations(self.rest_axes)
+        return polar_rotations(node_axes(self.bodies.rest, self.bodies.cells))
 
     @cached_property
-    def axes(self) -> Tensor:
-        """(n, 3, 3), over the cell size, after the step."""
-        return node_axes(self.snapshot.proposed, self.bodies.cells) / self.size[..., None]
+    def gradients(self) -> Tensor:
+        """Deformation gradients F (n, 3, 3), after the step."""
+        return node_gradients(self.snapshot.proposed, self.bodies.rest, self.bodies.cells)
+
+    @cached_property
+    def turns(self) -> Tensor:
+        """Rotations R (n, 3, 3) of F = R U."""
+        return polar_rotations(self.gradients)
 
     @cached_property
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
-        return polar_rotations(self.axes)
+        return self.turns @ self.rest_frames
 
     @cached_property
     def strain(self) -> Tensor:
-        """Stretch of the axes beyond that at rest, in the node's frame, (n, 3, 3)."""
-        now = self.frames.transpose(1, 2) @ self.axes
-        return now - self.rest_frames.transpose(1, 2) @ self.rest_axes
+        """U - 1 in the node's frame, (n, 3, 3)."""
+        identity = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
+        stretch = self.turns.transpose(1, 2) @ self.gradients - identity
+        return self.rest_frames.transpose(1, 2) @ stretch @ self.rest_frames
 
     @cached_property
     def deformation(self) -> Tensor:
