@@ -111,6 +111,7 @@ ORDER = [
     "figures.sheet",
     "figures.files",
     "figures.curves",
+    "figures.learning",
     "figures",
     "data",
     "data.config",
@@ -157,8 +158,11 @@ ORDER = [
     "corrector.rollouts",
     "corrector.evaluation",
     "corrector.evaluation_table",
+    "corrector.candidates",
+    "corrector.speed",
     "report",
     "dataset_cli",
+    "evaluation_cli",
     "cli",
 ]
 """From bottom to top: a module imports only modules above it in this list."""

@@ -274,9 +274,7 @@ def _stored(case: Case) -> dict[str, Outcome]:
     }
 
 
-def _batches(
-    cases: Sequence[Case], bases: Sequence[str], size: int
-) -> Iterator[list[int]]:
+def _batches(cases: Sequence[Case], bases: Sequence[str], size: int) -> Iterator[list[int]]:
     """Numbers of cases that can be stepped together, of like numbers of nodes."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for i, case in enumerate(cases):
@@ -300,7 +298,10 @@ def _outcomes(
         runs = roll_out(hybrid, stepper, [case.steps for case in cases])
         coarse = [case.predictions.get(base) for case in cases]
         steps = single_steps(hybrid, stepper, [case.reference for case in cases], coarse)
-        yield candidate.name, [
-            Outcome(run.positions, one, base, run.refused, run.failed)
-            for run, one in zip(runs, steps, strict=True)
-        ]
+        yield (
+            candidate.name,
+            [
+                Outcome(run.positions, one, base, run.refused, run.failed)
+                for run, one in zip(runs, steps, strict=True)
+            ],
+        )

@@ -48,9 +48,7 @@ def seed_summaries(evaluation: Evaluation) -> dict[str, dict[str, SeedSummary]]:
     return out
 
 
-def to_json(
-    evaluation: Evaluation, record: Mapping[str, Any] | None = None, seed: int = 0
-) -> str:
+def to_json(evaluation: Evaluation, record: Mapping[str, Any] | None = None, seed: int = 0) -> str:
     """All summaries, and ``record``: how they came about (environment, command, models)."""
     count = len(evaluation.runs[REFERENCE].trajectories)
     content = {
@@ -112,12 +110,12 @@ def mean_errors(evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
     trajectories.
     """
     count = len(evaluation.runs[REFERENCE].trajectories)
-    found = {}
+    found: dict[str, NDArray[np.float64]] = {}
     for name, run in evaluation.runs.items():
         errors = [t.errors for t in run.trajectories if len(t.errors)]
         if name != REFERENCE and len(errors) == count:
             shortest = min(map(len, errors))
-            found[name] = np.mean([x[:shortest] for x in errors], axis=0)
+            found[name] = np.stack([x[:shortest] for x in errors]).mean(axis=0)
     return found
 
 
@@ -266,7 +264,7 @@ def _csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def _number(value: float | None, digits: int = 2) -> str:
-    return "" if value is None else f"{value + 0.0:.{digits}f}"
+    return "" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
 
 
 def _mean(found: Mapping[str, Summary], measure: str, factor: float = 1.0) -> str:
@@ -278,5 +276,5 @@ def _mean(found: Mapping[str, Summary], measure: str, factor: float = 1.0) -> st
 def _interval(omega: Summary | None) -> str:
     if omega is None or omega.interval is None:
         return ""
-    low, high = omega.interval
-    return f"{low:.2f} to {high:.2f}"
+    low, high = map(_number, omega.interval)
+    return f"{low} to {high}"

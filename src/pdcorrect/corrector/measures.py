@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,9 +186,7 @@ def measure(case: Case, outcome: Outcome) -> Measured:
     if outcome.refused is not None:
         found["gate_rate"] = 100.0 * float(outcome.refused.mean())
     numbers = {name: x for name, x in found.items() if x is not None and np.isfinite(x)}
-    measures = TrajectoryMeasures(
-        case.mesh, case.simulation, failed=outcome.failed, **numbers
-    )  # type: ignore[arg-type]
+    measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
     return Measured(measures, errors)
 
 
@@ -274,7 +273,7 @@ def energies(problem: Problem, positions: Array) -> EnergyBalance:
     h, speeds = problem.time_step, velocities(positions, problem.time_step)
     work = [
         float(np.vdot(problem.external_forces(t * h, (t + 1) * h, x), y - x))
-        for t, (x, y) in enumerate(zip(positions[:-1], positions[1:], strict=True))
+        for t, (x, y) in enumerate(pairwise(positions))
     ]
     none = np.zeros(len(positions))
     return EnergyBalance(

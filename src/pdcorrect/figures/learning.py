@@ -25,8 +25,10 @@ def plot_omega(values: Mapping[str, Sequence[float]], output: str | Path) -> Pat
         raise InputError("Omega by model: expected one model or more, each with values.")
     every = np.concatenate([np.asarray(found, dtype=np.float64) for found in values.values()])
     low, high = float(every.min()), float(every.max())
-    edges = np.linspace(low - 0.5, high + 0.5, _BINS + 1) if high - low < 1.0 else np.linspace(
-        low, high, _BINS + 1
+    edges = (
+        np.linspace(low - 0.5, high + 0.5, _BINS + 1)
+        if high - low < 1.0
+        else np.linspace(low, high, _BINS + 1)
     )
     figure, (axis,) = _axes(1, 4.0)
     for index, (label, found) in enumerate(values.items()):

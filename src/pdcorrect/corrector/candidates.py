@@ -1,0 +1,133 @@
+"""Saved models as candidates of an evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.evaluation import Candidate
+from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
+from pdcorrect.corrector.rollouts import Hybrid
+from pdcorrect.data.schema import PLAIN
+from pdcorrect.errors import InputError
+
+_GROUP_DIGITS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SavedCandidate:
+    """A model of a folder, to be evaluated.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    folder : Path
+    model : LoadedModel
+    weights_sha256 : str
+    """
+
+    candidate: Candidate
+    folder: Path
+    model: LoadedModel
+    weights_sha256: str
+
+    def record(self) -> dict[str, Any]:
+        """What identifies it, for results."""
+        found = self.model.record
+        return {
+            "folder": str(self.folder),
+            "weights_sha256": self.weights_sha256,
+            "base": self.candidate.base,
+            "group": self.candidate.group,
+            "seed": _configured(self.model, "seed", None),
+            "velocity": _configured(self.model, "velocity", "recomputed"),
+            "dataset": found.dataset,
+            "dataset_hash": found.dataset_hash,
+            "code_digest": found.code_digest,
+        }
+
+    def warnings(self, dataset: str, config_hash: str) -> list[str]:
+        """What speaks against comparing its errors with those on its own data."""
+        record = self.model.record
+        if config_hash == record.dataset_hash or dataset == record.dataset:
+            return []
+        return [
+            f"{self.candidate.name} was trained on {record.dataset!r}, not on {dataset!r}: bodies, "
+            "loads, materials and the coarse model's setting may be others than it knows."
+        ]
+
+
+def saved_candidates(
+    paths: Sequence[str | Path], device: str = "cpu", *, gate: bool = True
+) -> list[SavedCandidate]:
+    """Models by folder or name; their own names are those of the folders.
+
+    Models that differ by the seed of their training only are of one group.  Which coarse model
+    one corrects, and how velocities follow, is what its training says; "plain" and
+    "recomputed" where it says nothing.
+
+    Parameters
+    ----------
+    paths : sequence of str or path
+        As of `load_model`.
+    device : str
+    gate : bool
+        Whether corrections may be refused, see `pdcorrect.corrector.gate.Gate`.
+
+    Raises
+    ------
+    InputError
+        If a model is missing or two have the same name.
+    FileFormatError
+        If one is damaged.
+    """
+    found = [_saved(path, device, gate) for path in paths]
+    names = [saved.candidate.name for saved in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"models: {twice[0]!r} comes twice: expected folders of unlike names.")
+    return found
+
+
+def _saved(path: str | Path, device: str, gate: bool) -> SavedCandidate:
+    folder = model_folder(path)
+    model = load_model(path, device)
+    velocity = _configured(model, "velocity", "recomputed")
+
+    def hybrid(stepper: BatchStepper) -> Hybrid:
+        return BatchHybrid(stepper, model.corrector, velocity=velocity)
+
+    base = _configured(model, "base", PLAIN)
+    name = folder.resolve().name
+    candidate = Candidate(name, base, hybrid, _group(model, base))
+    weights = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    return SavedCandidate(candidate, folder, model, weights)
+
+
+def _configuration(model: LoadedModel) -> dict[str, Any]:
+    """Of the training, as far as it is recorded."""
+    training: dict[str, Any] = model.record.training
+    inner = training.get("config")
+    return inner if isinstance(inner, dict) else training
+
+
+def _configured(model: LoadedModel, key: str, default: Any) -> Any:
+    return _configuration(model).get(key, default)
+
+
+def _group(model: LoadedModel, base: str) -> str | None:
+    """A name shared by models of equal configuration but the seed; None without a seed."""
+    configuration = dict(_configuration(model))
+    if configuration.pop("seed", None) is None:
+        return None
+    content = [
+        model.corrector.config.model_dump(mode="json"), model.record.dataset_hash, configuration,
+    ]  # fmt: skip
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return f"{base}-{digest[:_GROUP_DIGITS]}"
