@@ -154,6 +154,8 @@ ORDER = [
     "corrector.batch_bodies",
     "corrector.batch_hybrid",
     "corrector.resampling",
+    "corrector.physics",
+    "corrector.cases",
     "corrector.measures",
     "corrector.rollouts",
     "corrector.evaluation",

@@ -66,7 +66,7 @@ class SavedCandidate:
 def saved_candidates(
     paths: Sequence[str | Path], device: str = "cpu", *, gate: bool = True
 ) -> list[SavedCandidate]:
-    """Models by folder or name; their own names are those of the folders.
+    """Models by folder or name; they are called by the ends of their paths that tell them apart.
 
     Models that differ by the seed of their training only are of one group.  Which coarse model
     one corrects, and how velocities follow, is what its training says; "plain" and
@@ -83,19 +83,28 @@ def saved_candidates(
     Raises
     ------
     InputError
-        If a model is missing or two have the same name.
+        If a model is missing or comes twice.
     FileFormatError
         If one is damaged.
     """
-    found = [_saved(path, device, gate) for path in paths]
-    names = [saved.candidate.name for saved in found]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"models: {twice[0]!r} comes twice: expected folders of unlike names.")
-    return found
+    names = _names([model_folder(path).resolve() for path in paths])
+    return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
 
 
-def _saved(path: str | Path, device: str, gate: bool) -> SavedCandidate:
+def _names(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that are all unlike, such as "seed-1/model"."""
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(f"{folder}: this model comes twice: expected each one once.")
+    longest = max((len(folder.parts) for folder in folders), default=0)
+    for length in range(1, longest + 1):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return []
+
+
+def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandidate:
     folder = model_folder(path)
     model = load_model(path, device)
     velocity = _configured(model, "velocity", "recomputed")
@@ -104,7 +113,6 @@ def _saved(path: str | Path, device: str, gate: bool) -> SavedCandidate:
         return BatchHybrid(stepper, model.corrector, velocity=velocity)
 
     base = _configured(model, "base", PLAIN)
-    name = folder.resolve().name
     candidate = Candidate(name, base, hybrid, _group(model, base))
     weights = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
     return SavedCandidate(candidate, folder, model, weights)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.corrector.measures import Case, Measured, Outcome, TrajectoryMeasures, measure
+from pdcorrect.corrector.cases import Case, read_cases
+from pdcorrect.corrector.measures import Measured, Outcome, TrajectoryMeasures, measure
 from pdcorrect.corrector.rollouts import Hybrid, roll_out, single_steps
 from pdcorrect.data.config import EVALUATION
-from pdcorrect.data.damage import Damage, whole_files
-from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.rebuild import COARSE, rebuilt_problems
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.damage import Damage
+from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 
 Array = NDArray[np.float64]
@@ -104,53 +102,6 @@ class Evaluation:
     damaged: Damage = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class SplitCases:
-    """A split's simulations in float64; see `read_cases`."""
-
-    attributes: Mapping[str, str | int | float]
-    cases: tuple[Case, ...]
-    shards: Mapping[str, str]
-    damaged: Damage
-
-
-def read_cases(
-    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = (), *, skip_damaged: bool
-) -> SplitCases:
-    """All simulations of a split and their coarse models' problems.
-
-    Parameters
-    ----------
-    folder : path
-    split : str
-    bases : iterable of str
-        Coarse models besides the plain one.
-    skip_damaged : bool
-        Leave out files that are damaged.
-
-    Raises
-    ------
-    InputError
-        If the split is missing, of several data sets, or its problems cannot be rebuilt.
-    FileFormatError
-        If a file is damaged; with ``skip_damaged`` if all are.
-    """
-    damaged: Damage = {}
-    paths = whole_files(shard_paths(folder, split), damaged if skip_damaged else None)
-    wanted = [PLAIN, *(base for base in dict.fromkeys(bases) if base != PLAIN)]
-    shards: dict[str, str] = {}
-    cases: list[Case] = []
-    attributes: list[Mapping[str, str | int | float]] = []
-    for path in paths:
-        shard = read_shard(path)
-        attributes.append(shard.attributes)
-        shards[path.name] = stored_hashes(path)[1]
-        cases += _cases(shard, path, wanted)
-    if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
-        raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
-    return SplitCases(attributes[0], tuple(cases), shards, damaged)
-
-
 def evaluate(
     candidates: Sequence[Candidate],
     folder: str | Path,
@@ -229,36 +180,6 @@ def evaluate(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
         float(about["time_step"]), runs, found.shards, found.damaged,
     )  # fmt: skip
-
-
-def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
-    for base in bases:
-        if base not in COARSE:
-            raise InputError(f"base {base!r}: expected one of {', '.join(COARSE)}.")
-    problems = {base: rebuilt_problems(shard, path, base) for base in bases}
-    if "best" in shard.simulations[0].runs and "best" not in problems:
-        problems["best"] = rebuilt_problems(shard, path, "best")
-    out = []
-    for k, simulation in enumerate(shard.simulations):
-        reference = simulation.runs[REFERENCE].positions
-        if reference is None:
-            raise InputError(f"{path}: simulation {k} has no reference rollout.")
-        others = {name: run for name, run in simulation.runs.items() if name != REFERENCE}
-        out.append(
-            Case(
-                int(shard.attributes["number"]),
-                k,
-                {base: each[k] for base, each in problems.items()},
-                reference.astype(np.float64),
-                _float64({name: run.positions for name, run in others.items()}),
-                _float64({name: run.predictions for name, run in others.items()}),
-            )
-        )
-    return out
-
-
-def _float64(arrays: Mapping[str, NDArray[np.generic] | None]) -> dict[str, Array]:
-    return {name: x.astype(np.float64) for name, x in arrays.items() if x is not None}
 
 
 def _stored(case: Case) -> dict[str, Outcome]:

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.corrector.cases import Case
+from pdcorrect.corrector.physics import energies, stress_error
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import PLAIN
-from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.stress import stress
 from pdcorrect.metrics import (
-    EnergyBalance,
     angular_momentum,
     error_over_time,
     largest_displacement,
@@ -28,50 +25,6 @@ Array = NDArray[np.float64]
 
 CONVERGED = "time-converged"
 """Run: the reference with smaller time steps."""
-_STRESS_FRAMES = 10
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """A simulation of a split and what is known of it.
-
-    Attributes
-    ----------
-    mesh, simulation : int
-        Numbers of the mesh in its split and of the simulation on it.
-    problems : mapping of str to Problem
-        Coarse models by the run they made, "plain" among them.
-    reference : (T+1, N, 3)
-        m.
-    runs : mapping of str to (T+1, N, 3)
-        Stored rollouts, m.
-    predictions : mapping of str to (T, N, 3)
-        Stored single steps from the reference's frames, m.
-    """
-
-    mesh: int
-    simulation: int
-    problems: Mapping[str, Problem]
-    reference: Array
-    runs: Mapping[str, Array]
-    predictions: Mapping[str, Array]
-    _energies: dict[str, EnergyBalance] = field(default_factory=dict, repr=False)
-
-    def reference_energies(self, base: str) -> EnergyBalance:
-        """Of the reference by a coarse model; kept, for all runs are compared with them."""
-        if base not in self._energies:
-            self._energies[base] = energies(self.problems[base], self.reference)
-        return self._energies[base]
-
-    @property
-    def steps(self) -> int:
-        """T."""
-        return len(self.reference) - 1
-
-    @property
-    def time_step(self) -> float:
-        """In s."""
-        return self.problems[PLAIN].time_step
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,43 +215,6 @@ def _of_physics(case: Case, positions: Array, base: str | None) -> dict[str, flo
         "stress_error": stress_error(plain, positions, case.reference),
         "smallest_volume_ratio": min(float(plain.volume_ratios(x).min()) for x in positions),
     }
-
-
-def energies(problem: Problem, positions: Array) -> EnergyBalance:
-    """Energies of a rollout from rest, and the work of the loads, by a coarse model.
-
-    Velocities are backward differences of the positions, and loads act along the path as in
-    the solver: those that follow the body are sampled where a step starts.
-    """
-    h, speeds = problem.time_step, velocities(positions, problem.time_step)
-    work = [
-        float(np.vdot(problem.external_forces(t * h, (t + 1) * h, x), y - x))
-        for t, (x, y) in enumerate(pairwise(positions))
-    ]
-    none = np.zeros(len(positions))
-    return EnergyBalance(
-        kinetic=np.array([0.5 * np.vdot(v, problem.mass_times(v)) for v in speeds]),
-        elastic=np.array([problem.energy(x) for x in positions]),
-        external_work=np.concatenate([[0.0], np.cumsum(work)]),
-        clamp_work=none,
-        damping_loss=none,
-    )
-
-
-def stress_error(problem: Problem, positions: Array, reference: Array) -> float | None:
-    """Relative RMS difference of Cauchy stress at quadrature points, by rest volume.
-
-    Over about ten frames, evenly spaced, the last one among them.  None if a cell is flat or
-    the reference has no stress.
-    """
-    frames = np.unique(np.linspace(0, len(reference) - 1, _STRESS_FRAMES + 1).round()[1:])
-    difference = size = 0.0
-    for frame in frames.astype(int):
-        ours, truth = (stress(problem, x[frame]) for x in (positions, reference))
-        weights = truth.weights[..., None, None]
-        difference += float((weights * (ours.cauchy - truth.cauchy) ** 2).sum())
-        size += float((weights * truth.cauchy**2).sum())
-    return float(np.sqrt(difference / size)) if size and np.isfinite(difference) else None
 
 
 def _rms(values: Array) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,13 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
         exact = run == "best" or shard.attributes["setting"] == "exact"
         refine = int(stored.attributes.get("refine", 1))
         problem = discretise(best_coarse(scenes[0]) if exact else scenes[0], refine)
-    return [problem.with_loads(scene.loads) for scene in scenes]
+    return [_under(problem, scene) for scene in scenes]
+
+
+def _under(problem: Problem, scene: Scene) -> Problem:
+    """The problem under another scene's loads, and by its name."""
+    loaded = problem.with_loads(scene.loads)
+    return replace(loaded, scene=loaded.scene.with_changes(name=scene.name))
 
 
 def _names(shard: Shard) -> str:
