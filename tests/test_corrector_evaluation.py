@@ -628,6 +628,18 @@ def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_see
         saved_candidates([paths[0], paths[0]])
 
 
+def test_the_gate_refuses_what_the_network_has_not_seen_unless_it_is_off(tmp_path, pair):
+    """A fitted range of nothing: every input lies outside."""
+    _, stepper = pair
+    path = untrained(tmp_path / "model")
+    rates = {}
+    for gate in (True, False):
+        (saved,) = saved_candidates([path], gate=gate)
+        runs = roll_out(saved.candidate.hybrid(stepper), stepper, [2, 2])
+        rates[gate] = [run.refused.mean() for run in runs]
+    assert rates == {True: [1.0, 1.0], False: [0.0, 0.0]}
+
+
 def run_command(*arguments):
     result = CliRunner().invoke(app, ["evaluate", *map(str, arguments)])
     if result.exception and not isinstance(result.exception, SystemExit):

@@ -29,9 +29,7 @@ def evaluate(
         Optional[Path],
         typer.Option("-o", "--output", help="Folder for JSON, CSV, Markdown and figures."),
     ] = None,
-    gate: Annotated[
-        bool, typer.Option(help="Refuse corrections outside the training's range.")
-    ] = True,
+    gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
     seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
     skip_damaged: Annotated[
         bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")

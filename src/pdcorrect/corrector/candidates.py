@@ -12,6 +12,7 @@ from typing import Any
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.evaluation import Candidate
+from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
 from pdcorrect.corrector.rollouts import Hybrid
 from pdcorrect.data.schema import PLAIN
@@ -78,7 +79,8 @@ def saved_candidates(
         As of `load_model`.
     device : str
     gate : bool
-        Whether corrections may be refused, see `pdcorrect.corrector.gate.Gate`.
+        Whether corrections may be refused, as by `pdcorrect.corrector.gate.Gate` by default.
+        Those that are not finite are refused in any case.
 
     Raises
     ------
@@ -110,7 +112,9 @@ def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandida
     velocity = _configured(model, "velocity", "recomputed")
 
     def hybrid(stepper: BatchStepper) -> Hybrid:
-        return BatchHybrid(stepper, model.corrector, velocity=velocity)
+        return BatchHybrid(
+            stepper, model.corrector, velocity=velocity, gate=Gate() if gate else None
+        )
 
     base = _configured(model, "base", PLAIN)
     candidate = Candidate(name, base, hybrid, _group(model, base))
