@@ -92,16 +92,22 @@ def info(
         Optional[Path],
         typer.Option(help="Also draw histograms and samples into this folder (extra 'view')."),
     ] = None,
+    skip_damaged: Annotated[
+        bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
+    ] = False,
 ) -> None:
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
     from rich.console import Console
 
     from pdcorrect.data.info import dataset_files, measure_dataset, summarise
 
+    damaged: dict[Path, str] = {}
     with _progress("reading", len(dataset_files(folder))) as advance:
-        meshes = measure_dataset(folder, on_file=advance)
-    found = summarise(folder.resolve().name, meshes)
+        meshes = measure_dataset(folder, advance, damaged if skip_damaged else None)
+    found = summarise(folder.resolve().name, meshes, damaged)
     Console().print(found.tables())
+    for text in damaged.values():
+        typer.echo(f"left out: {text}", err=True)
     if json:
         _write(json, found.to_json() + "\n")
     if figures:

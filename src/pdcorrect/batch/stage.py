@@ -85,10 +85,18 @@ class BatchStaging:
             self.extended(self._split(known, scheme.origin, scheme.clamped_origin)),
         )
 
-    def start(self, stage: BatchStage) -> Tensor:
-        """First iterate (B, U, 3), prescribed where clamped."""
+    def start(self, stage: BatchStage, guess: Tensor | None = None) -> Tensor:
+        """First iterate (B, U, 3), prescribed where clamped.
+
+        Where positions after the step are ``guess`` (B, N, 3), in scenes where it is finite.
+        """
         scheme = stage.scheme
-        return self.extended(self._split(stage.known, scheme.start, scheme.clamped))
+        nodal = self._split(stage.known, scheme.start, scheme.clamped)
+        if guess is not None:
+            y = nodal_solution(scheme, stage.known["positions"], guess)
+            usable = torch.isfinite(y).all(dim=2, keepdim=True).all(dim=1, keepdim=True)
+            nodal = torch.where(usable & self.free, y, nodal)
+        return self.extended(nodal)
 
     def finish(self, stage: BatchStage, y: Tensor, state: BatchState) -> BatchState:
         """The state after the step from ``state`` with solution y (B, U, 3).

@@ -290,8 +290,13 @@ class BatchStepper:
 
     # --- a step ---------------------------------------------------------------------------
 
-    def __call__(self, state: BatchState, forces: Tensor | None = None) -> BatchResult:
+    def __call__(
+        self, state: BatchState, forces: Tensor | None = None, guess: Tensor | None = None
+    ) -> BatchResult:
         """Advance all scenes by one step, with extra nodal forces (B, N, 3), N.
+
+        The minimisation begins where positions after the step are ``guess`` (B, N, 3), m, but
+        as without one where a component is clamped, and in scenes whose guess is not finite.
 
         Raises
         ------
@@ -299,14 +304,16 @@ class BatchStepper:
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
         with self.alone():
-            result = self._step(state, forces)
+            result = self._step(state, forces, guess)
             return self._one_by_one(state, forces, result) if self._recover else result
 
-    def _step(self, state: BatchState, forces: Tensor | None) -> BatchResult:
+    def _step(self, state: BatchState, forces: Tensor | None, guess: Tensor | None) -> BatchResult:
+        if guess is not None:
+            check_nodal(self.cells, "guess", guess)
         stage = self.prepare(state, forces)
         minimiser = self._minimiser
         assert minimiser is not None
-        start = self.staging.start(stage)
+        start = self.staging.start(stage, guess)
         alive = torch.isfinite(start).all(dim=2).all(dim=1) & self._material.sound
         minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
         y = minimiser.y.clone()  # the next step overwrites it

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
@@ -177,11 +178,21 @@ class SplitInfo:
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """A data set in numbers, as a whole and by split."""
+    """A data set in numbers, as a whole and by split.
+
+    Attributes
+    ----------
+    name : str
+    whole : SplitInfo
+    splits : mapping of str to SplitInfo
+    damaged : mapping of str to str
+        Files that were left out, and what is wrong with them.
+    """
 
     name: str
     whole: SplitInfo
     splits: Mapping[str, SplitInfo]
+    damaged: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """All numbers, in SI units and per cent."""
@@ -195,7 +206,9 @@ class DatasetInfo:
 
 
 def measure_dataset(
-    folder: str | Path, on_file: Callable[[Path], None] | None = None
+    folder: str | Path,
+    on_file: Callable[[Path], None] | None = None,
+    damaged: Damage | None = None,
 ) -> list[MeasuredMesh]:
     """Read a data set and measure each simulation.
 
@@ -204,16 +217,18 @@ def measure_dataset(
     folder : path
     on_file : callable, optional
         Called with each file after it was read.
+    damaged : dict, optional
+        Where given, damaged files are left out and noted here.
 
     Raises
     ------
     InputError
         If the folder holds no files of meshes.
     FileFormatError
-        If one of them is damaged.
+        If one of them is damaged; with ``damaged`` if all are.
     """
     meshes = []
-    for path in dataset_files(folder):
+    for path in whole_files(dataset_files(folder), damaged):
         meshes.append(_mesh(read_shard(path), path.stat().st_size))
         if on_file:
             on_file(path)
@@ -234,16 +249,29 @@ def dataset_files(folder: str | Path) -> list[Path]:
     return found
 
 
-def dataset_info(folder: str | Path, on_file: Callable[[Path], None] | None = None) -> DatasetInfo:
-    """Read a data set and summarise it; parameters and errors as of `measure_dataset`."""
-    return summarise(Path(folder).resolve().name, measure_dataset(folder, on_file))
+def dataset_info(
+    folder: str | Path,
+    on_file: Callable[[Path], None] | None = None,
+    *,
+    skip_damaged: bool = False,
+) -> DatasetInfo:
+    """Read a data set and summarise it; parameters and errors as of `measure_dataset`.
+
+    With ``skip_damaged`` damaged files are left out and listed in the result.
+    """
+    damaged: Damage = {}
+    meshes = measure_dataset(folder, on_file, damaged if skip_damaged else None)
+    return summarise(Path(folder).resolve().name, meshes, damaged)
 
 
-def summarise(name: str, meshes: Sequence[MeasuredMesh]) -> DatasetInfo:
+def summarise(
+    name: str, meshes: Sequence[MeasuredMesh], damaged: Mapping[Path, str] | None = None
+) -> DatasetInfo:
     """Summary of measured meshes, by split in their order."""
     splits = dict.fromkeys(mesh.split for mesh in meshes)
     parts = {split: _split([m for m in meshes if m.split == split]) for split in splits}
-    return DatasetInfo(name, _split(meshes), parts)
+    left_out = {f"{p.parent.name}/{p.name}": text for p, text in (damaged or {}).items()}
+    return DatasetInfo(name, _split(meshes), parts, left_out)
 
 
 # --- measuring ---------------------------------------------------------------------------

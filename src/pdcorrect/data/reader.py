@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.cache import RecentlyUsed
+from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.sampling import ShardShuffle
 from pdcorrect.data.shard_arrays import (
@@ -149,13 +150,20 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         exceeded by that file.
     dtype : torch.dtype
         Of everything but indices and masks.
+    skip_damaged : bool
+        Leave out files that are damaged; all files are read once to find them.
+
+    Attributes
+    ----------
+    damaged : dict of Path to str
+        Files that were left out, and what is wrong with them.
 
     Raises
     ------
     InputError
         If there is no such split, its simulations lack a run, or all are shorter than k.
     FileFormatError
-        If a file is damaged.
+        If a file is damaged; with ``skip_damaged`` if all are.
     """
 
     def __init__(
@@ -168,6 +176,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         runs: Sequence[str] = (),
         cache_bytes: int = CACHE_BYTES,
         dtype: torch.dtype = torch.float32,
+        skip_damaged: bool = False,
     ) -> None:
         super().__init__()
         if window < 1:
@@ -175,7 +184,9 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         self.folder, self.split = Path(folder), split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
-        self.headers = [read_header(path) for path in shard_paths(folder, split)]
+        self.damaged: Damage = {}
+        paths = whole_files(shard_paths(folder, split), self.damaged if skip_damaged else None)
+        self.headers = [read_header(path) for path in paths]
         for header in self.headers:
             _check_runs(header, base, self.runs)
         counts = [max(0, steps - window + 1) for h in self.headers for steps in h.steps]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.config import TRAINING
+from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.schema import NORMALISATION
 from pdcorrect.data.shard_arrays import (
@@ -104,11 +105,14 @@ class Statistics:
         Of the data set.
     shards : mapping of str to str
         Content hash of each file of the split, by its name.
+    damaged : mapping of Path to str
+        Files that were left out, and what is wrong with them; not saved.
     """
 
     quantities: Mapping[str, Moments]
     config_hash: str
     shards: Mapping[str, str]
+    damaged: Mapping[Path, str] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> Moments:
         if name not in self.quantities:
@@ -136,24 +140,32 @@ class Statistics:
         return path
 
 
-def compute_statistics(folder: str | Path) -> Statistics:
+def compute_statistics(folder: str | Path, *, skip_damaged: bool = False) -> Statistics:
     """Statistics of a data set's training split.
 
     Corrections are those of every run that has predictions in all its simulations.
+
+    Parameters
+    ----------
+    folder : path
+    skip_damaged : bool
+        Leave out files that are damaged; all files are read twice then.
 
     Raises
     ------
     InputError
         If there is no training split, or its files come from different configurations.
     FileFormatError
-        If a file is damaged.
+        If a file is damaged; with ``skip_damaged`` if all are.
     """
-    headers = [read_header(path) for path in shard_paths(folder, TRAINING)]
+    damaged: Damage = {}
+    paths = whole_files(shard_paths(folder, TRAINING), damaged if skip_damaged else None)
+    headers = [read_header(path) for path in paths]
     config_hash, shards = _identity(headers)
     bases = frozenset.intersection(*(names for h in headers for _, names in h.runs))
     parts = (part for h in headers for part in _parts(h, sorted(bases)))
     merged: dict[str, Moments] = reduce(_merged, parts)
-    return Statistics(merged, config_hash, shards)
+    return Statistics(merged, config_hash, shards, damaged)
 
 
 def load_statistics(folder: str | Path) -> Statistics:

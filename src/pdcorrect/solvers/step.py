@@ -300,23 +300,35 @@ def check_input(problem: Problem, state: State, forces: Array | None) -> None:
         raise InputError(
             f"state is a {type(state).__name__}: expected State(positions, velocities)."
         )
-    named = {"positions": state.positions, "velocities": state.velocities}
+    nodal_array(problem, "positions", state.positions)
+    nodal_array(problem, "velocities", state.velocities)
     if forces is not None:
-        if not isinstance(forces, (np.ndarray, Sequence)):
-            raise InputError(
-                f"forces is a {type(forces).__name__}: expected an array of shape "
-                f"{problem.positions.shape}."
-            )
-        named["forces"] = np.asarray(forces, dtype=np.float64)
-    for name, array in named.items():
-        if array.shape != problem.positions.shape:
-            raise InputError(
-                f"{name} has shape {array.shape}: expected {problem.positions.shape}, one row "
-                "for each node of the problem."
-            )
-        if not np.isfinite(array).all():
-            node = int(np.argmin(np.isfinite(array).all(axis=1)))
-            raise InputError(
-                f"{name} of node {node} (at rest at {problem.positions[node].tolist()} m) is "
-                f"{array[node].tolist()}: expected finite numbers."
-            )
+        nodal_array(problem, "forces", forces)
+
+
+def nodal_array(problem: Problem, name: str, values: Array) -> Array:
+    """``values`` as an array; refused if it is not (N, 3) and finite.
+
+    Raises
+    ------
+    InputError
+        That names the node.
+    """
+    if isinstance(values, str) or not isinstance(values, (np.ndarray, Sequence)):
+        raise InputError(
+            f"{name} is a {type(values).__name__}: expected an array of shape "
+            f"{problem.positions.shape}."
+        )
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != problem.positions.shape:
+        raise InputError(
+            f"{name} has shape {array.shape}: expected {problem.positions.shape}, one row "
+            "for each node of the problem."
+        )
+    if not np.isfinite(array).all():
+        node = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise InputError(
+            f"{name} of node {node} (at rest at {problem.positions[node].tolist()} m) is "
+            f"{array[node].tolist()}: expected finite numbers."
+        )
+    return array

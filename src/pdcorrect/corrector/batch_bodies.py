@@ -1,0 +1,132 @@
+"""`BatchBodies`: the scenes of a `BatchStepper` as one graph, and back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pdcorrect.batch.loads import Spans
+from pdcorrect.batch.states import BatchState
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import Snapshot
+from pdcorrect.corrector.placements import as_forces, ballistic
+from pdcorrect.errors import InputError
+
+
+def check_corrector(corrector: object, device: torch.device) -> Corrector:
+    """A corrector that can be asked on a device; others are refused.
+
+    Raises
+    ------
+    InputError
+        If it is of another kind, its normaliser was not fitted or it is elsewhere.
+    """
+    if not isinstance(corrector, Corrector):
+        raise InputError(f"corrector is a {type(corrector).__name__}: expected a Corrector.")
+    if not corrector.normaliser.fitted:
+        raise InputError(
+            "corrector: its normaliser has seen no data, so its inputs and output have no "
+            "scale. Expected one that was trained or loaded."
+        )
+    found = corrector.normaliser.output_scale.device
+    if found != device:
+        raise InputError(
+            f"corrector: on {found}, expected {device} as the coarse solver: move it there "
+            f"with corrector.to({str(device)!r})."
+        )
+    return corrector
+
+
+class BatchBodies:
+    """The scenes of a stepper as the bodies of a graph: n nodes without padding.
+
+    Attributes
+    ----------
+    graph : BodyGraph
+        float64, on the stepper's device.  Of the stepper's problems: a material that the
+        stepper was given later is not seen.
+    """
+
+    def __init__(self, stepper: BatchStepper) -> None:
+        if not isinstance(stepper, BatchStepper):
+            raise InputError(f"stepper is a {type(stepper).__name__}: expected a BatchStepper.")
+        self._stepper = stepper
+        self.graph = BodyGraph.of(
+            stepper.problems, stepper.time_step, device=stepper.device, dtype=torch.float64
+        )
+        self._shape = tuple(stepper.node_mask.shape)
+        self._rows = stepper.node_mask.reshape(-1).nonzero()[:, 0]
+
+    def flat(self, x: Tensor) -> Tensor:
+        """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
+        return x.reshape(-1, *x.shape[2:])[self._rows].to(self.graph.rest.dtype)
+
+    def padded(self, x: Tensor) -> Tensor:
+        """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
+        scenes, nodes = self._shape
+        out = x.new_zeros(scenes * nodes, *x.shape[1:]).index_copy(0, self._rows, x)
+        return out.reshape(scenes, nodes, *x.shape[1:]).to(self._stepper.dtype)
+
+    def snapshot(
+        self, state: BatchState, coarse: Tensor | None, previous: Tensor | None
+    ) -> Snapshot:
+        """A step from ``state``, with the coarse answer (B, N, 3) if there is one."""
+        forces = external_forces(self._stepper, state)
+        flat = Snapshot(
+            self.flat(state.positions), self.flat(state.velocities),
+            self.flat(state.positions), self.flat(forces), previous,
+        )  # fmt: skip
+        h, graph = self._stepper.time_step, self.graph
+        proposed = (
+            ballistic(flat, h, flat.forces, graph.mass, graph.free)
+            if coarse is None
+            else self.flat(coarse)
+        )
+        return Snapshot(flat.positions, flat.velocities, proposed, flat.forces, previous)
+
+    def forces(self, correction: Tensor) -> Tensor:
+        """Nodal forces (B, N, 3), N, for a correction (n, 3)."""
+        return self.padded(as_forces(correction, self._stepper.time_step, self.graph.mass))
+
+    def sound(self, x: Tensor) -> Tensor:
+        """Whether all values (n, ...) of each body are finite, (B,)."""
+        faults = (~torch.isfinite(x)).flatten(1).any(dim=1).to(self.graph.rest.dtype)
+        return self.graph.node_sums(faults) == 0.0
+
+
+def external_forces(stepper: BatchStepper, state: BatchState) -> Tensor:
+    """All loads of the scenes (B, N, 3), N, in the step from a state.
+
+    Those that follow the body are sampled on the CPU, others do not leave the device.
+    Differentiable by the state, on which only the former depend.
+    """
+    stage = stepper.staging(state)
+    at = stage.scheme.loads_at(stage.known)
+    found: Tensor = _Loads.apply(stepper, stage.spans, at)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _Loads(torch.autograd.Function):
+    """Loads sampled at positions."""
+
+    @staticmethod
+    def forward(ctx: Any, stepper: BatchStepper, spans: Spans, at: Tensor) -> Tensor:
+        ctx.stepper, ctx.spans = stepper, spans
+        ctx.save_for_backward(at)
+        with stepper.alone():
+            return stepper.loads(spans, at)[:, : at.shape[1]].clone()
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, grad: Tensor) -> tuple[None, None, Tensor | None]:
+        (at,) = ctx.saved_tensors
+        stepper: BatchStepper = ctx.stepper
+        if not stepper.loads.follow:
+            return None, None, None
+        with stepper.alone():
+            return None, None, stepper.loads.pulled(ctx.spans, at, grad)

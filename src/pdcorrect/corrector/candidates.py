@@ -1,0 +1,145 @@
+"""Saved models as candidates of an evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.evaluation import Candidate
+from pdcorrect.corrector.gate import Gate
+from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
+from pdcorrect.corrector.rollouts import Hybrid
+from pdcorrect.data.schema import PLAIN
+from pdcorrect.errors import InputError
+
+_GROUP_DIGITS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SavedCandidate:
+    """A model of a folder, to be evaluated.
+
+    Attributes
+    ----------
+    candidate : Candidate
+    folder : Path
+    model : LoadedModel
+    weights_sha256 : str
+    """
+
+    candidate: Candidate
+    folder: Path
+    model: LoadedModel
+    weights_sha256: str
+
+    def record(self) -> dict[str, Any]:
+        """What identifies it, for results."""
+        found = self.model.record
+        return {
+            "folder": str(self.folder),
+            "weights_sha256": self.weights_sha256,
+            "base": self.candidate.base,
+            "group": self.candidate.group,
+            "seed": _configured(self.model, "seed", None),
+            "velocity": _configured(self.model, "velocity", "recomputed"),
+            "dataset": found.dataset,
+            "dataset_hash": found.dataset_hash,
+            "code_digest": found.code_digest,
+        }
+
+    def warnings(self, dataset: str, config_hash: str) -> list[str]:
+        """What speaks against comparing its errors with those on its own data."""
+        record = self.model.record
+        if config_hash == record.dataset_hash or dataset == record.dataset:
+            return []
+        return [
+            f"{self.candidate.name} was trained on {record.dataset!r}, not on {dataset!r}: bodies, "
+            "loads, materials and the coarse model's setting may be others than it knows."
+        ]
+
+
+def saved_candidates(
+    paths: Sequence[str | Path], device: str = "cpu", *, gate: bool = True
+) -> list[SavedCandidate]:
+    """Models by folder or name; they are called by the ends of their paths that tell them apart.
+
+    Models that differ by the seed of their training only are of one group.  Which coarse model
+    one corrects, and how velocities follow, is what its training says; "plain" and
+    "recomputed" where it says nothing.
+
+    Parameters
+    ----------
+    paths : sequence of str or path
+        As of `load_model`.
+    device : str
+    gate : bool
+        Whether corrections may be refused, as by `pdcorrect.corrector.gate.Gate` by default.
+        Those that are not finite are refused in any case.
+
+    Raises
+    ------
+    InputError
+        If a model is missing or comes twice.
+    FileFormatError
+        If one is damaged.
+    """
+    names = _names([model_folder(path).resolve() for path in paths])
+    return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
+
+
+def _names(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that are all unlike, such as "seed-1/model"."""
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(f"{folder}: this model comes twice: expected each one once.")
+    longest = max((len(folder.parts) for folder in folders), default=0)
+    for length in range(1, longest + 1):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return []
+
+
+def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandidate:
+    folder = model_folder(path)
+    model = load_model(path, device)
+    velocity = _configured(model, "velocity", "recomputed")
+
+    def hybrid(stepper: BatchStepper) -> Hybrid:
+        return BatchHybrid(
+            stepper, model.corrector, velocity=velocity, gate=Gate() if gate else None
+        )
+
+    base = _configured(model, "base", PLAIN)
+    candidate = Candidate(name, base, hybrid, _group(model, base))
+    weights = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+    return SavedCandidate(candidate, folder, model, weights)
+
+
+def _configuration(model: LoadedModel) -> dict[str, Any]:
+    """Of the training, as far as it is recorded."""
+    training: dict[str, Any] = model.record.training
+    inner = training.get("config")
+    return inner if isinstance(inner, dict) else training
+
+
+def _configured(model: LoadedModel, key: str, default: Any) -> Any:
+    return _configuration(model).get(key, default)
+
+
+def _group(model: LoadedModel, base: str) -> str | None:
+    """A name shared by models of equal configuration but the seed; None without a seed."""
+    configuration = dict(_configuration(model))
+    if configuration.pop("seed", None) is None:
+        return None
+    content = [
+        model.corrector.config.model_dump(mode="json"), model.record.dataset_hash, configuration,
+    ]  # fmt: skip
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    return f"{base}-{digest[:_GROUP_DIGITS]}"

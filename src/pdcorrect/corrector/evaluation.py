@@ -1,0 +1,228 @@
+"""`evaluate`: correctors and stored runs of a data set's split against its reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.cases import Case, read_cases
+from pdcorrect.corrector.measures import Measured, Outcome, TrajectoryMeasures, measure
+from pdcorrect.corrector.rollouts import Hybrid, roll_out, single_steps
+from pdcorrect.data.config import EVALUATION
+from pdcorrect.data.damage import Damage
+from pdcorrect.data.schema import PLAIN, REFERENCE
+from pdcorrect.errors import InputError
+
+Array = NDArray[np.float64]
+OnCases = Callable[[int, int], None]
+"""Called with how many trajectories of how many are done."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A corrector to be evaluated.
+
+    Attributes
+    ----------
+    name : str
+        Unlike the other candidates' and the stored runs'.
+    base : str
+        Run of the coarse model that it corrects: "plain", "best" or "total-mass".
+    hybrid : callable
+        From a stepper of that model's problems to their corrected step.
+    group : str or None
+        Shared by models that differ by their seed only.
+    """
+
+    name: str
+    base: str
+    hybrid: Callable[[BatchStepper], Hybrid]
+    group: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class EvaluatedRun:
+    """One run over the trajectories that have it.
+
+    Attributes
+    ----------
+    name : str
+    base, group : str or None
+        Of a `Candidate`.
+    trajectories : tuple of Measured
+    """
+
+    name: str
+    base: str | None
+    group: str | None
+    trajectories: tuple[Measured, ...]
+
+    def values(self, measure: str) -> tuple[list[float], list[int]]:
+        """A measure of the trajectories that have it, and on which mesh each one is."""
+        every = [t.measures for t in self.trajectories]
+        found = [(getattr(m, measure), m.mesh) for m in every]
+        known = [(float(x), mesh) for x, mesh in found if x is not None]
+        return [x for x, _ in known], [mesh for _, mesh in known]
+
+    def failures(self) -> list[TrajectoryMeasures]:
+        """Trajectories that failed."""
+        return [t.measures for t in self.trajectories if t.measures.failed is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Runs of a split.
+
+    Attributes
+    ----------
+    dataset, split, setting, config_hash : str
+    time_step : float
+        s.
+    runs : mapping of str to EvaluatedRun
+        Candidates, then stored runs, "reference" last: of the latter only energies are of
+        interest.
+    shards : mapping of str to str
+        Content hash of each file, by its name.
+    damaged : mapping of Path to str
+        Files that were left out.
+    """
+
+    dataset: str
+    split: str
+    setting: str
+    config_hash: str
+    time_step: float
+    runs: Mapping[str, EvaluatedRun]
+    shards: Mapping[str, str]
+    damaged: Damage = field(default_factory=dict)
+
+
+def evaluate(
+    candidates: Sequence[Candidate],
+    folder: str | Path,
+    split: str = EVALUATION,
+    *,
+    device: str = "cpu",
+    batch: int = 32,
+    skip_damaged: bool = False,
+    on_cases: OnCases | None = None,
+) -> Evaluation:
+    """Free rollouts and single steps of candidates, and of the stored runs, measured.
+
+    Every simulation is stepped again from rest, in all of the reference's frames, as the
+    data set's coarse runs were; see `measures` for what is measured and `roll_out` for what
+    becomes of simulations that fail.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        None are allowed: then only stored runs are measured.
+    folder : path
+        Of the data set.
+    split : str
+    device : str
+    batch : int
+        Simulations that are stepped together.
+    skip_damaged : bool
+        Leave out files that are damaged.
+    on_cases : callable, optional
+        For progress.
+
+    Raises
+    ------
+    InputError
+        If names are not unlike, a base is none, or as of `read_cases`.
+    FileFormatError
+        As of `read_cases`.
+    """
+    if batch < 1:
+        raise InputError(f"batch = {batch}: expected 1 or more.")
+    bases = [candidate.base for candidate in candidates]
+    found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
+    stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
+    names = [candidate.name for candidate in candidates]
+    if len({*names, *stored, REFERENCE}) < len(names) + len({*stored, REFERENCE}):
+        raise InputError(
+            f"names {', '.join(names)}: expected each one once, and none of a stored run "
+            f"({', '.join(stored)})."
+        )
+    measured: dict[str, dict[int, Measured]] = {name: {} for name in (*names, *stored, REFERENCE)}
+    done = 0
+    for numbers in _batches(found.cases, bases, batch):
+        cases = [found.cases[i] for i in numbers]
+        for name, outcomes in _outcomes(candidates, cases, device):
+            for i, case, outcome in zip(numbers, cases, outcomes, strict=True):
+                measured[name][i] = measure(case, outcome)
+        for i, case in zip(numbers, cases, strict=True):
+            for name, outcome in _stored(case).items():
+                measured[name][i] = measure(case, outcome)
+            measured[REFERENCE][i] = measure(case, Outcome(case.reference))
+        done += len(cases)
+        if on_cases:
+            on_cases(done, len(found.cases))
+    known = {candidate.name: candidate for candidate in candidates}
+    runs = {
+        name: EvaluatedRun(
+            name,
+            known[name].base if name in known else None,
+            known[name].group if name in known else None,
+            tuple(by_case[i] for i in sorted(by_case)),
+        )
+        for name, by_case in measured.items()
+    }
+    about = found.attributes
+    return Evaluation(
+        str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
+        float(about["time_step"]), runs, found.shards, found.damaged,
+    )  # fmt: skip
+
+
+def _stored(case: Case) -> dict[str, Outcome]:
+    """Stored runs by name, the plain one first."""
+    names = sorted(case.runs.keys() | case.predictions, key=lambda name: (name != PLAIN, name))
+    return {
+        name: Outcome(
+            case.runs.get(name),
+            case.predictions.get(name),
+            base=name if name in case.problems else None,
+        )
+        for name in names
+    }
+
+
+def _batches(cases: Sequence[Case], bases: Sequence[str], size: int) -> Iterator[list[int]]:
+    """Numbers of cases that can be stepped together, of like numbers of nodes."""
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, case in enumerate(cases):
+        elements = tuple(case.problems[base].element for base in bases)
+        groups.setdefault(elements, []).append(i)
+    for group in groups.values():
+        group.sort(key=lambda i: cases[i].reference.shape[1])
+        yield from (group[first : first + size] for first in range(0, len(group), size))
+
+
+def _outcomes(
+    candidates: Sequence[Candidate], cases: Sequence[Case], device: str
+) -> Iterator[tuple[str, list[Outcome]]]:
+    steppers: dict[str, BatchStepper] = {}
+    for candidate in candidates:
+        base = candidate.base
+        if base not in steppers:
+            steppers[base] = BatchStepper([case.problems[base] for case in cases], device=device)
+        stepper = steppers[base]
+        hybrid = candidate.hybrid(stepper)
+        runs = roll_out(hybrid, stepper, [case.steps for case in cases])
+        coarse = [case.predictions.get(base) for case in cases]
+        steps = single_steps(hybrid, stepper, [case.reference for case in cases], coarse)
+        yield (
+            candidate.name,
+            [
+                Outcome(run.positions, one, base, run.refused, run.failed)
+                for run, one in zip(runs, steps, strict=True)
+            ],
+        )

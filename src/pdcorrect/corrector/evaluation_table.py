@@ -1,0 +1,280 @@
+"""Results of an evaluation as tables, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.corrector.evaluation import EvaluatedRun, Evaluation
+from pdcorrect.corrector.measures import TrajectoryMeasures
+from pdcorrect.corrector.resampling import SeedSummary, Summary, over_seeds, summarise
+from pdcorrect.data.schema import REFERENCE
+from pdcorrect.replacement import make_folder, write_text
+
+VERSION = 1
+SUMMARY, TRAJECTORIES, ERRORS, TABLE = "summary.json", "trajectories.csv", "errors.csv", "table.md"
+"""Files of an evaluation."""
+
+MEASURES = tuple(
+    f.name for f in fields(TrajectoryMeasures) if f.name not in ("mesh", "simulation", "failed")
+)
+Rows = list[list[str]]
+
+
+def summaries(run: EvaluatedRun, seed: int = 0) -> dict[str, Summary]:
+    """By measure, of those that some trajectory has."""
+    found = {name: run.values(name) for name in MEASURES}
+    return {name: summarise(x, meshes, seed) for name, (x, meshes) in found.items() if x}
+
+
+def seed_summaries(evaluation: Evaluation) -> dict[str, dict[str, SeedSummary]]:
+    """By group of two models or more and measure: the split's means over the seeds."""
+    out = {}
+    for group, runs in _groups(evaluation).items():
+        values = {name: [run.values(name)[0] for run in runs] for name in MEASURES}
+        out[group] = {
+            name: over_seeds([float(np.mean(x)) for x in each])
+            for name, each in values.items()
+            if all(each)
+        }
+    return out
+
+
+def to_json(evaluation: Evaluation, record: Mapping[str, Any] | None = None, seed: int = 0) -> str:
+    """All summaries, and ``record``: how they came about (environment, command, models)."""
+    count = len(evaluation.runs[REFERENCE].trajectories)
+    content = {
+        "version": VERSION,
+        **(record or {}),
+        "bootstrap_seed": seed,
+        "data": {
+            "name": evaluation.dataset,
+            "split": evaluation.split,
+            "setting": evaluation.setting,
+            "config_hash": evaluation.config_hash,
+            "time_step": evaluation.time_step,
+            "trajectories": count,
+            "shards": dict(evaluation.shards),
+            "damaged": {path.name: text for path, text in evaluation.damaged.items()},
+        },
+        "runs": {name: _run(run, seed) for name, run in evaluation.runs.items()},
+        "seeds": {
+            group: {
+                "models": [run.name for run in _groups(evaluation)[group]],
+                "measures": {name: asdict(x) for name, x in found.items()},
+            }
+            for group, found in seed_summaries(evaluation).items()
+        },
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def trajectories_csv(evaluation: Evaluation) -> str:
+    """One line a run and trajectory; empty where a measure is not defined."""
+    names = [f.name for f in fields(TrajectoryMeasures)]
+    rows = (
+        [run.name, *("" if x is None else repr(x) for x in asdict(t.measures).values())]
+        for run in evaluation.runs.values()
+        for t in run.trajectories
+    )
+    return _csv(["run", *names], rows)
+
+
+def errors_csv(evaluation: Evaluation) -> str:
+    """RMS distance from the reference of each run, trajectory and frame, m."""
+    rows = (
+        [
+            run.name, t.measures.mesh, t.measures.simulation, frame,
+            repr(frame * evaluation.time_step), repr(error),
+        ]
+        for run in evaluation.runs.values()
+        if run.name != REFERENCE
+        for t in run.trajectories
+        for frame, error in enumerate(t.errors.tolist())
+    )  # fmt: skip
+    return _csv(["run", "mesh", "simulation", "frame", "time", "rms_error"], rows)
+
+
+def mean_errors(evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
+    """Mean over trajectories of the RMS distance over time by run, (T+1,), m.
+
+    Runs and frames that not every trajectory has are left out, so all means are of the same
+    trajectories.
+    """
+    count = len(evaluation.runs[REFERENCE].trajectories)
+    found: dict[str, NDArray[np.float64]] = {}
+    for name, run in evaluation.runs.items():
+        errors = [t.errors for t in run.trajectories if len(t.errors)]
+        if name != REFERENCE and len(errors) == count:
+            shortest = min(map(len, errors))
+            found[name] = np.stack([x[:shortest] for x in errors]).mean(axis=0)
+    return found
+
+
+# --- tables ------------------------------------------------------------------------------
+
+
+def headline(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
+    """Headings and rows of the main table: shares of squared error removed, per cent."""
+    headings = [
+        "run", "Omega", "95 % interval", "median", "5 %", "worst", "of own base", "RMS reduction",
+        "one step", "refused", "failed",
+    ]  # fmt: skip
+    rows = []
+    for name, run in _shown(evaluation):
+        found = summaries(run, seed)
+        omega = found.get("omega")
+        shares = (omega.median, omega.q05, omega.smallest) if omega else (None, None, None)
+        means = ("omega_base", "rms_reduction", "step_omega", "gate_rate")
+        rows.append([
+            name, _number(omega.mean if omega else None), _interval(omega),
+            *map(_number, shares), *(_mean(found, measure) for measure in means),
+            f"{len(run.failures())}/{len(run.trajectories)}",
+        ])  # fmt: skip
+    return headings, rows
+
+
+def details(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
+    """Headings and rows of the second table: means over trajectories in their units."""
+    columns: dict[str, tuple[str, float]] = {
+        "RMS, mm": ("rms_error", 1e3), "worst node, mm": ("worst_node", 1e3),
+        "one step, mm": ("step_rms_error", 1e3), "to 1 %, s": ("within_1", 1.0),
+        "to 2 %, s": ("within_2", 1.0), "to 5 %, s": ("within_5", 1.0),
+        "stress, %": ("stress_error", 100.0), "energy, %": ("energy_error", 100.0),
+        "lost, %": ("energy_loss", 100.0), "momentum, %": ("linear_momentum_error", 100.0),
+        "spin, %": ("angular_momentum_error", 100.0),
+        "RMS to converged, mm": ("converged_rms_error", 1e3),
+    }  # fmt: skip
+    found = {name: summaries(run, seed) for name, run in evaluation.runs.items()}
+    used = {
+        heading: column
+        for heading, column in columns.items()
+        if any(column[0] in each for name, each in found.items() if name != REFERENCE)
+    }
+    names = [name for name, _ in _shown(evaluation)]
+    rows = [
+        [name, *(_mean(found[name], measure, factor) for measure, factor in used.values())]
+        for name in [*names, REFERENCE]
+    ]
+    return ["run", *used], rows
+
+
+def seed_table(evaluation: Evaluation) -> tuple[list[str], Rows]:
+    """Headings and rows of the third table: mean and deviation over seeds."""
+    columns = {"Omega": "omega", "of own base": "omega_base", "RMS reduction": "rms_reduction",
+               "one step": "step_omega"}  # fmt: skip
+    rows = []
+    for group, found in seed_summaries(evaluation).items():
+        parts = [found.get(measure) for measure in columns.values()]
+        texts = [f"{x.mean:.2f} ± {x.deviation:.2f}" if x else "" for x in parts]
+        rows.append([group, str(len(_groups(evaluation)[group])), *texts])
+    return ["model", "seeds", *columns], rows
+
+
+def tables(evaluation: Evaluation, seed: int = 0) -> list[tuple[str, list[str], Rows]]:
+    """Titles, headings and rows of all tables that have any."""
+    about = f"{evaluation.dataset}, {evaluation.split}"
+    removed = f"{about}: share of the plain coarse run's squared error removed, %"
+    found = [
+        (removed, *headline(evaluation, seed)),
+        (f"{about}: means over trajectories", *details(evaluation, seed)),
+        (f"{about}: mean ± deviation over seeds, %", *seed_table(evaluation)),
+    ]
+    return [table for table in found if table[2]]
+
+
+def markdown(evaluation: Evaluation, notes: Sequence[str] = (), seed: int = 0) -> str:
+    """All tables and some notes as Markdown."""
+    parts = []
+    for title, headings, rows in tables(evaluation, seed):
+        lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *rows]
+        parts += [f"**{title}**", "\n".join(f"| {' | '.join(line)} |" for line in lines)]
+    parts += ["\n".join(f"- {note}" for note in notes)] if notes else []
+    return "\n\n".join(parts) + "\n"
+
+
+def write_evaluation(
+    evaluation: Evaluation,
+    folder: str | Path,
+    record: Mapping[str, Any] | None = None,
+    notes: Sequence[str] = (),
+    seed: int = 0,
+) -> list[Path]:
+    """Write all files of an evaluation into a folder.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be written.
+    """
+    folder = make_folder(folder)
+    contents = {
+        TRAJECTORIES: trajectories_csv(evaluation),
+        ERRORS: errors_csv(evaluation),
+        TABLE: markdown(evaluation, notes, seed),
+        SUMMARY: to_json(evaluation, record, seed),
+    }
+    for name, text in contents.items():
+        write_text(folder / name, text)
+    return [folder / name for name in contents]
+
+
+# --- parts -------------------------------------------------------------------------------
+
+
+def _groups(evaluation: Evaluation) -> dict[str, list[EvaluatedRun]]:
+    """Models that differ by their seed only, where there are two or more."""
+    found: dict[str, list[EvaluatedRun]] = {}
+    for run in evaluation.runs.values():
+        if run.group is not None:
+            found.setdefault(run.group, []).append(run)
+    return {group: runs for group, runs in found.items() if len(runs) > 1}
+
+
+def _run(run: EvaluatedRun, seed: int) -> dict[str, Any]:
+    return {
+        "base": run.base,
+        "group": run.group,
+        "trajectories": len(run.trajectories),
+        "failed": [
+            {"mesh": m.mesh, "simulation": m.simulation, "step": m.failed} for m in run.failures()
+        ],
+        "measures": {name: asdict(x) for name, x in summaries(run, seed).items()},
+    }
+
+
+def _shown(evaluation: Evaluation) -> list[tuple[str, EvaluatedRun]]:
+    return [(name, run) for name, run in evaluation.runs.items() if name != REFERENCE]
+
+
+def _csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(headings)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _number(value: float | None, digits: int = 2) -> str:
+    return "" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def _mean(found: Mapping[str, Summary], measure: str, factor: float = 1.0) -> str:
+    if measure not in found:
+        return ""
+    return f"{factor * found[measure].mean:.3g}" if factor != 1.0 else _number(found[measure].mean)
+
+
+def _interval(omega: Summary | None) -> str:
+    if omega is None or omega.interval is None:
+        return ""
+    low, high = map(_number, omega.interval)
+    return f"{low} to {high}"

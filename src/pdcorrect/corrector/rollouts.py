@@ -1,0 +1,159 @@
+"""Free rollouts and single steps of corrected scenes, many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.states import BatchResult, BatchState
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.data.graph import velocities
+from pdcorrect.state import State
+
+Array = NDArray[np.float64]
+
+
+class HybridResult(Protocol):
+    """What a step of a hybrid gives; see `pdcorrect.corrector.batch_hybrid`."""
+
+    @property
+    def state(self) -> BatchState:
+        """After the step."""
+
+    @property
+    def correction(self) -> Tensor:
+        """What was added, (n, 3), m."""
+
+    @property
+    def coarse(self) -> BatchResult:
+        """The coarse solver's step."""
+
+    @property
+    def refused(self) -> Tensor:
+        """Scenes (B,) that were left uncorrected."""
+
+
+class Hybrid(Protocol):
+    """A step of many scenes with a correction."""
+
+    def __call__(self, state: BatchState, previous: Tensor | None = None) -> HybridResult:
+        """One step; ``previous`` (n, 3) is the correction of the step before, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """One scene's free rollout from rest.
+
+    Attributes
+    ----------
+    positions : (T+1, N, 3)
+        m.
+    refused : (T,) bool
+        Steps without correction; never after a failure.
+    failed : int or None
+        First step that did not converge, or gave numbers that are not finite.  The body is
+        held where it was before.
+    """
+
+    positions: Array
+    refused: NDArray[np.bool_]
+    failed: int | None
+
+
+def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> list[Rollout]:
+    """All scenes of a stepper from rest, each for its number of steps.
+
+    A failed scene is held at its last state, so its error is that of a simulation that has
+    stopped: it is neither left out nor replaced by anything better.
+    """
+    rest = stepper.rest_state()
+    state, previous = rest, None
+    frames, refusals = [rest.positions], []
+    failed: list[int | None] = [None] * len(steps)
+    for number in range(1, max(steps) + 1):
+        result = hybrid(state, previous)
+        fine = _fine(result)
+        for i, good in enumerate(fine.tolist()):
+            if not good and failed[i] is None and number <= steps[i]:
+                failed[i] = number
+        alive = torch.tensor([f is None for f in failed], device=fine.device) & fine
+        frames.append(_where(alive, result.state.positions, frames[-1]))
+        refusals.append(result.refused & alive)
+        state = BatchState(
+            _where(alive, result.state.positions, rest.positions),
+            _where(alive, result.state.velocities, rest.velocities),
+            result.state.times,
+            result.state.memory,
+        )
+        previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
+    positions = torch.stack(frames).to("cpu", torch.float64).numpy()
+    refused = torch.stack(refusals).cpu().numpy()
+    return [
+        Rollout(positions[: count + 1, i, : stepper.node_counts[i]], refused[:count, i], failed[i])
+        for i, count in enumerate(steps)
+    ]
+
+
+def single_steps(
+    hybrid: Hybrid,
+    stepper: BatchStepper,
+    references: Sequence[Array],
+    coarse: Sequence[Array | None],
+) -> list[Array]:
+    """One step from each frame of each scene's reference but the last, (T, N, 3), m.
+
+    Parameters
+    ----------
+    hybrid, stepper
+    references : sequence of (T+1, N, 3)
+        m.
+    coarse : sequence of (T, N, 3) or None
+        Single steps of the coarse model: the correction of the step before is taken to have
+        been what it lacked; without them zero.
+
+    Notes
+    -----
+    A step that fails leaves the scene where it was.
+    """
+    h = stepper.time_step
+    speeds = [velocities(x, h) for x in references]
+    steps = [len(x) - 1 for x in references]
+    found: list[Tensor] = []
+    for number in range(max(steps)):
+        frames = [min(number, last - 1) for last in steps]
+        state = stepper.state([
+            State(x[t], v[t], t * h) for x, v, t in zip(references, speeds, frames, strict=True)
+        ])  # fmt: skip
+        before = np.concatenate([
+            np.zeros(x.shape[1:]) if y is None or not t else x[t] - y[t - 1]
+            for x, y, t in zip(references, coarse, frames, strict=True)
+        ])  # fmt: skip
+        previous = torch.as_tensor(before, device=stepper.device)
+        result = hybrid(state, previous)
+        found.append(_where(_fine(result), result.state.positions, state.positions))
+    positions = torch.stack(found).to("cpu", torch.float64).numpy()
+    return [positions[:n, i, : stepper.node_counts[i]] for i, n in enumerate(steps)]
+
+
+def _fine(result: HybridResult) -> Tensor:
+    """Scenes (B,) whose step converged and gave finite numbers."""
+    state = result.state
+    finite = torch.isfinite(state.positions) & torch.isfinite(state.velocities)
+    converged = torch.tensor([s.ok for s in result.coarse.statuses], device=finite.device)
+    return finite.all(dim=2).all(dim=1) & converged
+
+
+def _where(scenes: Tensor, x: Tensor, y: Any) -> Tensor:
+    return torch.where(scenes[:, None, None], x, y)
+
+
+def _by_node(stepper: BatchStepper, scenes: Tensor) -> Tensor:
+    """Values (B,) of scenes at all nodes, (n, 1), without padding."""
+    mask = stepper.node_mask
+    return scenes[:, None].expand_as(mask)[mask][:, None]

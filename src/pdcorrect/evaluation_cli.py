@@ -1,0 +1,158 @@
+"""The command ``pdcorrect evaluate``.  It imports what it needs when it runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from pdcorrect.corrector.candidates import SavedCandidate
+    from pdcorrect.corrector.evaluation import Evaluation
+
+
+def evaluate(
+    paths: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[MODEL]... DATA",
+            help="Folders or names of models, then the folder of the data set.",
+            show_default=False,
+        ),
+    ],
+    split: Annotated[str, typer.Option(help="Split of the data set.")] = "evaluation",
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    batch: Annotated[int, typer.Option(help="Simulations at once.", min=1)] = 32,
+    output: Annotated[
+        Optional[Path],
+        typer.Option("-o", "--output", help="Folder for JSON, CSV, Markdown and figures."),
+    ] = None,
+    gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
+    seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
+    skip_damaged: Annotated[
+        bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
+    ] = False,
+    figures: Annotated[
+        bool, typer.Option(help="Also draw figures into the folder (extra 'view').")
+    ] = True,
+) -> None:
+    """Measure models, and the stored runs of a data set, against its reference.
+
+    Every simulation of the split is stepped from rest.  Several models that differ by their
+    seed only are summed up together.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from pdcorrect.corrector.candidates import saved_candidates
+    from pdcorrect.corrector.evaluation import evaluate as run
+    from pdcorrect.corrector.evaluation_table import write_evaluation
+
+    *models, folder = paths
+    if output and figures:
+        from pdcorrect.errors import require_extra
+
+        require_extra("matplotlib", "view")
+    saved = saved_candidates(models, device, gate=gate)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("evaluating", total=None)
+        found = run(
+            [one.candidate for one in saved], folder, split, device=device, batch=batch,
+            skip_damaged=skip_damaged,
+            on_cases=lambda done, total: progress.update(task, completed=done, total=total),
+        )  # fmt: skip
+    notes = _notes(saved, found)
+    _print(found, notes, seed)
+    if output:
+        record = _record(saved, folder, device, batch, gate, notes)
+        written = write_evaluation(found, output, record, notes, seed)
+        for path in [*written, *(_draw(found, output) if figures else [])]:
+            typer.echo(f"wrote {path}")
+
+
+def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
+    """What a reader of the numbers has to know."""
+    notes = [f"left out: {text}" for text in found.damaged.values()]
+    for one in saved:
+        notes += one.warnings(found.dataset, found.config_hash)
+    for name, run in found.runs.items():
+        failures = run.failures()
+        if failures:
+            first = failures[0]
+            notes.append(
+                f"{name} failed in {len(failures)} of {len(run.trajectories)} trajectories, first "
+                f"on mesh {first.mesh}, simulation {first.simulation}, step {first.failed}: held "
+                "from there on, and counted so."
+            )
+    return notes
+
+
+def _print(found: Evaluation, notes: list[str], seed: int) -> None:
+    from rich.box import MARKDOWN
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdcorrect.corrector.evaluation_table import tables
+
+    # Without a terminal lines are not broken, so that the tables remain Markdown.
+    console = Console() if sys.stdout.isatty() else Console(width=400)
+    for title, headings, rows in tables(found, seed):
+        table = Table(title=title, title_justify="left", title_style="bold", box=MARKDOWN)
+        for number, heading in enumerate(headings):
+            table.add_column(heading, justify="right" if number else "left", no_wrap=True)
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    for note in notes:
+        typer.echo(f"- {note}")
+
+
+def _record(
+    saved: list[SavedCandidate], folder: str, device: str, batch: int, gate: bool, notes: list[str]
+) -> dict[str, Any]:
+    import datetime
+
+    from pdcorrect.environment import code_digest, environment
+
+    return {
+        "date": datetime.date.today().isoformat(),
+        "command": " ".join(["pdcorrect", *sys.argv[1:]]),
+        "environment": {**environment(), "device": _device(device)},
+        "code_digest": code_digest(),
+        "folder": folder,
+        "batch": batch,
+        "gate": gate,
+        "models": {one.candidate.name: one.record() for one in saved},
+        "notes": notes,
+    }
+
+
+def _device(device: str) -> str:
+    import torch
+
+    kind = torch.device(device).type
+    return f"{device}, {torch.cuda.get_device_name(device)}" if kind == "cuda" else device
+
+
+def _draw(found: Evaluation, folder: Path) -> list[Path]:
+    import numpy as np
+
+    from pdcorrect.corrector.evaluation_table import mean_errors
+    from pdcorrect.data.schema import PLAIN, REFERENCE
+    from pdcorrect.figures.curves import plot_error_over_time
+    from pdcorrect.figures.learning import plot_omega
+
+    drawn = []
+    errors = mean_errors(found)
+    if errors:
+        frames = min(map(len, errors.values()))
+        times = np.linspace(0.0, found.time_step * (frames - 1), frames)
+        shortened = {name: values[:frames] for name, values in errors.items()}
+        drawn.append(plot_error_over_time(shortened, times, folder / "errors.png"))
+    omegas = {name: run.values("omega")[0] for name, run in found.runs.items()}
+    shown = {n: x for n, x in omegas.items() if x and n not in (PLAIN, REFERENCE)}
+    if shown:
+        drawn.append(plot_omega(shown, folder / "omega.png"))
+    return drawn

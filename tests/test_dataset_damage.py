@@ -1,0 +1,116 @@
+"""Data sets with damaged files: named, and on demand left out of what is read."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+from typer.testing import CliRunner  # noqa: E402
+
+import reader_samples as samples  # noqa: E402
+from pdcorrect.cli import app  # noqa: E402
+from pdcorrect.data.damage import whole_files  # noqa: E402
+from pdcorrect.data.folder import shard_paths  # noqa: E402
+from pdcorrect.data.info import dataset_info  # noqa: E402
+from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
+from pdcorrect.data.statistics import compute_statistics  # noqa: E402
+from pdcorrect.errors import FileFormatError, FileVersionError  # noqa: E402
+
+
+def change_a_byte(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def truncate(path):
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+@pytest.fixture(params=[change_a_byte, truncate])
+def damaged(request, tmp_path):
+    """A data set whose second training file is damaged, and one where it is not there."""
+    folder = samples.dataset(tmp_path / "whole", splits=("training", "evaluation"))
+    without = tmp_path / "without"
+    shutil.copytree(folder, without)
+    (without / "training" / "mesh-0001.h5").unlink()
+    request.param(folder / "training" / "mesh-0001.h5")
+    return folder, without
+
+
+def names(found):
+    return [path.name for path in found]
+
+
+def test_windows_of_whole_files_are_read_without_the_damaged_one(damaged):
+    folder, without = damaged
+    dataset = TrajectoryDataset(folder, "training", skip_damaged=True)
+    expected = TrajectoryDataset(without, "training")
+    assert names(dataset.damaged) == ["mesh-0001.h5"]
+    assert "mesh-0001.h5" in next(iter(dataset.damaged.values()))
+    assert len(dataset) == len(expected)
+    for index in range(len(expected)):
+        one, other = dataset[index], expected[index]
+        assert torch.equal(one.positions, other.positions)
+        assert int(one.mesh) == int(other.mesh)
+    assert not TrajectoryDataset(without, "training", skip_damaged=True).damaged
+    assert not expected.damaged
+
+
+def test_damage_is_refused_where_nothing_else_is_asked_for(damaged):
+    with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
+        dataset_info(damaged[0])
+
+
+def test_truncated_files_are_refused_where_nothing_else_is_asked_for(tmp_path):
+    folder = samples.dataset(tmp_path, splits=("training",))
+    truncate(folder / "training" / "mesh-0001.h5")
+    for read in (lambda: TrajectoryDataset(folder, "training"), lambda: compute_statistics(folder)):
+        with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
+            read()
+
+
+def test_statistics_are_of_the_whole_files_and_name_the_other(damaged):
+    folder, without = damaged
+    found, expected = compute_statistics(folder, skip_damaged=True), compute_statistics(without)
+    assert names(found.damaged) == ["mesh-0001.h5"]
+    assert not expected.damaged
+    assert found.shards == expected.shards
+    np.testing.assert_array_equal(found["velocity"].mean, expected["velocity"].mean)
+
+
+def test_the_summary_is_of_the_whole_files_and_names_the_other(damaged, tmp_path):
+    folder, without = damaged
+    found, expected = dataset_info(folder, skip_damaged=True), dataset_info(without)
+    assert list(found.damaged) == ["training/mesh-0001.h5"]
+    assert found.splits == expected.splits
+    assert "training/mesh-0001.h5" in json.loads(found.to_json())["damaged"]
+    result = CliRunner().invoke(
+        app, ["dataset", "info", str(folder), "--skip-damaged", "--json", str(tmp_path / "a.json")]
+    )
+    assert result.exit_code == 0
+    assert "left out: " in result.output
+    assert "training/mesh-0001.h5" in json.loads((tmp_path / "a.json").read_text())["damaged"]
+
+
+def test_a_data_set_of_damaged_files_only_is_refused(tmp_path):
+    folder = samples.dataset(tmp_path, splits=("training",))
+    for path in shard_paths(folder, "training"):
+        truncate(path)
+    with pytest.raises(FileFormatError, match=r"all 4 files are damaged, .*mesh-0000\.h5"):
+        TrajectoryDataset(folder, "training", skip_damaged=True)
+
+
+def test_another_version_of_the_format_is_no_damage(tmp_path, monkeypatch):
+    folder = samples.dataset(tmp_path, splits=("training",))
+
+    def newer(path):
+        raise FileVersionError(f"{path}: version 9")
+
+    monkeypatch.setattr("pdcorrect.data.damage.stored_hashes", newer)
+    with pytest.raises(FileVersionError, match="version 9"):
+        whole_files(shard_paths(folder, "training"), {})
