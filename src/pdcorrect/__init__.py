@@ -35,6 +35,10 @@ _HOME = {
     "BatchStepper": "pdcorrect.batch.stepper",
     "BatchGradients": "pdcorrect.batch.adjoint",
     "PDLayer": "pdcorrect.torch_layer",
+    "HybridStepper": "pdcorrect.corrector.hybrid",
+    "BatchHybrid": "pdcorrect.corrector.batch_hybrid",
+    "HybridLayer": "pdcorrect.corrector.batch_hybrid",
+    "Gate": "pdcorrect.corrector.gate",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
@@ -46,7 +50,15 @@ _HOME = {
     "render": "pdcorrect.figures",
     "compare": "pdcorrect.evaluate",
 }
-_NEEDS_TORCH = ("BatchStepper", "BatchGradients", "PDLayer")
+_NEEDS_TORCH = (
+    "BatchStepper",
+    "BatchGradients",
+    "PDLayer",
+    "HybridStepper",
+    "BatchHybrid",
+    "HybridLayer",
+    "Gate",
+)
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
 __all__ = [  # noqa: RUF022
@@ -67,6 +79,10 @@ __all__ = [  # noqa: RUF022
     "BatchStepper",
     "BatchGradients",
     "PDLayer",
+    "HybridStepper",
+    "BatchHybrid",
+    "HybridLayer",
+    "Gate",
     "rollout",
     "march",
     "restrict",
@@ -89,6 +105,9 @@ if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report
     from pdcorrect.batch.adjoint import BatchGradients
     from pdcorrect.batch.stepper import BatchStepper
+    from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+    from pdcorrect.corrector.gate import Gate
+    from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.evaluate import compare
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
