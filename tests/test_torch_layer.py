@@ -509,8 +509,8 @@ def test_what_has_no_derivative_is_told():
     layer = pc.PDLayer(stepper, 2, on_failure="zero")
     step = stepper._step
 
-    def in_parts(state, forces):
-        result = step(state, forces)
+    def in_parts(*arguments):
+        result = step(*arguments)
         result.statuses[1] = pc.Status.SUBSTEPPED
         return result
 
