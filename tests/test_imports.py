@@ -148,6 +148,8 @@ ORDER = [
     "corrector.placements",
     "corrector.batch_bodies",
     "corrector.batch_hybrid",
+    "corrector.cost",
+    "corrector.model_io",
     "corrector.training_config",
     "corrector.losses",
     "corrector.recordings",

@@ -35,6 +35,9 @@ _HOME = {
     "BatchStepper": "pdcorrect.batch.stepper",
     "BatchGradients": "pdcorrect.batch.adjoint",
     "PDLayer": "pdcorrect.torch_layer",
+    "Corrector": "pdcorrect.corrector.corrector",
+    "load_model": "pdcorrect.corrector.model_io",
+    "save_model": "pdcorrect.corrector.model_io",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
@@ -46,7 +49,9 @@ _HOME = {
     "render": "pdcorrect.figures",
     "compare": "pdcorrect.evaluate",
 }
-_NEEDS_TORCH = ("BatchStepper", "BatchGradients", "PDLayer")
+_NEEDS_TORCH = (
+    "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "load_model", "save_model",
+)  # fmt: skip
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
 __all__ = [  # noqa: RUF022
@@ -67,6 +72,9 @@ __all__ = [  # noqa: RUF022
     "BatchStepper",
     "BatchGradients",
     "PDLayer",
+    "Corrector",
+    "load_model",
+    "save_model",
     "rollout",
     "march",
     "restrict",
@@ -89,6 +97,8 @@ if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report
     from pdcorrect.batch.adjoint import BatchGradients
     from pdcorrect.batch.stepper import BatchStepper
+    from pdcorrect.corrector.corrector import Corrector
+    from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.evaluate import compare
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise

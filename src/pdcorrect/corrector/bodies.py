@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.frames import cell_axes
+from pdcorrect.corrector.frames import (
+    cell_axes,
+    node_axes,
+    polar_rotations,
+    rotation_vectors,
+    turned_back,
+)
 from pdcorrect.data.graph import mesh_edges, node_means
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
@@ -105,6 +112,33 @@ class BodyGraph:
     def bodies(self) -> int:
         """B."""
         return len(self.cell_size)
+
+    @cached_property
+    def rest_inverses(self) -> Tensor:
+        """Inverses of the cells' axes at rest, (c, 3, 3), 1/m."""
+        with torch.inference_mode(False):  # for later use with derivatives too
+            return torch.linalg.inv(cell_axes(self.rest, self.cells))
+
+    @cached_property
+    def rest_frames(self) -> Tensor:
+        """Frames of the nodes at rest: rotations (n, 3, 3)."""
+        with torch.inference_mode(False):
+            return polar_rotations(node_axes(self.rest, self.cells))
+
+    @cached_property
+    def rest_edges(self) -> Tensor:
+        """From receiver to sender at rest, in the receiver's frame, (E, 3), m."""
+        here, there = self.edge_index
+        with torch.inference_mode(False):
+            return turned_back(self.rest_frames[here], self.rest[there] - self.rest[here])
+
+    @cached_property
+    def rest_turns(self) -> Tensor:
+        """Rotation from the receiver's to the sender's frame at rest, (E, 3)."""
+        here, there = self.edge_index
+        with torch.inference_mode(False):
+            frames = self.rest_frames
+            return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
 
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""

@@ -29,7 +29,8 @@ class CorrectorConfig(Strict):
     clip
         Normalised inputs bend towards this bound; None leaves them as they are.
     momentum_neutral
-        Whether the correction's own linear and angular momentum are taken out.
+        Whether the linear and angular momentum that the correction gives to the wholly free
+        nodes of a body are taken out.
     placement
         What is corrected: "state", the coarse solver's answer; "force", its loads;
         "guess", only where its iteration begins.

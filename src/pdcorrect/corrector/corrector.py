@@ -79,21 +79,31 @@ class Corrector(nn.Module):
 
 
 def without_momentum(view: View, correction: Tensor) -> Tensor:
-    """The correction less that rigid motion of the free nodes which has its momenta."""
+    """The correction less the rigid motion of the wholly free nodes that has their momenta.
+
+    Nodes with a held component keep theirs: clamps take up what they have.
+    """
     bodies = view.bodies
-    free = bodies.free.to(correction.dtype)
-    mass = bodies.mass[:, None] * free.amin(dim=1, keepdim=True)
-    total = bodies.node_sums(mass).clamp_min(1e-300)
-    centre = bodies.node_sums(mass * view.snapshot.proposed) / total
-    r = view.snapshot.proposed - bodies.by_node(centre)
-    mean = bodies.node_sums(mass * correction) / total
-    x = correction - bodies.by_node(mean)
-    spin = bodies.node_sums(mass * torch.linalg.cross(r, x))
+    carries = bodies.free.all(dim=1, keepdim=True)
+    mass = bodies.mass[:, None] * carries.to(correction.dtype)
+    total = bodies.node_sums(mass)
+    total = torch.where(total > 0.0, total, 1.0)
+    r = view.snapshot.proposed - bodies.by_node(
+        bodies.node_sums(mass * view.snapshot.proposed) / total
+    )
+    impulse = mass * correction
+    mean = bodies.node_sums(impulse) / total
+    spin = bodies.node_sums(torch.linalg.cross(r, impulse))
     identity = torch.eye(3, dtype=r.dtype, device=r.device)
     outer = r[:, :, None] * r[:, None, :]
     moments = (r.square().sum(dim=1)[:, None, None] * identity - outer) * mass[..., None]
     inertia = bodies.node_sums(moments)
-    inertia = inertia + 1e-12 * inertia.diagonal(dim1=1, dim2=2).sum(1)[:, None, None] * identity
-    turn = torch.linalg.solve(inertia, spin)
-    x = x - torch.linalg.cross(bodies.by_node(turn), r)
-    return torch.where(bodies.free.all(dim=1, keepdim=True), x, correction)
+    trace = inertia.diagonal(dim1=1, dim2=2).sum(dim=1)
+    least = torch.where(trace > 0.0, _LEAST_INERTIA * trace, 1.0)
+    turn = torch.linalg.solve(inertia + least[:, None, None] * identity, spin)
+    motion = bodies.by_node(mean) + torch.linalg.cross(bodies.by_node(turn), r)
+    return torch.where(carries, correction - motion, correction)
+
+
+_LEAST_INERTIA = 1e-12
+"""Of the trace, added so that nodes on a line or at a point can be solved for."""

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.frames import (
-    node_axes,
+    node_gradients,
     polar_rotations,
     rotation_vectors,
     turned_back,
@@ -26,7 +26,10 @@ from pdcorrect.corrector.frames import (
 from pdcorrect.errors import InputError
 
 STILL = 1e-9
-"""Deformation (dimensionless) below which a body counts as not deformed."""
+"""Deformation (dimensionless) below which a body counts as not deformed.
+
+Above the rounding errors of states in float64, but not of those in float32.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,31 +65,38 @@ class View:
         self.step = bodies.by_node(bodies.time_step)[:, None]
         self.receiver, self.sender = bodies.edge_index
 
-    @cached_property
-    def rest_axes(self) -> Tensor:
-        """(n, 3, 3), over the cell size."""
-        return node_axes(self.bodies.rest, self.bodies.cells) / self.size[..., None]
-
-    @cached_property
+    @property
     def rest_frames(self) -> Tensor:
         """Rotations (n, 3, 3)."""
-        return polar_rotations(self.rest_axes)
+        return self.bodies.rest_frames
 
     @cached_property
-    def axes(self) -> Tensor:
-        """(n, 3, 3), over the cell size, after the step."""
-        return node_axes(self.snapshot.proposed, self.bodies.cells) / self.size[..., None]
+    def gradients(self) -> Tensor:
+        """Deformation gradients F (n, 3, 3), after the step."""
+        bodies = self.bodies
+        return node_gradients(self.snapshot.proposed, bodies.rest_inverses, bodies.cells)
+
+    @cached_property
+    def turns(self) -> Tensor:
+        """Rotations R (n, 3, 3) of F = R U."""
+        return polar_rotations(self.gradients)
 
     @cached_property
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
-        return polar_rotations(self.axes)
+        return self.turns @ self.rest_frames
+
+    @cached_property
+    def receiver_frames(self) -> Tensor:
+        """Frames of the edges' receivers, (E, 3, 3)."""
+        return self.frames[self.receiver]
 
     @cached_property
     def strain(self) -> Tensor:
-        """Stretch of the axes beyond that at rest, in the node's frame, (n, 3, 3)."""
-        now = self.frames.transpose(1, 2) @ self.axes
-        return now - self.rest_frames.transpose(1, 2) @ self.rest_axes
+        """U - 1 in the node's frame, (n, 3, 3)."""
+        identity = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
+        stretch = self.turns.transpose(1, 2) @ self.gradients - identity
+        return self.rest_frames.transpose(1, 2) @ stretch @ self.rest_frames
 
     @cached_property
     def deformation(self) -> Tensor:
@@ -111,7 +121,7 @@ class View:
     def in_receiver_frame(self, x: Tensor) -> Tensor:
         """Vectors (E, 3) of edges in the receiver's frame, over cell size and deformation."""
         unit = (self.size * self.scale)[self.receiver]
-        return turned_back(self.frames[self.receiver], x) / unit
+        return turned_back(self.receiver_frames, x) / unit
 
 
 Feature = tuple[int, Callable[[View], Tensor]]
@@ -153,16 +163,13 @@ def _strain(view: View) -> Tensor:
 
 
 def _rest_edge(view: View) -> Tensor:
-    x = view.edge_change(view.bodies.rest) / view.size[view.receiver]
-    return _with_length(turned_back(view.rest_frames[view.receiver], x))
+    return _with_length(view.bodies.rest_edges / view.size[view.receiver])
 
 
 def _stretch(view: View) -> Tensor:
     """Edge in the receiver's frame, minus that at rest in the frame at rest."""
-    unit = view.size[view.receiver]
-    now = turned_back(view.frames[view.receiver], view.edge_change(view.snapshot.proposed))
-    rest = turned_back(view.rest_frames[view.receiver], view.edge_change(view.bodies.rest))
-    return (now - rest) / (unit * view.scale[view.receiver])
+    now = turned_back(view.receiver_frames, view.edge_change(view.snapshot.proposed))
+    return (now - view.bodies.rest_edges) / (view.size * view.scale)[view.receiver]
 
 
 def _motion(view: View) -> Tensor:
@@ -173,12 +180,8 @@ def _motion(view: View) -> Tensor:
 
 def _turn(view: View) -> Tensor:
     """Rotation between the frames of an edge's ends, beyond that at rest."""
-    here, there = view.receiver, view.sender
-
-    def between(frames: Tensor) -> Tensor:
-        return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
-
-    return (between(view.frames) - between(view.rest_frames)) / view.scale[here]
+    now = rotation_vectors(view.receiver_frames.transpose(1, 2) @ view.frames[view.sender])
+    return (now - view.bodies.rest_turns) / view.scale[view.receiver]
 
 
 def _with_length(x: Tensor) -> Tensor:

@@ -1,9 +1,11 @@
 """How the surroundings of each node are turned and stretched.
 
 A cell's axes are the means of its four edges along each of its own directions.  The mean
-over the cells of a node, M = R U, has a rotation R (polar decomposition): the node's frame.
-It turns with the body, at rest too, so what is told in frames does not depend on how the
-scene lies in space, nor on how it has turned since.
+over the cells of a node at rest has a rotation (polar decomposition): the node's frame at
+rest.  The mean of the cells' deformation gradients F = R U (axes now times the inverse of
+those at rest) turns it by R.  So a frame turns with the body, at rest too, and what is told
+in frames does not depend on how the scene lies in space, nor on how it has turned since.
+R does not depend on how a mesh orders the corners of its cells; the frame at rest does.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 _NEWTON_STEPS = 8
 _FLATTEST = 1e-3
-"""Least determinant of axes over cell volume; flatter surroundings count as not deformed."""
+"""Least determinant, of what a cube's axes of the same norm have, that a rotation is made of."""
 
 
 def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
@@ -26,12 +28,22 @@ def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
 
 def node_axes(positions: Tensor, cells: Tensor) -> Tensor:
     """Means of the axes of the cells that touch a node, (n, 3, 3), m."""
-    axes = cell_axes(positions, cells)
-    sums = positions.new_zeros(len(positions), 3, 3)
-    counts = positions.new_zeros(len(positions))
-    for corner in range(cells.shape[1]):
-        sums = sums.index_add(0, cells[:, corner], axes)
-        counts = counts.index_add(0, cells[:, corner], torch.ones_like(axes[:, 0, 0]))
+    return _node_means(cell_axes(positions, cells), cells, len(positions))
+
+
+def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor) -> Tensor:
+    """Means of the deformation gradients of the cells that touch a node, (n, 3, 3).
+
+    ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m.
+    """
+    return _node_means(cell_axes(positions, cells) @ inverses, cells, len(positions))
+
+
+def _node_means(values: Tensor, cells: Tensor, nodes: int) -> Tensor:
+    corners = cells.reshape(-1)
+    sums = values.new_zeros(nodes, 3, 3)
+    sums = sums.index_add(0, corners, values.repeat_interleave(cells.shape[1], dim=0))
+    counts = values.new_zeros(nodes).index_add(0, corners, values.new_ones(len(corners)))
     return sums / counts[:, None, None]
 
 
@@ -41,28 +53,30 @@ def polar_rotations(matrices: Tensor) -> Tensor:
     Newton's iteration with scaling (Higham 1986), which can be differentiated.  Where the
     determinant is not positive, or tiny beside the matrix, R is the identity.
     """
-    size = matrices.square().sum(dim=(1, 2), keepdim=True).sqrt().clamp_min(1e-300)
-    X = matrices / size
-    usable = (determinants(X) > _FLATTEST * 3.0**-1.5)[:, None, None]
-    identity = torch.eye(3, dtype=X.dtype, device=X.device)
+    X = matrices.permute(1, 2, 0).contiguous()  # long rows: fewer and quicker operations
+    squares = X.square().sum(dim=(0, 1))
+    X = X / torch.where(squares > 0.0, squares, 1.0).sqrt()
+    usable = _determinants(X, _cofactors(X)) > _FLATTEST * 3.0**-1.5
+    identity = torch.eye(3, dtype=X.dtype, device=X.device)[..., None]
     X = torch.where(usable, X, identity)
     for _ in range(_NEWTON_STEPS):
-        inverse = cofactors(X) / determinants(X)[:, None, None]
-        scale = (inverse.square().sum(dim=(1, 2)) / X.square().sum(dim=(1, 2))) ** 0.25
-        X = 0.5 * (scale[:, None, None] * X + inverse / scale[:, None, None])
-    return torch.where(usable, X, identity)
+        C = _cofactors(X)
+        inverse = C / _determinants(X, C)
+        scale = (inverse.square().sum(dim=(0, 1)) / X.square().sum(dim=(0, 1))).sqrt().sqrt()
+        X = (0.5 * scale) * X + inverse / (2.0 * scale)
+    return torch.where(usable, X, identity).permute(2, 0, 1).contiguous()
 
 
-def determinants(A: Tensor) -> Tensor:
-    """Of (n, 3, 3), (n,)."""
-    return (A[:, 0] * torch.linalg.cross(A[:, 1], A[:, 2])).sum(dim=1)
+def _cofactors(A: Tensor) -> Tensor:
+    """Det A A^-T of (3, 3, n)."""
+    rows = torch.cat([A, A[:2]])
+    B = torch.cat([rows, rows[:, :2]], dim=1)
+    return B[1:4, 1:4] * B[2:, 2:] - B[1:4, 2:] * B[2:, 1:4]
 
 
-def cofactors(A: Tensor) -> Tensor:
-    """Det A A^-T of (n, 3, 3)."""
-    a, b, c = A.unbind(dim=1)
-    rows = (torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b))
-    return torch.stack(rows, dim=1)
+def _determinants(A: Tensor, cofactors: Tensor) -> Tensor:
+    """Of (3, 3, n), (n,)."""
+    return (A[0] * cofactors[0]).sum(dim=0)
 
 
 def turned(R: Tensor, x: Tensor) -> Tensor:

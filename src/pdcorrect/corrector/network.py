@@ -46,9 +46,10 @@ class MessageLayer(MessagePassing):  # type: ignore[misc]
         self.of_sender = nn.Linear(width, width, bias=False)
         self.edge_rest = nn.Sequential(nn.ReLU(), *MLP(width, width, width, layers - 1, norm))
         self.node = MLP(2 * width, width, width, layers, norm)
+        bound = (3 * width) ** -0.5  # as one map from all three
         for part in (self.of_edge, self.of_receiver, self.of_sender):
-            bound = (3 * width) ** -0.5  # as one map from all three
             nn.init.uniform_(part.weight, -bound, bound)
+        nn.init.uniform_(self.of_edge.bias, -bound, bound)
 
     def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         """New values of nodes (n, w) and edges (E, w)."""

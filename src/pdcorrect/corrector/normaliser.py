@@ -8,47 +8,59 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector.features import UNSCALED
+from pdcorrect.errors import InputError
 
 _LEAST_DEVIATION = 1e-8
 """Of the largest magnitude; below it a component counts as constant."""
 
 
 class Moments:
-    """Mean, mean square and range of values that come in parts.
+    """Mean, deviation and range of values that come in parts.
 
     Attributes
     ----------
     count : int
-    mean, square, low, high : (k,)
+    mean, variance, low, high : (k,)
         float64.
     """
 
     def __init__(self) -> None:
         self.count = 0
-        self.mean = self.square = torch.zeros(0, dtype=torch.float64)
+        self.mean = self.variance = torch.zeros(0, dtype=torch.float64)
         self.low = self.high = self.mean
 
     def add(self, values: Tensor) -> None:
-        """Take in values (m, k); those that are not finite are an error of the caller."""
+        """Take in values (m, k); those that are not finite are an error of the caller.
+
+        Parts are merged as in Chan, Golub and LeVeque (1979), without cancellation.
+        """
         values = values.detach().to("cpu", torch.float64)
         if not len(values):
             return
-        parts = values.mean(dim=0), values.square().mean(dim=0), values.amin(dim=0)
-        high = values.amax(dim=0)
+        mean, low, high = values.mean(dim=0), values.amin(dim=0), values.amax(dim=0)
+        variance = (values - mean).square().mean(dim=0)
         if not self.count:
             self.count = len(values)
-            (self.mean, self.square, self.low), self.high = parts, high
+            self.mean, self.variance, self.low, self.high = mean, variance, low, high
             return
         share = len(values) / (self.count + len(values))
-        self.mean = self.mean + share * (parts[0] - self.mean)
-        self.square = self.square + share * (parts[1] - self.square)
-        self.low, self.high = torch.minimum(self.low, parts[2]), torch.maximum(self.high, high)
+        away = mean - self.mean
+        self.mean = self.mean + share * away
+        self.variance = (
+            (1.0 - share) * self.variance + share * variance + share * (1.0 - share) * away.square()
+        )
+        self.low, self.high = torch.minimum(self.low, low), torch.maximum(self.high, high)
         self.count += len(values)
+
+    @property
+    def square(self) -> Tensor:
+        """Mean square, (k,)."""
+        return self.variance + self.mean.square()
 
     @property
     def deviation(self) -> Tensor:
         """Root mean squared distance from the mean, (k,)."""
-        return (self.square - self.mean.square()).clamp_min(0.0).sqrt()
+        return self.variance.sqrt()
 
 
 class Normaliser(nn.Module):
@@ -82,7 +94,19 @@ class Normaliser(nn.Module):
         return bool(self.output_scale > 0)
 
     def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
-        """Take over the moments of features, and of targets (m, 1)."""
+        """Take over the moments of features, and of targets (m, 1).
+
+        Raises
+        ------
+        InputError
+            If there are none of a feature or of the targets, or all targets are zero.
+        """
+        seen = {name: features[name].count for name in self.names if name in features}
+        missing = [name for name in self.names if not seen.get(name)]
+        if missing:
+            raise InputError(f"features {', '.join(missing)}: expected values, got none.")
+        if not target.count or not float(target.square.mean()) > 0.0:
+            raise InputError("targets: expected values other than zero.")
         for name in self.names:
             moments = features[name]
             largest = torch.maximum(moments.low.abs(), moments.high.abs())

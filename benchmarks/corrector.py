@@ -1,0 +1,134 @@
+"""What a call of the corrector costs on the CPU: features apart from the network.
+
+    python benchmarks/corrector.py [results.json] [--quick]
+
+Each preset with random weights, a beam of 135 and a cross of 405 nodes, both bent; states in
+float64, network in float32, without gradients, on one and two threads.  Times are medians of
+30 calls after three that do not count (``--quick``: of three after one).
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import pdcorrect as pc
+from pdcorrect.corrector import cost, features
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.config import PRESETS
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
+from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.environment import environment
+
+BODIES: dict[str, dict[str, Any]] = {
+    "beam": {"shape": "beam", "cells": [14, 2, 2], "cell_size": 0.05},
+    "cross": {
+        "shape": "cross", "cells": [16, 2, 2], "cell_size": 0.05, "arms": 4, "arm_start": 5,
+        "arm_width": 2, "arm_length": 7,
+    },
+}  # fmt: skip
+
+
+def sample(body: dict[str, Any]) -> tuple[BodyGraph, Snapshot]:
+    """A bent body in motion."""
+    scene = pc.Scene(
+        body=body,
+        material={"young": 2e5, "poisson": 0.35, "density": 1e3},
+        time={"step": 0.01, "frames": 1},
+        clamps=[{"region": {"plane": "x", "at": 0.0}}],
+    )
+    problem = pc.discretise(scene)
+    bodies = BodyGraph.of([problem], dtype=torch.float64)
+    rng = np.random.default_rng(0)
+
+    def noise(size: float) -> torch.Tensor:
+        return torch.as_tensor(size * rng.normal(size=problem.positions.shape)) * bodies.free
+
+    start = bodies.rest + 0.01 * torch.sin(5.0 * bodies.rest[:, [1, 2, 0]]) + noise(1e-3)
+    return bodies, Snapshot(start, noise(0.1), start + noise(1e-3), noise(1.0))
+
+
+def fitted(name: str, view: View) -> Corrector:
+    """A corrector whose normaliser has seen one view."""
+    torch.manual_seed(0)
+    corrector, found = Corrector(PRESETS[name]), {}
+    config = corrector.config
+    for table, names in (
+        (NODE_FEATURES, config.node_features), (EDGE_FEATURES, config.edge_features),
+    ):  # fmt: skip
+        for feature, values in features.values(table, names, view).items():
+            found[feature] = Moments()
+            found[feature].add(values)
+    target = Moments()
+    target.add(torch.ones(1, 1))
+    corrector.normaliser.fit(found, target)
+    return corrector.eval()
+
+
+def measure(name: str, body: str, threads: int, calls: int, warm: int) -> dict[str, Any]:
+    """One row."""
+    torch.set_num_threads(threads)
+    bodies, step = sample(BODIES[body])
+    corrector = fitted(name, View(bodies, step))
+    n, e = len(bodies.rest), bodies.edge_index.shape[1]
+    with torch.no_grad():
+        nodes, edges = (x.float() for x in corrector.inputs(View(bodies, step)))
+        taken = {
+            "features_ms": lambda: corrector.inputs(View(bodies, step)),
+            "network_ms": lambda: corrector.network(nodes, edges, bodies.edge_index),
+            "call_ms": lambda: corrector(bodies, step),
+        }
+        times = {key: 1e3 * median(function, calls, warm) for key, function in taken.items()}
+    flops = cost.flops(corrector.config, n, e)
+    row = {
+        "preset": name, "body": body, "nodes": n, "edges": e, "threads": threads,
+        "parameters": cost.parameters(corrector.config), "flops": flops, **times,
+        "network_gflops_a_second": 1e-6 * flops / times["network_ms"],
+    }  # fmt: skip
+    print(json.dumps(row), flush=True)
+    return row
+
+
+def median(function: Callable[[], object], calls: int, warm: int) -> float:
+    """Seconds of a call."""
+    taken = []
+    for _ in range(calls + warm):
+        started = time.perf_counter()
+        function()
+        taken.append(time.perf_counter() - started)
+    return statistics.median(taken[warm:])
+
+
+def main() -> None:
+    """Measure and write JSON."""
+    paths = [argument for argument in sys.argv[1:] if argument != "--quick"]
+    quick = "--quick" in sys.argv
+    calls, warm = (3, 1) if quick else (30, 3)
+    rows = [
+        measure(name, body, threads, calls, warm)
+        for name in PRESETS
+        for body in BODIES
+        for threads in (1, 2)
+    ]
+    record = {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": "python benchmarks/corrector.py" + (" --quick" if quick else ""),
+        "environment": environment(),
+        "results": rows,
+    }
+    path = Path(paths[0]) if paths else Path("corrector.json")
+    path.write_text(json.dumps(record, indent=2) + "\n")
+    print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    main()

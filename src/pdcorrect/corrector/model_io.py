@@ -1,0 +1,335 @@
+"""Models on disk: a folder with ``weights.safetensors`` and ``model.json``.
+
+``weights.safetensors`` holds the network's weights (float32) and the normaliser's buffers
+(float64).  ``model.json`` says what they belong to: architecture, normalisation, data set,
+code, training and metrics, the SHA-256 of the weights' file, and under ``checksum`` that of
+all its own other content.  It is replaced last.  If a program is ended between the two
+replacements, an old ``model.json`` lies beside new weights; that, like any other damage, is
+refused.  Nothing is ever unpickled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, JsonValue, ValidationError
+
+import pdcorrect
+from pdcorrect import __version__
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.cost import parameters
+from pdcorrect.environment import code_digest
+from pdcorrect.errors import (
+    FileFormatError,
+    FileVersionError,
+    InputError,
+    OutputError,
+    require_extra,
+)
+from pdcorrect.replacement import make_folder, part_of_process, replacing
+from pdcorrect.scene.regions import Strict
+
+require_extra("safetensors", "learn")
+
+import torch  # noqa: E402
+from safetensors import SafetensorError  # noqa: E402
+from safetensors import torch as safetensors  # noqa: E402
+from torch import Tensor  # noqa: E402
+
+from pdcorrect.corrector.corrector import Corrector  # noqa: E402
+
+FORMAT = "pdcorrect-model"
+VERSION = 1
+WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
+HOME = "PDCORRECT_HOME"
+"""Environment variable: the folder with ``models``; by default the checkout of the code."""
+
+_NORMALISER = "normaliser."
+_CHECKSUM = "checksum"
+
+
+class ModelRecord(Strict):
+    """Where a model comes from.
+
+    Attributes
+    ----------
+    dataset, dataset_hash
+        Name of the data set, and the hash of its configuration or content.
+    training, metrics
+        Settings of the training, and what the model achieved; any JSON with finite numbers.
+    code_version, code_digest
+        Of the code that made it, see `pdcorrect.environment.code_digest`.
+    """
+
+    dataset: str
+    dataset_hash: str
+    training: dict[str, JsonValue] = Field(default_factory=dict)
+    metrics: dict[str, JsonValue] = Field(default_factory=dict)
+    code_version: str = __version__
+    code_digest: str = Field(default_factory=code_digest)
+
+
+class _Description(Strict):
+    """``model.json`` without its checksum."""
+
+    format: Literal["pdcorrect-model"] = "pdcorrect-model"
+    version: Literal[1] = 1
+    architecture: CorrectorConfig
+    parameters: int
+    dtype: Literal["float32"] = "float32"
+    normalisation: dict[str, list[float] | float]
+    record: ModelRecord
+    weights_sha256: str
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedModel:
+    """A corrector ready for use, and where it comes from."""
+
+    corrector: Corrector
+    record: ModelRecord
+
+
+# --- writing -----------------------------------------------------------------------------
+
+
+def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord) -> Path:
+    """Write a model, replacing the one that is there; returns its folder.
+
+    Both files are complete under other names before the first is replaced, so after an
+    error the old model is there as it was.
+
+    Raises
+    ------
+    InputError
+        If the normaliser is not fitted, weights are not float32 or not finite, or the record
+        has numbers that are not finite.
+    OutputError
+        If it cannot be written.
+    """
+    folder = Path(folder)
+    state = {name: t.detach().to("cpu").contiguous() for name, t in corrector.state_dict().items()}
+    _check_values(f"model for {folder}", state, InputError)
+    weights = safetensors.save(state)
+    description = _Description(
+        architecture=corrector.config, parameters=parameters(corrector.config),
+        normalisation=_normalisation(state), record=record,
+        weights_sha256=hashlib.sha256(weights).hexdigest(),
+    )  # fmt: skip
+    try:
+        content = description.model_dump(mode="json")
+        text = json.dumps({**content, _CHECKSUM: _digest(content)}, indent=1, allow_nan=False)
+    except ValueError as error:
+        raise InputError(f"record of the model for {folder}: {error}.") from None
+    make_folder(folder)
+    paths = folder / WEIGHTS, folder / DESCRIPTION
+    try:
+        with (
+            replacing(paths[1], part_of_process(paths[1])) as last,
+            replacing(paths[0], part_of_process(paths[0])) as first,
+        ):
+            first.write_bytes(weights)
+            last.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
+    return folder
+
+
+def _normalisation(state: dict[str, Tensor]) -> dict[str, Any]:
+    """The normaliser's buffers as numbers."""
+    return {
+        name.removeprefix(_NORMALISER): tensor.tolist()
+        for name, tensor in sorted(state.items())
+        if name.startswith(_NORMALISER)
+    }
+
+
+def _digest(content: dict[str, Any]) -> str:
+    """SHA-256 of JSON content, however it is laid out."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# --- reading -----------------------------------------------------------------------------
+
+
+def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> LoadedModel:
+    """A saved model; the corrector is in evaluation mode.
+
+    Parameters
+    ----------
+    path_or_name : str or path
+        Folder, or, as a text without slashes, the name of one in ``models`` of the folder
+        that the environment variable ``PDCORRECT_HOME`` names, by default of the checkout.
+    device : str or torch.device
+
+    Raises
+    ------
+    InputError
+        If there is no such model or device.
+    FileFormatError
+        If a file is damaged, or the two do not belong together; names file and reason.
+    FileVersionError
+        If it was written in another version of the format.
+    """
+    folder = model_folder(path_or_name)
+    path = folder / WEIGHTS
+    found = _read_description(folder / DESCRIPTION)
+    data = _read(path)
+    if hashlib.sha256(data).hexdigest() != found.weights_sha256:
+        raise FileFormatError(
+            f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "
+            "the program that replaced the model was ended half-way; copy or save it again."
+        )
+    state = _tensors(path, data)
+    corrector = _empty(path, found.architecture, state)
+    _check_tensors(path, state, corrector.state_dict())
+    _check_values(str(path), state, FileFormatError)
+    if found.normalisation != _normalisation(state):
+        raise FileFormatError(
+            f"{folder / DESCRIPTION}: its normalisation is not that of {WEIGHTS}: damaged."
+        )
+    corrector.load_state_dict(_moved(state, device), assign=True)
+    return LoadedModel(corrector.eval(), found.record)
+
+
+def model_folder(path_or_name: str | Path) -> Path:
+    """Where a model given by path or name is.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    named = isinstance(path_or_name, str) and path_or_name.strip(".") != ""
+    named = named and not set(str(path_or_name)) & {"/", os.sep}
+    folder = models_folder() / path_or_name if named else Path(path_or_name)
+    if folder.is_dir():
+        return folder
+    if not named:
+        raise InputError(f"{folder}: expected a folder with a model, there is none.")
+    known = sorted(path.parent.name for path in models_folder().glob(f"*/{DESCRIPTION}"))
+    raise InputError(
+        f"model {path_or_name!r}: not in {models_folder()}: expected one of "
+        f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}."
+    )
+
+
+def models_folder() -> Path:
+    """Where models are looked up by name.
+
+    Raises
+    ------
+    InputError
+        If the environment does not say, and the code is not in its checkout.
+    """
+    home = os.environ.get(HOME)
+    if home:
+        return Path(home) / "models"
+    checkout = Path(pdcorrect.__file__).resolve().parents[2]
+    if not (checkout / "pyproject.toml").is_file():
+        raise InputError(
+            f"models by name: expected the environment variable {HOME} to name the folder that "
+            "has 'models' in it, or the path of a model."
+        )
+    return checkout / "models"
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
+
+
+def _read_description(path: Path) -> _Description:
+    try:
+        content = json.loads(_read(path).decode("utf-8"))
+        digest = _digest({k: v for k, v in content.items() if k != _CHECKSUM})
+    except (ValueError, AttributeError, RecursionError) as error:
+        reason = "expected keys and values" if isinstance(error, AttributeError) else error
+        raise FileFormatError(f"{path}: damaged: not JSON of a model ({reason}).") from None
+    if content.get("format") != FORMAT:
+        raise FileFormatError(f"{path}: expected format {FORMAT!r}: damaged or something else.")
+    version = content.get("version")
+    if version != VERSION:
+        newer = isinstance(version, int) and version > VERSION
+        raise FileVersionError(
+            f"{path}: format version {version!r}: expected {VERSION}"
+            + (": written by a newer pdcorrect: update it." if newer else ".")
+        )
+    if content.pop(_CHECKSUM, None) != digest:
+        raise FileFormatError(
+            f"{path}: damaged: its checksum is not that of its content; copy or save it again."
+        )
+    try:
+        return _Description.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise FileFormatError(f"{path}: {place}: {first['msg']}.") from None
+
+
+def _tensors(path: Path, data: bytes) -> dict[str, Tensor]:
+    try:
+        found: dict[str, Tensor] = safetensors.load(data)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"{path}: not a file of tensors ({error}).") from None
+    return found
+
+
+def _empty(path: Path, config: CorrectorConfig, state: dict[str, Tensor]) -> Corrector:
+    """A corrector without values; random numbers are left alone."""
+    layers = (1 if config.shared else config.layers) + config.mlp_layers
+    if layers > len(state):
+        raise FileFormatError(
+            f"{path}: {len(state)} tensors: expected more for {config.layers} layers of networks "
+            f"with {config.mlp_layers}, as {DESCRIPTION} says."
+        )
+    with torch.device("meta"):
+        return Corrector(config)
+
+
+def _check_tensors(path: Path, state: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    for what, names in (
+        ("missing", expected.keys() - state.keys()),
+        ("unexpected", state.keys() - expected.keys()),
+    ):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            raise FileFormatError(
+                f"{path}: {what} tensor {min(names)}{more}: the architecture in {DESCRIPTION} is "
+                "another one."
+            )
+    for name, tensor in expected.items():
+        if state[name].shape != tensor.shape:
+            raise FileFormatError(
+                f"{path}: {name} has shape {tuple(state[name].shape)}: expected "
+                f"{tuple(tensor.shape)} for the architecture in {DESCRIPTION}."
+            )
+
+
+def _check_values(where: str, state: dict[str, Tensor], error: type[InputError]) -> None:
+    for name, tensor in state.items():
+        dtype = torch.float64 if name.startswith(_NORMALISER) else torch.float32
+        if tensor.dtype != dtype:
+            raise error(f"{where}: {name} has type {tensor.dtype}: expected {dtype}.")
+        if not bool(torch.isfinite(tensor).all()):
+            raise error(f"{where}: {name} has values that are infinite or not a number.")
+        if name.endswith("__deviation") and not bool((tensor > 0.0).all()):
+            raise error(f"{where}: {name} has values that are not positive.")
+    if not float(state[f"{_NORMALISER}output_scale"]) > 0.0:
+        raise error(f"{where}: its normaliser has not been fitted: it cannot be used.")
+
+
+def _moved(state: dict[str, Tensor], device: str | torch.device) -> dict[str, Tensor]:
+    try:
+        return {name: tensor.to(device) for name, tensor in state.items()}
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).split("\n")[0]
+        raise InputError(f"device {str(device)!r}: cannot be used ({reason}).") from None
