@@ -18,8 +18,8 @@ from pdcorrect.corrector.recordings import Base, Recording
 from pdcorrect.corrector.scenes import SceneGroup
 from pdcorrect.corrector.world import World
 
-FAILED = -100.0
-"""Omega of a simulation whose rollout failed, and the least that counts in means, per cent."""
+LEAST = -100.0
+"""Omega of a simulation whose rollout failed or is worse than this, per cent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Scores:
     Attributes
     ----------
     omegas : (S,)
-        Per cent, in the order of the recordings.
+        Per cent, in the order of the recordings; at least `LEAST`.
     failed : int
         Rollouts in which a step failed.
     """
@@ -39,8 +39,8 @@ class Scores:
 
     @property
     def mean(self) -> float:
-        """Eq. 7-3, with `FAILED` as the least value."""
-        return float(np.maximum(self.omegas, FAILED).mean())
+        """Eq. 7-3, with `LEAST` as the least value."""
+        return float(self.omegas.mean())
 
     @property
     def median(self) -> float:
@@ -85,24 +85,26 @@ class Validation:
         """Omega of each simulation."""
         found = torch.zeros(2, len(self.recordings), dtype=torch.float64)
         if self._group is not None:
-            squares, failed = self._rollout(self._group, corrector)
-            plain = np.array([_squares(r) for r in self._group.recordings])
-            omegas = 100.0 * (1.0 - squares / plain)
             chosen = list(self._numbers)
-            found[0, chosen] = torch.from_numpy(np.where(failed, FAILED, omegas))
-            found[1, chosen] = torch.from_numpy(failed.astype(np.float64))
+            omegas, failed = self._rollout(self._group, corrector)
+            found[0, chosen], found[1, chosen] = omegas.cpu(), failed.double().cpu()
         found = self._world.total(found)
         return Scores(found[0].numpy(), int(found[1].sum()))
 
-    def _rollout(
-        self, group: SceneGroup, corrector: Corrector
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Squared distance from the reference over all frames and nodes, m2; what failed."""
+    def _rollout(self, group: SceneGroup, corrector: Corrector) -> tuple[Tensor, Tensor]:
+        """Omega of a group, (B,), and which rollouts failed.
+
+        Those that failed, or are sure to end below `LEAST`, are put back to rest, where
+        they cost little.
+        """
         hybrid = BatchHybrid(group.stepper, corrector, velocity=self._velocity)
         rest = group.stepper.rest_state()
         state, previous = rest, None
         total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
         ok = torch.ones(len(group), dtype=torch.bool, device=group.device)
+        good = ok.clone()
+        plain = torch.tensor([_squares(r) for r in group.recordings], device=group.device)
+        worst = (1.0 - LEAST / 100.0) * plain
         steps = torch.from_numpy(group.steps).to(group.device)
         for frame in range(1, int(group.steps.max()) + 1):
             result = hybrid(state, previous)
@@ -111,11 +113,12 @@ class Validation:
             fine = torch.tensor([s.ok for s in result.coarse.statuses], device=group.device)
             fine &= torch.isfinite(state.positions).flatten(1).all(dim=1) & ~result.refused
             ok &= fine | ~running
-            state = _where(ok, state, rest)
             error = state.positions - group.truth(np.minimum(frame, group.steps))
             square = group.sums(error.square().sum(dim=2))
-            total += torch.where(running, square, 0.0)
-        return total.cpu().numpy(), ~ok.cpu().numpy()
+            total += torch.where(running & ok, square, 0.0)
+            good &= ok & (total <= worst)
+            state = _where(good, state, rest)
+        return torch.where(good, 100.0 * (1.0 - total / plain), LEAST), ~ok
 
 
 def _squares(recording: Recording) -> float:
@@ -124,7 +127,7 @@ def _squares(recording: Recording) -> float:
 
 
 def _where(ok: Tensor, state: BatchState, rest: BatchState) -> BatchState:
-    """The state, but rest where it is of no use, which costs little."""
+    """The state, but rest where it is not ok."""
     at = ok[:, None, None]
     return replace(
         state,
