@@ -273,6 +273,15 @@ def test_noise_is_seen_and_to_be_corrected(folder, relative):
     assert noisy.snapshot.positions is batch.snapshot.positions
 
 
+def test_what_is_known_of_the_rest_is_that_of_the_bodies(folder):
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    bodies = windows.batch([3, 45, 4]).bodies
+    anew = bodies.to()
+    for name in ("rest_inverses", "rest_frames", "rest_edges", "rest_turns"):
+        torch.testing.assert_close(getattr(bodies, name), getattr(anew, name))
+        assert len(getattr(bodies, name)) > 200
+
+
 # --- normalisation -----------------------------------------------------------------------
 
 
@@ -385,6 +394,7 @@ def test_bfloat16_is_close_to_full_precision_but_not_the_same(folder):
     )
     assert half == pytest.approx(full, rel=0.05)
     assert half != full
+    assert one_step_loss(corrector, batch, samples.one_step()).item() == full
 
 
 # --- scenes ------------------------------------------------------------------------------

@@ -152,6 +152,7 @@ ORDER = [
     "corrector.model_io",
     "corrector.training_config",
     "corrector.losses",
+    "corrector.precision",
     "corrector.recordings",
     "corrector.windows",
     "corrector.fitting",

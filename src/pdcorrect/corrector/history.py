@@ -35,7 +35,7 @@ class History:
         path = folder / NAME
         try:
             self._file = path.open("r+b" if path.exists() else "w+b")
-            self._file.truncate(length)
+            self._file.truncate(min(length, self._file.seek(0, os.SEEK_END)))
             self._file.seek(0, os.SEEK_END)
         except OSError as error:
             raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None

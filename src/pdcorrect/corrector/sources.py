@@ -11,9 +11,10 @@ from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.losses import body_losses
+from pdcorrect.corrector.precision import network_precision
 from pdcorrect.corrector.recordings import Recording
 from pdcorrect.corrector.training_config import Stage, TrainingConfig
-from pdcorrect.corrector.unrolled import UnrolledBatches, autocast
+from pdcorrect.corrector.unrolled import UnrolledBatches
 from pdcorrect.corrector.windows import StepBatch, StepWindows
 from pdcorrect.corrector.world import World
 
@@ -80,7 +81,7 @@ class OneStepBatches:
 
 def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tensor:
     """Mean loss of the bodies of a batch."""
-    with autocast(stage, batch.target.device):
+    with network_precision(corrector, stage.amp):
         correction = corrector(batch.bodies, batch.snapshot)
     counts = torch.bincount(batch.bodies.graph, minlength=batch.bodies.bodies)
     errors = correction - batch.target

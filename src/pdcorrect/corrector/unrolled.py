@@ -15,12 +15,16 @@ from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.losses import body_losses, mean_of
 from pdcorrect.corrector.placements import Velocity
+from pdcorrect.corrector.precision import network_precision
 from pdcorrect.corrector.recordings import Base, Recording
 from pdcorrect.corrector.scenes import Frames, SceneGroup, grouped
 from pdcorrect.corrector.training_config import Stage
 from pdcorrect.errors import InputError
 
 Flags = NDArray[np.bool_]
+
+_LEAST_FREE = 0.2
+"""Of a GPU's memory, when a group is set up."""
 
 
 @dataclass(eq=False)
@@ -100,7 +104,8 @@ class UnrolledBatches:
                 f"{len(usable)} simulations of {longest} steps or more, in groups of "
                 f"{stage.batch}, for {world_size} processes: expected a group for each."
             )
-        self._base, self._stage, self._device, self._velocity = base, stage, device, velocity
+        self._base, self._stage, self._velocity = base, stage, velocity
+        self._device = torch.device(device)
         self._seed = (seed, rank)
         self._groups: dict[int, SceneGroup] = {}
         self._pool: dict[int, Rollouts] = {}
@@ -154,8 +159,19 @@ class UnrolledBatches:
 
     def _group(self, number: int) -> SceneGroup:
         if number not in self._groups:
+            self._make_room()
             self._groups[number] = SceneGroup(self._chosen[number], self._base, self._device)
         return self._groups[number]
+
+    def _make_room(self) -> None:
+        """Forget groups, which are set up anew when they are needed, if a GPU is nearly full."""
+        if self._device.type != "cuda":
+            return
+        free, total = torch.cuda.mem_get_info(self._device)
+        while free < _LEAST_FREE * total and self._groups:
+            del self._groups[next(iter(self._groups))]
+            torch.cuda.empty_cache()
+            free, total = torch.cuda.mem_get_info(self._device)
 
     def _start(
         self, number: int, group: SceneGroup, steps: int, rng: np.random.Generator
@@ -188,7 +204,7 @@ def unroll(
     total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
     living = torch.ones(len(group), dtype=torch.bool, device=group.device)
     for _ in range(steps):
-        with autocast(stage, group.device):
+        with network_precision(corrector, stage.amp):
             positions, velocities, correction = layer(
                 positions, velocities, group.times(frames), correction
             )
@@ -203,11 +219,6 @@ def unroll(
         total = total + body_losses(stage.loss, positions - truth, group.sums, group.counts, scale)
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
-
-
-def autocast(stage: Stage, device: torch.device) -> torch.autocast:
-    """In which precision the network's products are computed."""
-    return torch.autocast(device.type, torch.bfloat16, enabled=stage.amp == "bf16")
 
 
 def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:

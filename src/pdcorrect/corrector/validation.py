@@ -103,7 +103,8 @@ class Validation:
         total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
         ok = torch.ones(len(group), dtype=torch.bool, device=group.device)
         good = ok.clone()
-        plain = torch.tensor([_squares(r) for r in group.recordings], device=group.device)
+        squares = [_squares(r) for r in group.recordings]
+        plain = torch.tensor(squares, dtype=torch.float64, device=group.device)
         worst = (1.0 - LEAST / 100.0) * plain
         steps = torch.from_numpy(group.steps).to(group.device)
         for frame in range(1, int(group.steps.max()) + 1):

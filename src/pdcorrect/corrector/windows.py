@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -101,6 +102,11 @@ class StepWindows:
         for r in recordings:
             errors[r.mesh, r.number] = r.one_step
         self._errors = errors.to(self.device)
+        shards, first = np.unique(dataset.shard_numbers(), return_index=True)
+        self._first = {
+            dataset.headers[k].number: int(i) for k, i in zip(shards, first, strict=True)
+        }
+        self._rest: dict[int, dict[str, Tensor]] = {}
 
     def batch(self, indices: Sequence[int]) -> StepBatch:
         """Chosen windows."""
@@ -120,8 +126,9 @@ class StepWindows:
 
     def step_batch(self, found: Any) -> StepBatch:
         """What a batch of samples says about its last step."""
+        meshes = found.mesh.tolist()
         found = found.to(self.device, non_blocking=True)
-        bodies = BodyGraph.of_batch(found).to(dtype=torch.float64)
+        bodies = self._with_rest(BodyGraph.of_batch(found).to(dtype=torch.float64), meshes)
         positions, targets, predictions, forces = (
             getattr(found, name).to(torch.float64)
             for name in ("positions", "targets", "predictions", "forces")
@@ -141,6 +148,20 @@ class StepWindows:
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
         return StepBatch(bodies, state, target, self._errors[found.mesh, found.simulation])
+
+    def _with_rest(self, bodies: BodyGraph, meshes: list[int]) -> BodyGraph:
+        """The bodies with what is computed of their rest once for each mesh."""
+        for mesh in set(meshes) - self._rest.keys():
+            one = self.dataset.batch([self._first[mesh]]).to(self.device)
+            alone = BodyGraph.of_batch(one).to(dtype=torch.float64)
+            self._rest[mesh] = {name: getattr(alone, name) for name in _REST}
+        for name in _REST:
+            vars(bodies)[name] = torch.cat([self._rest[mesh][name] for mesh in meshes])
+        return bodies
+
+
+_REST = ("rest_inverses", "rest_frames", "rest_edges", "rest_turns")
+"""Cached properties of `BodyGraph`."""
 
 
 class EndlessBatches:
