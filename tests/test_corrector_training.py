@@ -798,8 +798,11 @@ def test_one_trajectory_is_learned_by_heart(tmp_path):
     (data / "validation" / "mesh-0000.h5").write_bytes(text)
     architecture = {"preset": "compact", "changes": {"layers": 3, "width": 48}}
     settings = samples.config(
-        samples.one_step(iterations=1200, batch=10, rate={"peak": 3e-3, "last": 1e-5}),
-        corrector=architecture, validate_every={"iterations": 300}, base="best",
+        samples.one_step(iterations=300, batch=20, rate={"peak": 4e-3}, noise={"tau": 0.03}),
+        samples.unrolled(
+            iterations=80, steps=(5, 10, 20), batch=1, through_solver=True, rate={"peak": 5e-4}
+        ),
+        corrector=architecture, validate_every={"iterations": 50}, base="best",
     )  # fmt: skip
     training = trained(settings, data, tmp_path / "out")
     assert training.progress.best >= 99.9
