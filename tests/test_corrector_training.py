@@ -34,7 +34,7 @@ from pdcorrect.corrector.training_config import (  # noqa: E402
     TrainingConfig,
 )
 from pdcorrect.corrector.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
-from pdcorrect.corrector.validation import Validation  # noqa: E402
+from pdcorrect.corrector.validation import Scores, Validation  # noqa: E402
 from pdcorrect.corrector.world import World  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
@@ -680,6 +680,27 @@ def test_a_training_leaves_the_best_model_with_its_record(short, tmp_path):
     assert list((tmp_path / "out" / "tensorboard").iterdir())
 
 
+@pytest.mark.parametrize("begin", ["best", "last"])
+def test_a_stage_begins_from_the_best_or_the_last_weights(short, tmp_path, begin, monkeypatch):
+    settings = samples.config(
+        samples.one_step(iterations=3), samples.one_step(iterations=1, begin=begin),
+        validate_every={"iterations": 1},
+    )  # fmt: skip
+    found, shown = [], iter([5.0, 7.0, 6.0, 1.0])
+
+    def judge(self, corrector):
+        found.append(weights(corrector))
+        return Scores(np.array([next(shown)]), 0)
+
+    monkeypatch.setattr(Validation, "__call__", judge)
+    monkeypatch.setattr(
+        Optimiser, "step", lambda self, *_: [w.data.add_(1.0) for w in self._weights]
+    )
+    training = trained(settings, short, tmp_path / "out")
+    torch.testing.assert_close(found[3], found[1 if begin == "best" else 2] + 1.0)
+    assert torch.equal(weights(training.corrector), found[1])
+
+
 def test_training_ends_early_when_it_no_longer_helps(short, tmp_path):
     stage = samples.one_step(iterations=50, patience=2, rate={"peak": 1e-12, "last": 1e-12})
     settings = samples.config(stage, validate_every={"iterations": 1})
@@ -798,11 +819,12 @@ def test_one_trajectory_is_learned_by_heart(tmp_path):
     (data / "validation" / "mesh-0000.h5").write_bytes(text)
     architecture = {"preset": "compact", "changes": {"layers": 3, "width": 48}}
     settings = samples.config(
-        samples.one_step(iterations=300, batch=20, rate={"peak": 4e-3}, noise={"tau": 0.03}),
+        samples.one_step(iterations=500, batch=20, rate={"peak": 4e-3}, noise={"tau": 0.03}),
         samples.unrolled(
-            iterations=80, steps=(5, 10, 20), batch=1, through_solver=True, rate={"peak": 5e-4}
+            begin="last", iterations=60, steps=(5, 10, 20), batch=1, through_solver=True,
+            rate={"peak": 6e-4},
         ),
-        corrector=architecture, validate_every={"iterations": 50}, base="best",
+        corrector=architecture, validate_every={"iterations": 520}, base="best",
     )  # fmt: skip
     training = trained(settings, data, tmp_path / "out")
     assert training.progress.best >= 99.9

@@ -164,7 +164,10 @@ class Training:
         if self._validation is None:
             self._keep(shown, {})
         at.next_stage()
-        self._load_best()
+        later = self.config.stages[at.stage : at.stage + 1]
+        last = dict(shown.network.state_dict())
+        weights = last if later and later[0].begin == "last" else self._best
+        self.corrector.network.load_state_dict(weights)
         self._save()
         return True
 
@@ -256,10 +259,6 @@ class Training:
                 training=training, metrics=dict(metrics),
             )  # fmt: skip
             save_model(shown, self.output / MODEL, record=record)
-
-    def _load_best(self) -> None:
-        if self._best:
-            self.corrector.network.load_state_dict(self._best)
 
     def _save(self, optimiser: Optimiser | None = None, source: Source | None = None) -> None:
         """Write the checkpoint; between stages there is no optimiser."""

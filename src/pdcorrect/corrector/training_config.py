@@ -111,13 +111,16 @@ class Every(Strict):
 
 
 class Stage(Strict):
-    """A part of training; Adam starts afresh in each, from the best weights so far.
+    """A part of training; Adam starts afresh in each.
 
     Attributes
     ----------
     kind
         "one-step": on the stored predictions of the base model, without the simulator.
         "unrolled": steps of the hybrid, simulator included.
+    begin
+        From the best weights so far, or from the last ones of the stage before (averaged ones
+        if it had them).
     steps
         Of "unrolled"; several numbers share the stage equally, in order.
     through_solver
@@ -140,6 +143,7 @@ class Stage(Strict):
     """
 
     kind: Literal["one-step", "unrolled"]
+    begin: Literal["best", "last"] = "best"
     steps: Horizon = (1,)
     through_solver: bool = False
     start: Literal["reference", "pool"] = "reference"
