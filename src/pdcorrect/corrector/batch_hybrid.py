@@ -15,10 +15,13 @@ from torch import Tensor, nn
 from pdcorrect.batch.checks import check_nodal, start_times
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.batch.threads import one_thread
 from pdcorrect.corrector.batch_bodies import BatchBodies, check_corrector
+from pdcorrect.corrector.batch_gate import BatchAnswer
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import View
+from pdcorrect.corrector.gate import Gate, Reason, check_gate
 from pdcorrect.corrector.placements import Velocity, check_velocity, moved
 from pdcorrect.errors import InputError
 from pdcorrect.torch_layer import OnFailure, PDLayer
@@ -36,14 +39,22 @@ class BatchHybridResult:
         Zero where it was refused.
     coarse : BatchResult
         Of the coarse solver; with placement "force" under the corrected loads.
-    refused : (B,) bool tensor
-        Whether the plain coarse answer was kept.
+    reasons : (B,) int64 tensor
+        Numbers of `Reason`: why the plain coarse answer was kept; 0 where it was not.
+    factors : (B,) tensor
+        On the network's correction, less than 1 where a gate limited it.
     """
 
     state: BatchState
     correction: Tensor
     coarse: BatchResult
-    refused: Tensor
+    reasons: Tensor
+    factors: Tensor
+
+    @property
+    def refused(self) -> Tensor:
+        """Whether the plain coarse answer was kept, (B,) bool."""
+        return self.reasons > 0
 
 
 class _Hybrid:
@@ -77,8 +88,7 @@ class _Hybrid:
 class BatchHybrid:
     """Steps many scenes and corrects each; no gradients.
 
-    A scene whose correction is exactly zero keeps its coarse step bit for bit, and one whose
-    correction has a NaN or infinity too: it counts as refused.
+    A scene whose correction is exactly zero, or refused, keeps its coarse step bit for bit.
 
     Parameters
     ----------
@@ -88,6 +98,9 @@ class BatchHybrid:
     velocity : {"recomputed", "kept"}
         Of corrected states: what the integrator makes of the corrected positions, by backward
         Euler v = (p - p_before)/h, or the coarse solver's.  For placement "state".
+    gate : Gate, optional
+        What else is refused than corrections that are not finite, and those of scenes whose
+        coarse step fails.
 
     Raises
     ------
@@ -96,10 +109,16 @@ class BatchHybrid:
     """
 
     def __init__(
-        self, stepper: BatchStepper, corrector: Corrector, *, velocity: Velocity = "recomputed"
+        self,
+        stepper: BatchStepper,
+        corrector: Corrector,
+        *,
+        velocity: Velocity = "recomputed",
+        gate: Gate | None = None,
     ) -> None:
         self._hybrid = _Hybrid(stepper, corrector, velocity)
-        self.stepper, self.corrector = stepper, corrector
+        self.stepper, self.corrector, self.gate = stepper, corrector, gate
+        check_gate(gate, corrector)
 
     @property
     def bodies(self) -> BodyGraph:
@@ -129,45 +148,90 @@ class BatchHybrid:
         InputError
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
-        hybrid, nodes = self._hybrid, self._hybrid.nodes
-        if hybrid.placement == "state":
-            return self._correct_state(state, previous)
-        view = hybrid.view(state, None, previous)
-        correction, sound = self._asked(view)
-        if hybrid.placement == "force":
-            coarse = self.stepper(state, nodes.forces(correction))
-        else:
-            changed = nodes.graph.by_node(self._changed(correction))[:, None]
-            guess = torch.where(changed, view.snapshot.proposed + correction, torch.nan)
-            coarse = self.stepper(state, guess=nodes.padded(guess))
-        return BatchHybridResult(coarse.state, correction, coarse, ~sound)
+        correct = {"state": self._state, "force": self._force, "guess": self._guess}
+        with one_thread(self.stepper.device):
+            return correct[self._hybrid.placement](state, previous)
 
-    def _correct_state(self, state: BatchState, previous: Tensor | None) -> BatchHybridResult:
-        hybrid = self._hybrid
-        coarse = self.stepper(state)
-        correction, sound = self._asked(hybrid.view(state, coarse.state.positions, previous))
-        after = hybrid.moved(state, coarse.state, correction)
-        kept = ~self._changed(correction)[:, None, None]
+    def _state(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
+        hybrid, coarse = self._hybrid, self.stepper(before)
+        view = hybrid.view(before, coarse.state.positions, previous)
+        asked, reasons = self._asked(view)
+        reasons = torch.where(self._failed(coarse), int(Reason.SOLVER), reasons)
+        factors = torch.ones_like(self.bodies.cell_size)
+        if self.gate is not None and self.gate.judges:
+            answer = self._answer(before, coarse, view)
+            factors, found = answer.judged(
+                self.gate, lambda x: hybrid.moved(before, coarse.state, self._scaled(asked, x))
+            )
+            factors = factors.to(asked)
+            reasons = self._first(reasons, found, asked)
+        correction = self._scaled(asked, torch.where(reasons == 0, factors, 0.0))
+        after = hybrid.moved(before, coarse.state, correction)
+        changed = self._changed(correction)[:, None, None]
         final = replace(
             after,
-            positions=torch.where(kept, coarse.state.positions, after.positions),
-            velocities=torch.where(kept, coarse.state.velocities, after.velocities),
+            positions=torch.where(changed, after.positions, coarse.state.positions),
+            velocities=torch.where(changed, after.velocities, coarse.state.velocities),
             memory={
-                name: torch.where(kept, coarse.state.memory[name], x)
+                name: torch.where(changed, x, coarse.state.memory[name])
                 for name, x in after.memory.items()
             },
         )
-        return BatchHybridResult(final, correction, coarse, ~sound)
+        return BatchHybridResult(final, correction, coarse, reasons, factors)
+
+    def _force(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
+        view = self._hybrid.view(before, None, previous)
+        asked, reasons = self._asked(view)
+        added = self._hybrid.nodes.forces(asked)
+        coarse = self.stepper(before, added)
+        found = torch.where(self._failed(coarse), int(Reason.SOLVER), 0)
+        if self.gate is not None and self.gate.judges:
+            judged = self._answer(before, coarse, view).judged_as_forced(self.gate, added)
+            found = torch.where(found == 0, judged, found)
+        found = self._first(torch.zeros_like(reasons), found, asked)
+        correction = self._scaled(asked, (found == 0).to(asked))
+        if found.any():
+            coarse = self.stepper(before, self._hybrid.nodes.forces(correction))
+        reasons = torch.where(reasons == 0, found, reasons)
+        factors = torch.ones_like(self.bodies.cell_size)
+        return BatchHybridResult(coarse.state, correction, coarse, reasons, factors)
+
+    def _guess(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
+        view = self._hybrid.view(before, None, previous)
+        correction, reasons = self._asked(view)
+        changed = self.bodies.by_node(self._changed(correction))[:, None]
+        guess = torch.where(changed, view.snapshot.proposed + correction, torch.nan)
+        coarse = self.stepper(before, guess=self.padded(guess))
+        factors = torch.ones_like(self.bodies.cell_size)
+        return BatchHybridResult(coarse.state, correction, coarse, reasons, factors)
 
     def _asked(self, view: View) -> tuple[Tensor, Tensor]:
-        """The network's correction (n, 3), zero in scenes where it is not finite; which are not."""
+        """The network's correction (n, 3), and why scenes' were refused and made zero, (B,)."""
         correction = self.corrector.of_view(view)
         sound = self._hybrid.nodes.sound(correction)
-        return torch.where(view.bodies.by_node(sound)[:, None], correction, 0.0), sound
+        reasons = torch.where(sound, int(Reason.NONE), int(Reason.NOT_FINITE))
+        if self.gate is not None:
+            unknown = sound & self.gate.unknown(self.corrector, view)
+            reasons = torch.where(unknown, int(Reason.FEATURES), reasons)
+        fine = view.bodies.by_node(reasons == 0)[:, None]
+        return torch.where(fine, correction, 0.0), reasons
+
+    def _answer(self, before: BatchState, coarse: BatchResult, view: View) -> BatchAnswer:
+        return BatchAnswer(self.stepper, before, coarse, self.padded(view.snapshot.forces))
+
+    def _failed(self, coarse: BatchResult) -> Tensor:
+        return torch.tensor([not s.ok for s in coarse.statuses], device=self.stepper.device)
+
+    def _first(self, reasons: Tensor, found: Tensor, correction: Tensor) -> Tensor:
+        """Reasons, and those found later of scenes that have none and are corrected at all."""
+        return torch.where((reasons == 0) & self._changed(correction), found, reasons)
+
+    def _scaled(self, correction: Tensor, factors: Tensor) -> Tensor:
+        return correction * self.bodies.by_node(factors.to(correction))[:, None]
 
     def _changed(self, correction: Tensor) -> Tensor:
         """Whether a scene has a correction that is not zero, (B,)."""
-        return self.bodies.node_sums((correction != 0.0).any(dim=1).to(correction.dtype)) > 0.0
+        return self.bodies.node_sums((correction != 0.0).any(dim=1).to(correction)) > 0.0
 
 
 class HybridLayer(nn.Module):

@@ -165,9 +165,10 @@ class Training:
             self._keep(shown, {})
         at.next_stage()
         later = self.config.stages[at.stage : at.stage + 1]
-        last = dict(shown.network.state_dict())
-        weights = last if later and later[0].begin == "last" else self._best
-        self.corrector.network.load_state_dict(weights)
+        goes_on = bool(later) and later[0].begin == "last"
+        self.corrector.network.load_state_dict(
+            shown.network.state_dict() if goes_on else self._best
+        )
         self._save()
         return True
 
@@ -216,10 +217,7 @@ class Training:
         scores = self._validation(shown)
         at.passed(self._tick())
         at.validated = at.now()
-        metrics = {
-            "omega_mean": scores.mean, "omega_median": scores.median, "omega_least": scores.least,
-            "failed_rollouts": float(scores.failed),
-        }  # fmt: skip
+        metrics = scores.metrics()
         self._tell(**metrics)
         value = metrics[f"omega_{self.config.select}"]
         at.stale += 1
@@ -283,9 +281,7 @@ class Training:
         if not path.exists():
             return None
         if not resume:
-            raise InputError(
-                f"{path}: there is a training already: expected --resume, or another folder."
-            )
+            raise InputError(f"{path}: a training: expected --resume, or another folder.")
         content, tensors = read_checkpoint(path)
         check_same(content["identity"], self._identity, str(path))
         return content, tensors

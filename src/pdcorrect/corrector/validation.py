@@ -52,6 +52,13 @@ class Scores:
         """Per cent."""
         return float(self.omegas.min())
 
+    def metrics(self) -> dict[str, float]:
+        """By name, for tables and files."""
+        return {
+            "omega_mean": self.mean, "omega_median": self.median, "omega_least": self.least,
+            "failed_rollouts": float(self.failed),
+        }  # fmt: skip
+
 
 class Validation:
     """Rollouts of recorded simulations over all their frames, all together.

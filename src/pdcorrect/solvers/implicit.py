@@ -131,8 +131,8 @@ class ImplicitStepper:
             For this step only, s; a new value is factorised and kept.
         guess : (N, 3), optional
             Positions after the step from which the minimisation begins, m; clamped components
-            do not count.  A good one saves iterations, a bad one costs some; where gamma has
-            several minima it may lead to another of them.
+            do not count.  A good one saves iterations, a bad one costs some, and one that leads
+            nowhere is left; where gamma has several minima it may lead to another of them.
 
         Raises
         ------
@@ -168,6 +168,8 @@ class ImplicitStepper:
     ) -> StepResult:
         effort = _Effort()
         outcome = self._attempt(state, forces, h, effort, self.integrate, guess)
+        if guess is not None and not outcome.minimum.status.ok:
+            outcome = self._attempt(state, forces, h, effort, self.integrate)
         if not outcome.minimum.status.ok and self._recover:
             outcome = self._substeps(state, forces, h, effort) or outcome
         if h != self.time_step:

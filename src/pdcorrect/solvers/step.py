@@ -314,7 +314,7 @@ def nodal_array(problem: Problem, name: str, values: Array) -> Array:
     InputError
         That names the node.
     """
-    if not isinstance(values, (np.ndarray, Sequence)):
+    if isinstance(values, str) or not isinstance(values, (np.ndarray, Sequence)):
         raise InputError(
             f"{name} is a {type(values).__name__}: expected an array of shape "
             f"{problem.positions.shape}."

@@ -1,0 +1,685 @@
+"""Corrected steps: what they are made of, and what must not change."""
+
+import numpy as np
+import pytest
+import torch
+
+import pdcorrect as pc
+from conftest import box_mesh, disturbed, held, problem_on, rotation
+from hybrid_samples import (
+    PLACEMENTS,
+    PRESSURE,
+    TORSION,
+    Prescribed,
+    fitted,
+    prescribed,
+    problems,
+    silent,
+    soft_beam,
+)
+from pdcorrect.corrector.batch_bodies import BatchBodies, external_forces
+from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+from pdcorrect.corrector.config import preset
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.gate import Gate, Reason, refusals
+from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
+from pdcorrect.errors import InputError
+from pdcorrect.fem.mesh import HexMesh
+from pdcorrect.solvers.resume import check_same_run
+
+CELL = 0.02
+OPEN = Gate(margin=None, volume=None, energy=None)
+
+
+def same(a, b):
+    return np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)
+
+
+def bumped(problem, size=0.1, seed=0):
+    """A displacement of some cells, (N, 3), zero where clamped."""
+    return disturbed(problem, size, seed) - problem.positions
+
+
+def shaken(problem, speed=0.3, seed=1):
+    """At rest positions, but in motion."""
+    velocities = speed * np.random.default_rng(seed).normal(size=problem.positions.shape)
+    return pc.State(problem.positions, velocities * problem.free)
+
+
+# --- no correction, no change ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("kind", [pc.ProjectiveDynamics, pc.Newton])
+def test_a_network_that_gives_nothing_leaves_the_coarse_rollout_bit_for_bit(
+    placement, element, kind
+):
+    problem = pc.discretise(soft_beam(solver={"element": element}, loads=[TORSION]))
+    corrector = silent(fitted([problem], placement=placement))
+    run = pc.rollout(HybridStepper(kind(problem), corrector, gate=Gate()), 4)
+    plain = pc.rollout(kind(problem), 4)
+    assert same(run, plain)
+    assert not run.stats["refused"].any()
+    for name in plain.stats:
+        if name != "seconds":
+            assert np.array_equal(run.stats[name], plain.stats[name]), name
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    stepper = pc.BatchStepper(scenes)
+    hybrid = BatchHybrid(stepper, silent(fitted(scenes, placement=placement)), gate=Gate())
+    state = plain = stepper.rest_state()
+    for _ in range(3):
+        state, plain = hybrid(state).state, stepper(plain).state
+        assert torch.equal(state.positions, plain.positions)
+        assert torch.equal(state.velocities, plain.velocities)
+
+
+# --- one scene and many ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_scenes_of_a_batch_are_corrected_as_each_alone(placement, element):
+    scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
+    features = (*preset("compact").node_features, "previous-correction")
+    corrector = fitted(scenes, placement=placement, node_features=features)
+    gate = Gate(margin=None)
+    stepper = pc.BatchStepper(scenes, 1e-12)
+    many = BatchHybrid(stepper, corrector, gate=gate)
+    alone = [HybridStepper(pc.ProjectiveDynamics(p, 1e-12), corrector, gate=gate) for p in scenes]
+    state, states, previous = stepper.rest_state(), [p.rest_state() for p in scenes], None
+    for _ in range(4):
+        result = many(state, previous)
+        state, previous = result.state, result.correction
+        states = [one(s).state for one, s in zip(alone, states, strict=True)]
+        assert result.correction.abs().max() > 1e-5 * CELL
+        for found, expected in zip(stepper.states(state), states, strict=True):
+            size = np.abs(expected.positions - scenes[0].positions.min()).max()
+            assert np.abs(found.positions - expected.positions).max() < 1e-9 * size
+            speed = np.abs(expected.velocities).max()
+            assert np.abs(found.velocities - expected.velocities).max() < 1e-9 * speed
+
+
+def test_padding_and_flat_order_are_inverse():
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    stepper = pc.BatchStepper(scenes)
+    nodes = BatchBodies(stepper)
+    x = torch.arange(3.0 * len(nodes.graph.rest), dtype=torch.float64).reshape(-1, 3)
+    assert torch.equal(nodes.flat(nodes.padded(x)), x)
+    assert not nodes.padded(x)[~stepper.node_mask].any()
+    assert torch.equal(nodes.flat(stepper.rest_state().positions), nodes.graph.rest)
+
+
+@pytest.mark.parametrize("load", [TORSION, PRESSURE, {**TORSION, "window": [0.0, 0.015]}])
+def test_the_network_is_told_all_loads_of_the_step(load):
+    problem = pc.discretise(soft_beam(loads=[load]))
+    stepper = pc.BatchStepper([problem])
+    state = pc.State(disturbed(problem, 0.05), shaken(problem).velocities, 0.01)
+    ahead = state.positions + 0.01 * state.velocities
+    expected = problem.external_forces(0.01, 0.02, ahead)
+    found = external_forces(stepper, stepper.state([state]))[0].numpy()
+    assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+# --- placements ------------------------------------------------------------------------------
+
+
+def test_recomputed_velocities_are_the_way_over_the_step():
+    problem = pc.discretise(soft_beam())
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), prescribed(problem, bumped(problem)))
+    before = shaken(problem)
+    after = stepper(before).state
+    expected = (after.positions - before.positions) / problem.time_step
+    assert np.allclose(after.velocities, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+    assert np.abs(after.positions - stepper.coarse(before).state.positions).max() > 1e-2 * CELL
+
+
+def test_kept_velocities_are_the_coarse_solver_s():
+    problem = pc.discretise(soft_beam())
+    corrector = prescribed(problem, bumped(problem))
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector, velocity="kept")
+    before = shaken(problem)
+    found, coarse = stepper(before).state, stepper.coarse(before).state
+    assert np.array_equal(found.velocities, coarse.velocities)
+    assert np.allclose(found.positions - coarse.positions, corrector.answer, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint", "generalised-alpha", "quasi-static"])
+def test_every_integrator_goes_on_as_if_it_had_found_the_corrected_positions(integrator):
+    problem = pc.discretise(soft_beam())
+    corrector = prescribed(problem, bumped(problem))
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem, integrator=integrator), corrector)
+    first = stepper.coarse(shaken(problem)).state
+    before = stepper.coarse(first).state
+    after, h = stepper(before).state, problem.time_step
+    p, v, q, w = before.positions, before.velocities, after.positions, after.velocities
+    if integrator == "bdf2":
+        expected = (3 * q - 4 * p + first.positions) / (2 * h)
+        assert np.array_equal(after.memory["previous_positions"], p)
+    elif integrator == "midpoint":
+        expected = 2 * (q - p) / h - v
+    elif integrator == "quasi-static":
+        expected = np.zeros_like(p)
+    else:
+        r = problem.scene.time.spectral_radius
+        alpha_m, alpha_f = (2 * r - 1) / (r + 1), r / (r + 1)
+        gamma, beta = 0.5 - alpha_m + alpha_f, 0.25 * (1 - alpha_m + alpha_f) ** 2
+        a, b = before.memory["accelerations"], after.memory["accelerations"]
+        expected = v + h * ((1 - gamma) * a + gamma * b)
+        way = p + h * v + h**2 * ((0.5 - beta) * a + beta * b)
+        assert np.allclose(q, way, rtol=0, atol=1e-9 * CELL)
+    free = problem.free
+    assert np.allclose(w[free], expected[free], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("mass", ["consistent", "lumped"])
+def test_a_force_moves_a_free_body_by_the_correction(mass):
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2), solver={"mass": mass})
+    shift = np.broadcast_to([1e-3, 2e-3, -3e-3], problem.positions.shape)
+    corrector = prescribed(problem, shift, placement="force")
+    before = shaken(problem)
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), corrector)
+    way = stepper(before).state.positions - stepper.coarse(before).state.positions
+    assert np.allclose(way, shift, rtol=0, atol=1e-10)
+
+
+def test_forces_of_the_caller_act_beside_those_of_the_correction():
+    problem = pc.discretise(soft_beam())
+    push = np.full(problem.positions.shape, 1e-3)
+    corrector = prescribed(problem, bumped(problem), placement="force")
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-11), corrector)
+    added = problem.mass[:, None] * corrector.answer / problem.time_step**2
+    expected = stepper.coarse(problem.rest_state(), push + added).state
+    assert np.allclose(stepper(problem.rest_state(), push).state.positions, expected.positions)
+
+
+def test_a_corrected_guess_leads_to_the_coarse_answer():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, bumped(problem), placement="guess")
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-9), corrector)
+    state = plain = problem.rest_state()
+    for _ in range(3):
+        result, expected = stepper(state), stepper.coarse(plain)
+        state, plain = result.state, expected.state
+        assert np.abs(state.positions - plain.positions).max() < 1e-7 * CELL
+        assert result.iterations != expected.iterations
+
+
+@pytest.mark.parametrize("integrator", ["backward-euler", "midpoint", "bdf2"])
+@pytest.mark.parametrize("kind", [pc.ProjectiveDynamics, pc.Newton])
+def test_a_step_that_begins_at_its_answer_ends_at_once(kind, integrator):
+    problem = pc.discretise(soft_beam(loads=[TORSION], time={"integrator": integrator}))
+    stepper = kind(problem, 1e-7)
+    answer = stepper(shaken(problem))
+    again = stepper(shaken(problem), guess=answer.state.positions)
+    assert again.iterations <= 1 < answer.iterations
+    assert np.abs(again.state.positions - answer.state.positions).max() < 1e-6 * CELL
+
+
+def test_a_batch_that_begins_at_its_answer_ends_at_once():
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    stepper = pc.BatchStepper(scenes, 1e-7)
+    answer = stepper(stepper.rest_state())
+    again = stepper(stepper.rest_state(), guess=answer.state.positions)
+    assert (again.iterations <= 1).all()
+    assert (answer.iterations > 1).all()
+    guess = answer.state.positions.clone()
+    guess[1, 3] = torch.nan
+    other = stepper(stepper.rest_state(), guess=guess)
+    assert other.iterations.tolist() == [again.iterations[0], answer.iterations[1]]
+    assert torch.equal(other.state.positions[1], answer.state.positions[1])
+
+
+def test_a_step_recovers_from_an_absurd_guess():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    stepper = pc.ProjectiveDynamics(problem, 1e-8, max_iterations=15)
+    answer = stepper(problem.rest_state())
+    again = stepper(problem.rest_state(), guess=1e12 * (problem.positions[::-1] - 0.01))
+    assert again.status.ok
+    assert np.abs(again.state.positions - answer.state.positions).max() < 1e-6 * CELL
+
+
+@pytest.mark.parametrize(
+    ("guess", "message"),
+    [
+        (np.zeros((3, 3)), "guess has shape"),
+        ("there", "guess is a str"),
+        (np.full((16, 3), np.nan), "guess of node 0"),
+    ],
+)
+def test_a_guess_that_is_none_is_refused(guess, message):
+    problem = pc.discretise(soft_beam())
+    with pytest.raises(InputError, match=message):
+        pc.ProjectiveDynamics(problem)(problem.rest_state(), guess=guess)
+
+
+def test_a_batch_refuses_a_guess_of_another_shape():
+    stepper = pc.BatchStepper(problems((3, 1, 1)))
+    with pytest.raises(InputError, match="guess"):
+        stepper(stepper.rest_state(), guess=torch.zeros(1, 2, 3, dtype=torch.float64))
+
+
+# --- derivatives -----------------------------------------------------------------------------
+
+_TINY = {
+    "node_features": ("load", "previous-correction"),
+    "edge_features": ("stretch",),
+    "layers": 1,
+    "width": 2,
+}
+
+
+class Unrolled:
+    """A loss over four corrected steps from a bent shape, by the network's weights."""
+
+    def __init__(self, placement, through_solver, cells=((2, 1, 1),)):
+        scenes = [
+            pc.discretise(
+                soft_beam(c, loads=[TORSION, PRESSURE, {**PRESSURE, "window": [0, 0.02]}])
+            )
+            for c in cells
+        ]
+        self.corrector = fitted(scenes, placement=placement, **_TINY)
+        self.stepper = pc.BatchStepper(scenes, 1e-13)
+        self.layer = HybridLayer(self.stepper, self.corrector, through_solver=through_solver)
+        self.layer.steps.tolerance = 1e-10
+        self.start = self.stepper.rest_state()
+        self.through, self.frames = through_solver, []
+
+    def __call__(self, frames=None):
+        """The loss; each step from its given frame where there are such."""
+        p, v, d = self.start.positions, self.start.velocities, None
+        total, rest = 0.0, self.start.positions
+        self.frames = []
+        for k in range(4):
+            if frames is not None:
+                p, v, d = frames[k]
+            self.frames.append((p, v, d))
+            times = [k * self.stepper.time_step] * len(self.stepper.problems)
+            p, v, d = self.layer(p, v, times, d)
+            total = total + ((p - rest) / CELL).square().sum() + (d / CELL).square().sum()
+        return total
+
+
+@pytest.mark.parametrize(
+    ("placement", "through_solver"), [("state", True), ("state", False), ("force", True)]
+)
+def test_derivatives_by_every_weight_are_difference_quotients(placement, through_solver):
+    unrolled = Unrolled(placement, through_solver)
+    unrolled().backward()
+    given = None
+    if not through_solver:
+        given = [tuple(None if x is None else x.detach() for x in f) for f in unrolled.frames]
+    step, largest = 1e-6, 0.0
+    with torch.no_grad():
+        for name, weights in unrolled.corrector.named_parameters():
+            flat, quotients = weights.view(-1), torch.zeros(weights.numel(), dtype=torch.float64)
+            for i, value in enumerate(flat.tolist()):
+                flat[i] = value + step
+                ahead = unrolled(given)
+                flat[i] = value - step
+                quotients[i] = (ahead - unrolled(given)) / (2 * step)
+                flat[i] = value
+            size = quotients.abs().max()
+            largest = max(largest, float(size))
+            error = (weights.grad.view(-1) - quotients).abs().max()
+            assert error <= 1e-5 * size + 1e-9 * largest, name
+    assert largest > 0.0
+
+
+def test_derivatives_through_the_solver_are_other_ones_than_without():
+    both = [Unrolled("state", through) for through in (True, False)]
+    for unrolled in both:
+        unrolled().backward()
+    a, b = (u.corrector.network.decoder[-1].weight.grad for u in both)
+    assert (a - b).abs().max() > 1e-3 * a.abs().max()
+
+
+def test_the_layer_takes_the_steps_of_the_hybrid():
+    unrolled = Unrolled("state", True, ((2, 1, 1), (2, 2, 1)))
+    hybrid = BatchHybrid(unrolled.stepper, unrolled.corrector)
+    result, previous, state = None, None, unrolled.start
+    p, v, d = state.positions, state.velocities, None
+    for k in range(3):
+        result = hybrid(state, previous)
+        p, v, d = unrolled.layer(p, v, state.times, d)
+        state, previous = result.state, result.correction
+        assert torch.allclose(p, state.positions, rtol=0, atol=1e-12 * CELL), k
+        assert torch.allclose(v, state.velocities, rtol=0, atol=1e-12)
+    assert d.requires_grad
+    assert not result.correction.requires_grad
+
+
+# --- memory ----------------------------------------------------------------------------------
+
+
+def test_a_run_goes_on_from_its_file_with_the_correction_before(tmp_path):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = fitted([problem], **_TINY)
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    whole = pc.rollout(stepper, 5)
+    pc.save_trajectory(pc.rollout(stepper, 3), tmp_path / "run.h5")
+    read = pc.load_trajectory(tmp_path / "run.h5")
+    check_same_run(stepper, read)
+    rest = pc.rollout(stepper, 2, state=read.state(-1))
+    assert np.array_equal(rest.positions[-1], whole.positions[-1])
+    forgetful = pc.State(read.positions[-1], read.velocities[-1], read.times[-1])
+    other = pc.rollout(stepper, 2, state=forgetful)
+    assert not np.array_equal(other.positions[-1], whole.positions[-1])
+
+
+def test_only_networks_that_ask_for_the_correction_before_remember_it():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    for features, expected in ((preset("compact").node_features, set()), (None, {MEMORY})):
+        changes = _TINY if features is None else {"node_features": features}
+        stepper = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem], **changes))
+        assert set(stepper(problem.rest_state()).state.memory) == expected
+
+
+def test_the_correction_before_is_no_memory_of_the_integrator():
+    problem = pc.discretise(soft_beam(time={"integrator": "generalised-alpha"}))
+    corrector = fitted([problem], **_TINY)
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), silent(corrector))
+    state = pc.State(
+        shaken(problem).positions, shaken(problem).velocities, memory={MEMORY: bumped(problem)}
+    )
+    assert same(stepper(state).state, stepper.coarse(shaken(problem)).state)
+
+
+def test_a_run_is_not_continued_with_other_weights():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    run = pc.rollout(HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem])), 1)
+    other = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem], seed=1))
+    with pytest.raises(InputError, match="corrector was"):
+        check_same_run(other, run)
+
+
+# --- refusals --------------------------------------------------------------------------------
+
+
+def folded(problem):
+    """A correction that turns a cell inside out."""
+    answer = np.zeros_like(problem.positions)
+    end = np.argmax(problem.positions.sum(axis=1))
+    answer[end] = [-1.5 * CELL, 0.0, 0.0]
+    return answer
+
+
+def wild(problem):
+    """One without inverted cells, but with far more energy than the step has."""
+    stretch = np.zeros_like(problem.positions)
+    stretch[:, 0] = 0.5 * problem.positions[:, 0]
+    return stretch * problem.free
+
+
+def strange(problem):
+    """Forces far outside what the network has seen, and so its inputs."""
+    return np.random.default_rng(0).normal(size=problem.positions.shape) * 0.5
+
+
+CASES = {
+    Reason.NOT_FINITE: (OPEN, lambda p: np.full(p.positions.shape, np.nan), False),
+    Reason.FEATURES: (Gate(volume=None, energy=None), lambda p: 0.01 * bumped(p), True),
+    Reason.INVERSION: (Gate(margin=None, energy=None), folded, False),
+    Reason.ENERGY: (Gate(margin=None, volume=None), wild, False),
+}
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize("reason", CASES)
+def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason, placement):
+    gate, answer, pushed = CASES[reason]
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    correction = answer(problem)
+    if placement == "force" and reason in (Reason.INVERSION, Reason.ENERGY):
+        correction = 20.0 * correction  # the body resists
+    corrector = prescribed(problem, correction, placement=placement)
+    coarse = pc.ProjectiveDynamics(problem)
+    stepper = HybridStepper(coarse, corrector, gate=gate)
+    push = strange(problem) if pushed else None
+    found, plain = stepper(problem.rest_state(), push), coarse(problem.rest_state(), push)
+    assert found.stats["gate"] == reason
+    assert found.stats["refused"] == 1.0
+    assert found.stats["correction"] == 0.0
+    assert same(found.state, plain.state)
+    if reason is not Reason.NOT_FINITE:
+        open_ = HybridStepper(coarse, corrector, gate=OPEN)(problem.rest_state(), push)
+        assert open_.stats["refused"] == 0.0
+        assert not same(open_.state, plain.state)
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize("reason", [Reason.NOT_FINITE, Reason.INVERSION, Reason.ENERGY])
+def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason, placement):
+    gate, answer, _ = CASES[reason]
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, kind=Prescribed, placement=placement)
+    factor = 20.0 if placement == "force" else 1.0
+    small = 1e-4 * bumped(scenes[1])
+    corrector.answer = np.concatenate([factor * answer(scenes[0]), small])
+    stepper = pc.BatchStepper(scenes)
+    result = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+    plain = stepper(stepper.rest_state())
+    assert result.reasons.tolist() == [reason, 0]
+    assert result.refused.tolist() == [True, False]
+    assert torch.equal(result.state.positions[0], plain.state.positions[0])
+    assert torch.equal(result.state.velocities[0], plain.state.velocities[0])
+    assert not torch.equal(result.state.positions[1], plain.state.positions[1])
+    assert torch.isfinite(result.state.positions).all()
+    assert torch.isfinite(result.correction).all()
+    first = len(scenes[0].positions)
+    assert not result.correction[:first].any()
+    assert result.correction[first:].any()
+
+
+def test_inputs_unlike_the_training_data_are_refused_in_a_batch():
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes)
+    stepper = pc.BatchStepper(scenes)
+    states = [pc.State(disturbed(scenes[0], 0.3), shaken(scenes[0], 5.0).velocities)]
+    state = stepper.state([*states, scenes[1].rest_state()])
+    result = BatchHybrid(stepper, corrector, gate=Gate(volume=None, energy=None))(state)
+    assert result.reasons.tolist() == [Reason.FEATURES, 0]
+    wide = BatchHybrid(stepper, corrector, gate=Gate(margin=1e9, volume=None, energy=None))
+    assert wide(state).reasons.tolist() == [0, 0]
+
+
+def test_a_gate_lets_pass_what_it_has_no_objection_to():
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes)
+    stepper = pc.BatchStepper(scenes)
+    result = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
+    assert result.reasons.tolist() == [0, 0]
+    assert result.correction.any()
+
+
+def test_a_limited_correction_is_scaled_back_until_it_passes():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, folded(problem))
+    gate = Gate(margin=None, energy=None, limit=True)
+    coarse = pc.ProjectiveDynamics(problem)
+    result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
+    factor = result.stats["correction_factor"]
+    assert result.stats["refused"] == 0.0
+    assert factor in (0.5, 0.25, 0.125)
+    assert result.stats["smallest_volume_ratio"] > 0.0
+    way = result.state.positions - coarse(problem.rest_state()).state.positions
+    assert np.allclose(way, factor * corrector.answer, rtol=0, atol=1e-15)
+    stepper = pc.BatchStepper([problem])
+    many = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+    assert many.factors.tolist() == [factor]
+    assert many.reasons.tolist() == [0]
+
+
+def test_a_limit_that_does_not_suffice_refuses():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, 1e4 * folded(problem))
+    gate = Gate(margin=None, energy=None, limit=True)
+    coarse = pc.ProjectiveDynamics(problem)
+    result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
+    assert result.stats["gate"] == Reason.INVERSION
+    assert same(result.state, coarse(problem.rest_state()).state)
+
+
+def test_a_correction_may_improve_what_the_coarse_step_inverted():
+    problem = pc.discretise(soft_beam(loads=[]))
+    bad = pc.State(problem.positions + folded(problem), np.zeros_like(problem.positions))
+    coarse = pc.ProjectiveDynamics(problem)
+    answer = coarse(bad).state.positions
+    corrector = prescribed(problem, 0.5 * (problem.positions - answer))
+    ratio = problem.volume_ratios(answer).min()
+    gate = Gate(margin=None, energy=None, volume=float(ratio) + 10.0)
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["refused"] == 0.0
+    corrector.answer = -corrector.answer
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["gate"] == Reason.INVERSION
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_failed_coarse_step_is_not_corrected(placement):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, bumped(problem), placement=placement)
+    coarse = pc.ProjectiveDynamics(problem, 1e-13, max_iterations=1, recover=False)
+    result, plain = (s(shaken(problem)) for s in (HybridStepper(coarse, corrector), coarse))
+    assert not plain.status.ok
+    assert result.status is plain.status
+    assert same(result.state, plain.state)
+    if placement != "guess":
+        assert result.stats["gate"] == Reason.SOLVER
+
+
+def test_refusals_are_counted_by_reason():
+    assert refusals(np.array([0.0, 1.0, 3.0, 3.0, 0.0])) == {
+        "not finite": 1, "features": 0, "inversion": 2, "energy": 0, "solver": 0,
+    }  # fmt: skip
+
+
+# --- statistics ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+def test_energies_are_those_of_the_corrected_state(element):
+    problem = pc.discretise(soft_beam(solver={"element": element}))
+    corrector = prescribed(problem, bumped(problem))
+    result = HybridStepper(pc.ProjectiveDynamics(problem), corrector)(shaken(problem))
+    state, stats = result.state, result.stats
+    assert stats["elastic_energy"] == pytest.approx(problem.energy(state.positions), rel=1e-12)
+    kinetic = 0.5 * np.vdot(state.velocities, problem.mass_times(state.velocities))
+    assert stats["kinetic_energy"] == pytest.approx(kinetic, rel=1e-12)
+    way = state.positions - problem.positions
+    work = np.vdot(problem.external_forces(0.0, 0.01), way)
+    assert stats["external_work"] == pytest.approx(work, rel=1e-9)
+    assert stats["smallest_volume_ratio"] == problem.volume_ratios(state.positions).min()
+    assert stats["correction"] == np.linalg.norm(corrector.answer, axis=1).max()
+
+
+def test_a_state_that_the_correction_inverts_is_called_so():
+    problem = pc.discretise(soft_beam())
+    corrector = prescribed(problem, folded(problem))
+    result = HybridStepper(pc.ProjectiveDynamics(problem), corrector)(problem.rest_state())
+    assert result.status is pc.Status.INVERTED
+
+
+# --- turning the scene -----------------------------------------------------------------------
+
+
+def block(turn):
+    """A distorted block, held at one side, in some orientation."""
+    mesh = box_mesh((3, 2, 1), (0.06, 0.04, 0.02), 0.2)
+    gravity = {"kind": "gravity", "acceleration": [float(x) for x in turn @ [3.0, -5.0, 8.0]]}
+    turned = HexMesh.create(mesh.positions @ turn.T, mesh.cells)
+    problem = problem_on(turned, loads=[gravity], material={"young": 5e4})
+    return held(problem, np.flatnonzero(mesh.positions[:, 0] < 1e-9), problem.positions)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_turned_scene_has_the_turned_rollout(placement):
+    turn = rotation()
+    straight, turned = block(np.eye(3)), block(turn)
+    torch.manual_seed(5)
+    config = preset("equivariant", placement=placement)
+    fit = fitted([straight], size=0.2, placement=placement, layers=3, width=32)
+    corrector = Corrector(config.model_copy(update={"layers": 3, "width": 32, "mlp_layers": 2}))
+    corrector.normaliser.load_state_dict(fit.normaliser.state_dict())
+    runs = [
+        pc.rollout(HybridStepper(pc.ProjectiveDynamics(p, 1e-9), corrector), 5)
+        for p in (straight, turned)
+    ]
+    plain = pc.rollout(pc.ProjectiveDynamics(straight, 1e-9), 5)
+    if placement != "guess":
+        assert np.abs(runs[0].positions - plain.positions).max() > 1e-2 * CELL
+    assert runs[0].stats["correction"].min() > 1e-4 * CELL
+    assert np.abs(runs[0].positions @ turn.T - runs[1].positions).max() < 1e-5 * CELL
+
+
+# --- bad input -------------------------------------------------------------------------------
+
+
+def test_a_corrector_without_statistics_is_refused():
+    problem = pc.discretise(soft_beam())
+    corrector = Corrector(preset("compact"))
+    with pytest.raises(InputError, match="seen no data"):
+        HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    with pytest.raises(InputError, match="seen no data"):
+        BatchHybrid(pc.BatchStepper([problem]), corrector)
+    with pytest.raises(InputError, match="seen no data"):
+        HybridLayer(pc.BatchStepper([problem]), corrector, through_solver=True)
+
+
+def test_cells_with_more_than_eight_nodes_are_refused():
+    problem = pc.discretise(soft_beam(), element="hex27")
+    corrector = fitted([pc.discretise(soft_beam())])
+    with pytest.raises(InputError, match="27 nodes"):
+        HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    with pytest.raises(InputError, match="27 nodes"):
+        BatchHybrid(pc.BatchStepper([problem]), corrector)
+
+
+def test_parts_that_do_not_fit_are_refused():
+    problem = pc.discretise(soft_beam())
+    coarse, stepper = pc.ProjectiveDynamics(problem), pc.BatchStepper([problem])
+    corrector = fitted([problem])
+    with pytest.raises(InputError, match="coarse_stepper is a BatchStepper"):
+        HybridStepper(stepper, corrector)
+    with pytest.raises(InputError, match="stepper is a ProjectiveDynamics"):
+        BatchHybrid(coarse, corrector)
+    with pytest.raises(InputError, match="corrector is a str"):
+        HybridStepper(coarse, "weights.pt")
+    with pytest.raises(InputError, match="gate is a dict"):
+        HybridStepper(coarse, corrector, gate={"margin": 1.0})
+    with pytest.raises(InputError, match="velocity = 'mixed'"):
+        BatchHybrid(stepper, corrector, velocity="mixed")
+    with pytest.raises(InputError, match="limit with placement 'force'"):
+        HybridStepper(coarse, fitted([problem], placement="force"), gate=Gate(limit=True))
+    for hybrid in (HybridStepper, BatchHybrid):
+        part = (pc.ProjectiveDynamics if hybrid is HybridStepper else pc.BatchStepper)(
+            problem if hybrid is HybridStepper else [problem], integrator="bdf2"
+        )
+        with pytest.raises(InputError, match="'kept' with bdf2"):
+            hybrid(part, corrector, velocity="kept")
+
+
+def test_a_correction_before_of_other_bodies_is_refused():
+    problem = pc.discretise(soft_beam())
+    stepper = pc.BatchStepper([problem])
+    hybrid = BatchHybrid(stepper, fitted([problem]))
+    with pytest.raises(InputError, match="previous"):
+        hybrid(stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64))
+
+
+def test_a_state_that_is_none_is_refused():
+    problem = pc.discretise(soft_beam())
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]))
+    with pytest.raises(InputError, match="state is a"):
+        stepper(problem.positions)
+    with pytest.raises(InputError, match="forces has shape"):
+        stepper(problem.rest_state(), np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("changes", [{"margin": -1.0}, {"share": 1.0}, {"energy": float("nan")}])
+def test_a_gate_without_meaning_is_refused(changes):
+    with pytest.raises(ValueError, match=next(iter(changes))):
+        Gate(**changes)
