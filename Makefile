@@ -11,7 +11,7 @@ demo: $(VENV)/view.stamp
 
 demo-learn: $(VENV)/learn.stamp
 	rm -rf demo-learn
-	$(BIN)/pdcorrect train examples/training/tiny.toml --data datasets/tiny -o demo-learn --evaluate evaluation
+	OMP_NUM_THREADS=1 $(BIN)/pdcorrect train examples/training/tiny.toml --data datasets/tiny -o demo-learn --evaluate evaluation
 
 test: $(VENV)/dev.stamp lint
 	$(BIN)/python -m pytest -m "not slow"
