@@ -22,7 +22,7 @@ class Prescribed(Corrector):
     answer = None
 
     def of_view(self, view):
-        found = torch.as_tensor(self.answer).to(view.bodies.rest)
+        found = torch.tensor(self.answer).to(view.bodies.rest)
         return torch.where(view.bodies.free, found, 0.0)
 
 

@@ -269,7 +269,7 @@ _TINY = {
     "node_features": ("load", "previous-correction"),
     "edge_features": ("stretch",),
     "layers": 1,
-    "width": 2,
+    "width": 3,
 }
 
 
@@ -283,7 +283,7 @@ class Unrolled:
             )
             for c in cells
         ]
-        self.corrector = fitted(scenes, placement=placement, **_TINY)
+        self.corrector = fitted(scenes, size=0.5, placement=placement, seed=4, **_TINY)
         self.stepper = pc.BatchStepper(scenes, 1e-13)
         self.layer = HybridLayer(self.stepper, self.corrector, through_solver=through_solver)
         self.layer.steps.tolerance = 1e-10
@@ -305,16 +305,44 @@ class Unrolled:
         return total
 
 
-@pytest.mark.parametrize(
-    ("placement", "through_solver"), [("state", True), ("state", False), ("force", True)]
-)
+CHAINS = [("state", True), ("state", False), ("force", True), ("force", False)]
+
+
+def frozen(unrolled):
+    """The inputs of each step, if they count as given."""
+    if unrolled.layer.through_solver:
+        return None
+    return [tuple(None if x is None else x.detach() for x in frame) for frame in unrolled.frames]
+
+
+@pytest.mark.parametrize(("placement", "through_solver"), CHAINS)
+def test_derivatives_along_ways_through_all_weights_are_difference_quotients(
+    placement, through_solver
+):
+    unrolled = Unrolled(placement, through_solver)
+    unrolled().backward()
+    given, step = frozen(unrolled), 1e-6
+    weights = list(unrolled.corrector.parameters())
+    random = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for _ in range(3):
+            way = [torch.randn(w.shape, generator=random, dtype=w.dtype) for w in weights]
+            expected = sum((w.grad * d).sum() for w, d in zip(weights, way, strict=True))
+            losses = []
+            for shift in (step, -2 * step, step):
+                for w, d in zip(weights, way, strict=True):
+                    w += shift * d
+                losses.append(unrolled(given))
+            quotient = (losses[0] - losses[1]) / (2 * step)
+            assert abs(quotient - expected) < 1e-5 * abs(expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("placement", "through_solver"), CHAINS)
 def test_derivatives_by_every_weight_are_difference_quotients(placement, through_solver):
     unrolled = Unrolled(placement, through_solver)
     unrolled().backward()
-    given = None
-    if not through_solver:
-        given = [tuple(None if x is None else x.detach() for x in f) for f in unrolled.frames]
-    step, largest = 1e-6, 0.0
+    given, step, found = frozen(unrolled), 1e-5, {}
     with torch.no_grad():
         for name, weights in unrolled.corrector.named_parameters():
             flat, quotients = weights.view(-1), torch.zeros(weights.numel(), dtype=torch.float64)
@@ -324,11 +352,12 @@ def test_derivatives_by_every_weight_are_difference_quotients(placement, through
                 flat[i] = value - step
                 quotients[i] = (ahead - unrolled(given)) / (2 * step)
                 flat[i] = value
-            size = quotients.abs().max()
-            largest = max(largest, float(size))
-            error = (weights.grad.view(-1) - quotients).abs().max()
-            assert error <= 1e-5 * size + 1e-9 * largest, name
-    assert largest > 0.0
+            found[name] = quotients, weights.grad.view(-1)
+    largest = max(q.abs().max() for q, _ in found.values())
+    for name, (quotients, grad) in found.items():
+        error = (grad - quotients).abs().max()
+        assert error <= 1e-5 * quotients.abs().max() + 1e-8 * largest, name
+    assert sum(int((q != 0.0).sum()) for q, _ in found.values()) > 100
 
 
 def test_derivatives_through_the_solver_are_other_ones_than_without():
@@ -359,10 +388,10 @@ def test_the_layer_takes_the_steps_of_the_hybrid():
 
 def test_a_run_goes_on_from_its_file_with_the_correction_before(tmp_path):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    corrector = fitted([problem], **_TINY)
+    corrector = fitted([problem], seed=1, **_TINY)
     stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
     whole = pc.rollout(stepper, 5)
-    pc.save_trajectory(pc.rollout(stepper, 3), tmp_path / "run.h5")
+    pc.save_trajectory(tmp_path / "run.h5", pc.rollout(stepper, 3))
     read = pc.load_trajectory(tmp_path / "run.h5")
     check_same_run(stepper, read)
     rest = pc.rollout(stepper, 2, state=read.state(-1))
@@ -382,7 +411,7 @@ def test_only_networks_that_ask_for_the_correction_before_remember_it():
 
 def test_the_correction_before_is_no_memory_of_the_integrator():
     problem = pc.discretise(soft_beam(time={"integrator": "generalised-alpha"}))
-    corrector = fitted([problem], **_TINY)
+    corrector = fitted([pc.discretise(soft_beam())], **_TINY)
     stepper = HybridStepper(pc.ProjectiveDynamics(problem), silent(corrector))
     state = pc.State(
         shaken(problem).positions, shaken(problem).velocities, memory={MEMORY: bumped(problem)}
@@ -402,11 +431,9 @@ def test_a_run_is_not_continued_with_other_weights():
 
 
 def folded(problem):
-    """A correction that turns a cell inside out."""
-    answer = np.zeros_like(problem.positions)
-    end = np.argmax(problem.positions.sum(axis=1))
-    answer[end] = [-1.5 * CELL, 0.0, 0.0]
-    return answer
+    """A correction that pushes the end of the beam through its last cells."""
+    x = problem.positions[:, 0]
+    return np.outer(np.isclose(x, x.max()), [-1.5 * CELL, 0.0, 0.0])
 
 
 def wild(problem):
@@ -436,7 +463,7 @@ def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason, plac
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     correction = answer(problem)
     if placement == "force" and reason in (Reason.INVERSION, Reason.ENERGY):
-        correction = 20.0 * correction  # the body resists
+        correction = 100.0 * correction  # the body resists
     corrector = prescribed(problem, correction, placement=placement)
     coarse = pc.ProjectiveDynamics(problem)
     stepper = HybridStepper(coarse, corrector, gate=gate)
@@ -458,7 +485,7 @@ def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason, plac
     gate, answer, _ = CASES[reason]
     scenes = problems((3, 1, 1), (2, 2, 1))
     corrector = fitted(scenes, kind=Prescribed, placement=placement)
-    factor = 20.0 if placement == "force" else 1.0
+    factor = 100.0 if placement == "force" else 1.0
     small = 1e-4 * bumped(scenes[1])
     corrector.answer = np.concatenate([factor * answer(scenes[0]), small])
     stepper = pc.BatchStepper(scenes)
@@ -610,7 +637,7 @@ def test_a_turned_scene_has_the_turned_rollout(placement):
     ]
     plain = pc.rollout(pc.ProjectiveDynamics(straight, 1e-9), 5)
     if placement != "guess":
-        assert np.abs(runs[0].positions - plain.positions).max() > 1e-2 * CELL
+        assert np.abs(runs[0].positions - plain.positions).max() > 1e-3 * CELL
     assert runs[0].stats["correction"].min() > 1e-4 * CELL
     assert np.abs(runs[0].positions @ turn.T - runs[1].positions).max() < 1e-5 * CELL
 

@@ -38,6 +38,10 @@ _HOME = {
     "Corrector": "pdcorrect.corrector.corrector",
     "load_model": "pdcorrect.corrector.model_io",
     "save_model": "pdcorrect.corrector.model_io",
+    "HybridStepper": "pdcorrect.corrector.hybrid",
+    "BatchHybrid": "pdcorrect.corrector.batch_hybrid",
+    "HybridLayer": "pdcorrect.corrector.batch_hybrid",
+    "Gate": "pdcorrect.corrector.gate",
     "rollout": "pdcorrect.solvers.rollout",
     "march": "pdcorrect.solvers.rollout",
     "restrict": "pdcorrect.solvers.rollout",
@@ -51,6 +55,7 @@ _HOME = {
 }
 _NEEDS_TORCH = (
     "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "load_model", "save_model",
+    "HybridStepper", "BatchHybrid", "HybridLayer", "Gate",
 )  # fmt: skip
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
@@ -75,6 +80,10 @@ __all__ = [  # noqa: RUF022
     "Corrector",
     "load_model",
     "save_model",
+    "HybridStepper",
+    "BatchHybrid",
+    "HybridLayer",
+    "Gate",
     "rollout",
     "march",
     "restrict",
@@ -97,7 +106,10 @@ if TYPE_CHECKING:
     from pdcorrect import errors, evaluate, figures, metrics, report
     from pdcorrect.batch.adjoint import BatchGradients
     from pdcorrect.batch.stepper import BatchStepper
+    from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
     from pdcorrect.corrector.corrector import Corrector
+    from pdcorrect.corrector.gate import Gate
+    from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.evaluate import compare
     from pdcorrect.fem.modes import modes
