@@ -4,10 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-slow lint docs bench clean
+.PHONY: demo demo-learn test test-slow lint docs bench clean
 
 demo: $(VENV)/view.stamp
 	$(BIN)/pdcorrect compare examples/twisted_cross.toml -o demo
+
+demo-learn: $(VENV)/learn.stamp
+	rm -rf demo-learn
+	OMP_NUM_THREADS=1 $(BIN)/pdcorrect train examples/training/tiny.toml --data datasets/tiny -o demo-learn --evaluate evaluation
 
 test: $(VENV)/dev.stamp lint
 	$(BIN)/python -m pytest -m "not slow"
@@ -27,7 +31,7 @@ bench: $(VENV)/dev.stamp
 	$(BIN)/python benchmarks/run.py
 
 clean:
-	rm -rf $(VENV) demo docs/_build
+	rm -rf $(VENV) demo demo-learn docs/_build
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
@@ -36,6 +40,10 @@ $(VENV)/view.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[view]"
 	@touch $@
 
+$(VENV)/learn.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) -e ".[learn]"
+	@touch $@
+
 $(VENV)/dev.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[view,learn,cluster,dev]"
-	@touch $(VENV)/view.stamp $@
+	@touch $(VENV)/view.stamp $(VENV)/learn.stamp $@

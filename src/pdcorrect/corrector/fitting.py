@@ -1,0 +1,49 @@
+"""Fits a corrector's normalisation to the training split."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from pdcorrect.corrector import features
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
+from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.corrector.windows import StepWindows
+
+_AT_ONCE = 32
+"""Windows."""
+
+
+@torch.no_grad()
+def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: int = 0) -> None:
+    """Set means, deviations, ranges and the output's scale from windows of one step.
+
+    Inputs are what the network sees in a step from the reference, targets what it should
+    give there, on free components.
+
+    Parameters
+    ----------
+    corrector : Corrector
+    windows : StepWindows
+        Of the training split.
+    most : int
+        Windows; if there are more, so many are drawn without replacement by ``seed``.
+    """
+    count = len(windows.dataset)
+    chosen = np.arange(count)
+    if count > most:
+        chosen = np.sort(np.random.default_rng((seed, 1)).choice(count, most, replace=False))
+    config = corrector.config
+    moments = {name: Moments() for name in (*config.node_features, *config.edge_features)}
+    target = Moments()
+    for first in range(0, len(chosen), _AT_ONCE):
+        batch = windows.batch(chosen[first : first + _AT_ONCE].tolist())
+        view = View(batch.bodies, batch.snapshot)
+        found = features.values(NODE_FEATURES, config.node_features, view)
+        found |= features.values(EDGE_FEATURES, config.edge_features, view)
+        for name, values in found.items():
+            moments[name].add(values)
+        wanted = corrector.target(view, batch.target)
+        target.add(wanted[batch.bodies.free.all(dim=1)].reshape(-1, 1))
+    corrector.normaliser.fit(moments, target)

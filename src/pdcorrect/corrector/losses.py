@@ -1,0 +1,82 @@
+"""What training minimises, and how large the base model's own errors are.
+
+With the base model's error d1 = mean over steps and nodes of the squared distance between
+its single steps from the reference and the reference, and D that of its free rollout (both
+m2, of one trajectory), the "relative" loss of a frame that is j steps away from the
+reference is the mean over the body's nodes of the squared distance over
+
+    d(j) = min((j (j + 1) / 2)^2 d1, D),        d(1) = d1.
+
+The factor is how far j equal one-step errors carry: each of them is an error e of the
+positions and so e / h of the velocities, and j of them in the same direction add up to
+e (1 + 2 + ... + j) where nothing holds the body back.  The base model itself has a loss of
+about one, whether a trajectory moves by metres or trembles by micrometres.
+
+The "absolute" loss (thesis, eq. 5-3) sums over a body's nodes distances, or their squares,
+of positions in units of 1 / 1000 m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pdcorrect.corrector.training_config import Loss
+
+LEAST_ERROR = 1e-30
+"""d1 and D count as at least this, m2."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseErrors:
+    """Mean squared errors of the base model, m2, one a trajectory, (B,).
+
+    Attributes
+    ----------
+    one_step : (B,)
+        d1.
+    rollout : (B,)
+        D.
+    """
+
+    one_step: Tensor
+    rollout: Tensor
+
+    def after(self, steps: Tensor | int) -> Tensor:
+        """d(j) for j steps, one number or (B,)."""
+        factor = (steps * (steps + 1) / 2) ** 2
+        return torch.minimum(factor * self.one_step, torch.maximum(self.rollout, self.one_step))
+
+
+def body_losses(
+    loss: Loss, errors: Tensor, total: Callable[[Tensor], Tensor], counts: Tensor, scale: Tensor
+) -> Tensor:
+    """The loss of each body, (B,).
+
+    Parameters
+    ----------
+    loss : Loss
+    errors : (..., 3)
+        Distances at nodes, m.
+    total : callable
+        Sums of values (...) over the nodes of each body, (B,).
+    counts : (B,)
+        Nodes of each body.
+    scale : (B,)
+        d(j), m2.
+    """
+    if loss.kind == "relative":
+        return total(errors.square().sum(dim=-1)) / (counts * scale)
+    errors = loss.scale * errors
+    if loss.power == 1:
+        return total(torch.linalg.vector_norm(errors, dim=-1))
+    return total(errors.square().sum(dim=-1))
+
+
+def mean_of(values: Tensor, chosen: Tensor) -> Tensor:
+    """Mean of the chosen values; zero, with a zero gradient, where none is chosen."""
+    kept = torch.where(chosen, values, 0.0)
+    return kept.sum() / chosen.sum().clamp_min(1)

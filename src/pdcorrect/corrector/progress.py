@@ -1,0 +1,100 @@
+"""`Progress`: where a training is; plain numbers, which checkpoints hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from pdcorrect.corrector.training_config import Every
+from pdcorrect.errors import InputError
+
+
+@dataclass
+class Mark:
+    """When something was done last: iteration and second of the training."""
+
+    iteration: int = 0
+    seconds: float = 0.0
+
+
+@dataclass
+class Progress:
+    """Where a training is.
+
+    Attributes
+    ----------
+    stage, iteration : int
+        Number of the stage, and iterations done in it.
+    total : int
+        Iterations in all stages.
+    stage_seconds, seconds : float
+        Time spent in the stage and in all, interruptions not counted.
+    validated, saved : Mark
+    best : float or None
+        Omega of the best weights so far, per cent.
+    stale : int
+        Validations of this stage since there was a better one.
+    metrics : dict
+        Of the best weights.
+    """
+
+    stage: int = 0
+    iteration: int = 0
+    total: int = 0
+    stage_seconds: float = 0.0
+    seconds: float = 0.0
+    validated: Mark = field(default_factory=Mark)
+    saved: Mark = field(default_factory=Mark)
+    best: float | None = None
+    stale: int = 0
+    metrics: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> Progress:
+        """From ``dataclasses.asdict``."""
+        marks = {name: Mark(**content[name]) for name in ("validated", "saved")}
+        return cls(**{**content, **marks})
+
+    def due(self, every: Every, last: Mark) -> bool:
+        """Whether it is time for something again."""
+        if every.iterations is not None:
+            return self.total - last.iteration >= every.iterations
+        return self.seconds - last.seconds >= (every.seconds or 0.0)
+
+    def now(self) -> Mark:
+        """The present moment."""
+        return Mark(self.total, self.seconds)
+
+    def stepped(self, seconds: float) -> None:
+        """Count an iteration."""
+        self.iteration, self.total = self.iteration + 1, self.total + 1
+        self.passed(seconds)
+
+    def passed(self, seconds: float) -> None:
+        """Count time."""
+        self.stage_seconds += seconds
+        self.seconds += seconds
+
+    def next_stage(self) -> None:
+        """Begin another stage."""
+        self.stage, self.iteration, self.stage_seconds, self.stale = self.stage + 1, 0, 0.0, 0
+
+
+def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
+    """Refuse to go on with other settings, naming the first that differs.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(found, dict) and isinstance(expected, dict):
+        for name in sorted(found.keys() | expected.keys()):
+            check_same(found.get(name), expected.get(name), where, f"{key}.{name}".lstrip("."))
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        for k, (one, other) in enumerate(zip(found, expected, strict=True)):
+            check_same(one, other, where, f"{key}.{k}")
+    elif found != expected:
+        raise InputError(
+            f"{where}: was begun with {key} = {found!r:.80}, and is now to go on with "
+            f"{expected!r:.80}: expected the same; begin another one in another folder."
+        )

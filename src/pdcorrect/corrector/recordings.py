@@ -1,0 +1,175 @@
+"""`Recording`: a simulation of a data set with what the hybrid is trained on and judged by."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pdcorrect.corrector.losses import LEAST_ERROR, BaseErrors
+from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
+from pdcorrect.data.shard_arrays import read_header
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.scene import Scene, best_coarse
+
+Base = Literal["plain", "best"]
+Array = NDArray[Any]
+
+_SAME_MESH = 1e-5
+"""Of the cell size: distance of a scene's nodes from the file's that counts as none."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A simulation.
+
+    Attributes
+    ----------
+    dataset, split : str
+    mesh, number : int
+        Of the mesh in its split, and on the mesh.
+    scene_toml : str
+    points : (N, 3) float64
+        Rest positions, m.
+    reference, plain : (T+1, N, 3)
+        The reference, and the rollout of the plain coarse model, m.
+    one_step, rollout : float
+        Mean squared errors of the base model, m2, see `pdcorrect.corrector.losses`.
+    """
+
+    dataset: str
+    split: str
+    mesh: int
+    number: int
+    scene_toml: str
+    points: Array
+    reference: Array
+    plain: Array
+    one_step: float
+    rollout: float
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.reference) - 1
+
+    @property
+    def name(self) -> str:
+        """For messages and tables."""
+        return f"{self.split}/mesh-{self.mesh:04d}/{self.number}"
+
+
+def load_recordings(folder: str | Path, split: str, base: Base) -> list[Recording]:
+    """All simulations of a split, mesh by mesh.
+
+    Raises
+    ------
+    InputError
+        If there is no such split, or a simulation lacks a run that is needed.
+    FileFormatError
+        If a file is damaged.
+    """
+    found = []
+    for path in shard_paths(folder, split):
+        shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
+        for number, simulation in enumerate(shard.simulations):
+            found.append(_recording(shard, simulation, number, split, base, path))
+    return found
+
+
+def base_errors(recordings: Sequence[Recording], device: str | torch.device = "cpu") -> BaseErrors:
+    """Of some simulations, in their order."""
+
+    def tensor(values: list[float]) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=device)
+
+    return BaseErrors(
+        tensor([r.one_step for r in recordings]), tensor([r.rollout for r in recordings])
+    )
+
+
+def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
+    """The base model's problems; those of one mesh share its discretisation.
+
+    Raises
+    ------
+    InputError
+        If a scene is not that of the recorded mesh.
+    """
+    known: dict[tuple[str, int], Problem] = {}
+    problems = []
+    for recording in recordings:
+        scene = Scene.from_toml(recording.scene_toml, recording.name)
+        key = recording.split, recording.mesh
+        if key not in known:
+            known[key] = discretise(best_coarse(scene) if base == "best" else scene)
+            _check_mesh(recording, known[key])
+        problems.append(known[key].with_loads(scene.loads))
+    return problems
+
+
+def data_hash(folder: str | Path, splits: Sequence[str]) -> str:
+    """SHA-256 of the content hashes of the files of some splits."""
+    digest = hashlib.sha256()
+    for split in splits:
+        for path in shard_paths(folder, split):
+            digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
+    return digest.hexdigest()
+
+
+def _recording(
+    shard: Shard, simulation: Simulation, number: int, split: str, base: Base, path: Path
+) -> Recording:
+    reference = _positions(simulation, REFERENCE, path, number)
+    predictions = simulation.runs[base].predictions
+    if predictions is None:
+        raise InputError(
+            f"{path}: simulation {number} has no single steps of run {base!r}: expected data "
+            "with them, or another base."
+        )
+    rollout = _positions(simulation, base, path, number)
+    return Recording(
+        dataset=str(shard.attributes["dataset"]),
+        split=split,
+        mesh=int(shard.attributes["number"]),
+        number=number,
+        scene_toml=simulation.scene_toml,
+        points=shard.points,
+        reference=reference,
+        plain=_positions(simulation, PLAIN, path, number),
+        one_step=_mean_square(predictions, reference[1:]),
+        rollout=_mean_square(rollout[1:], reference[1:]),
+    )
+
+
+def _positions(simulation: Simulation, run: str, path: Path, number: int) -> Array:
+    found = simulation.runs[run].positions
+    if found is None:
+        raise InputError(f"{path}: simulation {number} has no positions of run {run!r}.")
+    return found
+
+
+def _mean_square(x: Array, y: Array) -> float:
+    """Mean over frames and nodes of the squared distance, m2."""
+    distance = x.astype(np.float64) - y
+    return max(float((distance**2).sum(axis=2).mean()), LEAST_ERROR)
+
+
+def _check_mesh(recording: Recording, problem: Problem) -> None:
+    found, wanted = problem.positions, recording.points
+    if found.shape != wanted.shape or not np.allclose(
+        found, wanted, rtol=0.0, atol=_SAME_MESH * problem.cell_size
+    ):
+        raise InputError(
+            f"{recording.name}: its scene has {len(found)} nodes which are not the file's "
+            f"{len(wanted)}: expected data whose scenes make their meshes."
+        )

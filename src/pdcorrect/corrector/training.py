@@ -1,0 +1,302 @@
+"""`Training`: a corrector's weights from a data set, stage by stage, to be resumed at any time."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.checks import usable_device
+from pdcorrect.corrector.checkpoints import read_checkpoint, write_checkpoint
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.fitting import fit_normaliser
+from pdcorrect.corrector.history import History
+from pdcorrect.corrector.model_io import ModelRecord, save_model
+from pdcorrect.corrector.optimisation import Optimiser, rate_at
+from pdcorrect.corrector.progress import Progress, check_same
+from pdcorrect.corrector.recordings import data_hash, load_recordings
+from pdcorrect.corrector.sources import Source, make_source, share_done
+from pdcorrect.corrector.training_config import Stage, TrainingConfig
+from pdcorrect.corrector.validation import Validation
+from pdcorrect.corrector.windows import StepWindows
+from pdcorrect.corrector.world import World
+from pdcorrect.data.config import TRAINING, VALIDATION
+from pdcorrect.data.folder import splits_of
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.replacement import make_folder, write_text
+
+CHECKPOINT, MODEL, CONFIG = "checkpoint.safetensors", "model", "config.toml"
+
+Report = Callable[[Progress, Mapping[str, Any]], None]
+"""Told where the training is, and the numbers of a row of the history."""
+
+
+class Training:
+    """A training in a folder.
+
+    Parameters
+    ----------
+    config : TrainingConfig
+    data : path
+        Folder of the data set.
+    output : path
+        For ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard`` and
+        the best ``model``.
+    device : str
+    resume : bool
+        Go on from the checkpoint, if there is one.
+    world : World
+    on_report : callable, optional
+        Called with each row of the history.
+
+    Attributes
+    ----------
+    corrector : Corrector
+        In its present state; the best one is in the folder.
+    progress : Progress
+
+    Raises
+    ------
+    InputError
+        If the folder holds a training and ``resume`` is not set, or it was another one; if
+        the data do not have what the configuration wants.
+    FileFormatError
+        If the checkpoint, or a file of the data set, is damaged.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        data: str | Path,
+        output: str | Path,
+        *,
+        device: str = "cpu",
+        resume: bool = False,
+        world: World | None = None,
+        on_report: Report | None = None,
+    ) -> None:
+        self.config, self.world = config, World() if world is None else world
+        self.device = usable_device(device)
+        self.output, self._on_report = Path(output), on_report
+        splits = [s for s in (TRAINING, VALIDATION) if s in splits_of(data)]
+        self._identity = json.loads(
+            json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
+        )
+        found = self._checkpoint(resume)
+        self._recordings = load_recordings(data, TRAINING, config.base)
+        self._windows = StepWindows(
+            data, self._recordings, config.architecture(), config.base, device=self.device,
+            workers=config.workers,
+        )  # fmt: skip
+        self.corrector = self._new_corrector(fit=found is None)
+        self._averaged = copy.deepcopy(self.corrector)
+        self._best: dict[str, Tensor] = {}
+        self._validation: Validation | None = None
+        if VALIDATION in splits:
+            self._validation = Validation(
+                load_recordings(data, VALIDATION, config.base), config.base,
+                velocity=config.velocity, device=self.device, world=self.world,
+            )  # fmt: skip
+        self.progress = Progress()
+        self._waiting: tuple[dict[str, Any], dict[str, Tensor]] | None = None
+        length = 0 if found is None else self._restore(*found)
+        self._history: History | None = None
+        if self.world.first:
+            make_folder(self.output)
+            write_text(self.output / CONFIG, config.to_toml())
+            self._history = History(self.output, length, self.progress.total)
+
+    # --- running ----------------------------------------------------------------------------
+
+    def run(self, seconds: float | None = None) -> bool:
+        """Train until the end, or for about so many seconds; whether it is finished.
+
+        Raises
+        ------
+        ConvergenceError
+            If too many batches in a row had no finite gradient.
+        """
+        self._limit = math.inf if seconds is None else self.progress.seconds + seconds
+        self._ticked = time.perf_counter()
+        try:
+            while self.progress.stage < len(self.config.stages):
+                if not self._run_stage(self.config.stages[self.progress.stage]):
+                    return False
+        finally:
+            if self._history is not None:
+                self._history.close()
+        return True
+
+    def _run_stage(self, stage: Stage) -> bool:
+        """One stage, or what is left of it; whether it came to its end."""
+        at = self.progress
+        source = make_source(
+            stage, at.stage, self.config, self._windows, self._recordings, self.world
+        )
+        optimiser = self._optimiser(stage, source)
+        shown = self.corrector if stage.ema is None else self._averaged
+        while (share := share_done(stage, len(source), at.iteration, at.stage_seconds)) < 1.0:
+            loss = source.loss(self.corrector, at.iteration, stage.horizon(share))
+            optimiser.step(loss, share)
+            at.stepped(self._tick())
+            if at.total % self.config.report_every == 0:
+                self._report(stage, optimiser, source, share)
+            if at.due(self.config.validate_every, at.validated):
+                self._validate(shown)
+                if stage.patience is not None and at.stale >= stage.patience:
+                    break
+            late = at.seconds >= self._limit
+            if late or at.due(self.config.checkpoint_every, at.saved):
+                self._save(optimiser, source)
+            if late:
+                return False
+        self._report(stage, optimiser, source, 1.0)
+        if at.total > at.validated.iteration:
+            self._validate(shown)
+        if self._validation is None:
+            self._keep(shown, {})
+        at.next_stage()
+        later = self.config.stages[at.stage : at.stage + 1]
+        goes_on = bool(later) and later[0].begin == "last"
+        self.corrector.network.load_state_dict(
+            shown.network.state_dict() if goes_on else self._best
+        )
+        self._save()
+        return True
+
+    def _optimiser(self, stage: Stage, source: Source) -> Optimiser:
+        """For a stage that begins, or one that goes on from a checkpoint."""
+        if self._waiting is None:
+            self._averaged.load_state_dict(self.corrector.state_dict())
+            return Optimiser(self.corrector, stage, self._averaged, self.world)
+        numbers, tensors = self._waiting
+        optimiser = Optimiser(self.corrector, stage, self._averaged, self.world)
+        optimiser.load_state_dict(_part(tensors, "optimiser."))
+        source.load_state_dict(numbers, _part(tensors, "source."))
+        self._waiting = None
+        return optimiser
+
+    def _tick(self) -> float:
+        """Seconds since the last call; all processes go by the first one's clock."""
+        now = time.perf_counter()
+        passed, self._ticked = now - self._ticked, now
+        return self.world.of_first(passed)
+
+    def _report(self, stage: Stage, optimiser: Optimiser, source: Source, share: float) -> None:
+        """A row about the batches since the last one."""
+        told = optimiser.take_report()
+        if told["longest"] >= self.config.most_skipped:
+            raise ConvergenceError(
+                f"stage {self.progress.stage}, iteration {self.progress.iteration}: "
+                f"{told['longest']:.0f} batches in a row had a loss or gradient that is not "
+                "finite. Expected a smaller learning rate, gradients that are clipped, or data "
+                "without extreme values."
+            )
+        failed = self.world.total(torch.tensor([source.failed], dtype=torch.float64))
+        if told["count"] + told["skipped"]:
+            loss = {"loss": told["loss"]} if told["count"] else {}
+            self._tell(
+                **loss, rate=rate_at(stage.rate, share), steps=stage.horizon(share),
+                skipped=int(told["skipped"]), failed_scenes=int(failed),
+            )  # fmt: skip
+
+    def _validate(self, shown: Corrector) -> None:
+        """Free rollouts; the best weights are kept."""
+        at = self.progress
+        at.validated = at.now()
+        if self._validation is None:
+            return
+        scores = self._validation(shown)
+        at.passed(self._tick())
+        at.validated = at.now()
+        metrics = scores.metrics()
+        self._tell(**metrics)
+        value = metrics[f"omega_{self.config.select}"]
+        at.stale += 1
+        if at.best is None or value > at.best:
+            at.best, at.stale = value, 0
+            self._keep(shown, metrics)
+
+    def _tell(self, **values: Any) -> None:
+        at = self.progress
+        row = {"stage": at.stage, "seconds": at.seconds, **values}
+        if self._history is not None:
+            self._history.add(at.total, **row)
+            if self._on_report is not None:
+                self._on_report(at, row)
+
+    # --- states -----------------------------------------------------------------------------
+
+    def _new_corrector(self, fit: bool) -> Corrector:
+        config = self.config
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            corrector = Corrector(config.architecture()).to(self.device)
+        if fit:
+            fit_normaliser(corrector, self._windows, config.fitting.windows, config.seed)
+            self.world.same(list(corrector.state_dict().values()))
+        return corrector
+
+    def _keep(self, shown: Corrector, metrics: dict[str, float]) -> None:
+        """These weights are the best so far."""
+        self.progress.metrics = metrics
+        self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
+        if self.world.first:
+            training = {**self._identity, "iterations": self.progress.total,
+                        "seconds": self.progress.seconds, "processes": self.world.size}  # fmt: skip
+            record = ModelRecord(
+                dataset=self._recordings[0].dataset, dataset_hash=self._identity["data"],
+                training=training, metrics=dict(metrics),
+            )  # fmt: skip
+            save_model(shown, self.output / MODEL, record=record)
+
+    def _save(self, optimiser: Optimiser | None = None, source: Source | None = None) -> None:
+        """Write the checkpoint; between stages there is no optimiser."""
+        self.progress.saved = self.progress.now()
+        if self._history is None:
+            return
+        content = {
+            "identity": self._identity, "progress": asdict(self.progress),
+            "history": self._history.length,
+        }  # fmt: skip
+        tensors = {f"model.{n}": x for n, x in self.corrector.state_dict().items()}
+        tensors |= {f"best.{n}": x for n, x in self._best.items()}
+        if optimiser is not None and source is not None:
+            content["source"], own = source.state_dict()
+            tensors |= {f"averaged.{n}": x for n, x in self._averaged.state_dict().items()}
+            tensors |= {f"optimiser.{n}": x for n, x in optimiser.state_dict().items()}
+            tensors |= {f"source.{n}": x for n, x in own.items()}
+        write_checkpoint(self.output / CHECKPOINT, content, tensors)
+
+    def _checkpoint(self, resume: bool) -> tuple[dict[str, Any], dict[str, Tensor]] | None:
+        path = self.output / CHECKPOINT
+        if not path.exists():
+            return None
+        if not resume:
+            raise InputError(f"{path}: a training: expected --resume, or another folder.")
+        content, tensors = read_checkpoint(path)
+        check_same(content["identity"], self._identity, str(path))
+        return content, tensors
+
+    def _restore(self, content: dict[str, Any], tensors: dict[str, Tensor]) -> int:
+        """Take over a checkpoint; the length of the history then."""
+        self.progress = Progress.from_json(content["progress"])
+        moved = {name: x.to(self.device) for name, x in tensors.items()}
+        self.corrector.load_state_dict(_part(moved, "model."))
+        self._best = _part(moved, "best.")
+        if "source" in content:
+            self._averaged.load_state_dict(_part(moved, "averaged."))
+            self._waiting = content["source"], tensors
+        return int(content["history"])
+
+
+def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {n.removeprefix(prefix): x for n, x in tensors.items() if n.startswith(prefix)}

@@ -1,0 +1,284 @@
+"""`TrainingConfig`: everything that determines a training but its data, as TOML."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tomli_w
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+
+from pdcorrect.corrector.config import CorrectorConfig, preset
+from pdcorrect.errors import InputError
+from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
+
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
+
+
+def _several(steps: Any) -> Any:
+    return (steps,) if isinstance(steps, int) else steps
+
+
+def _rising(steps: tuple[int, ...]) -> tuple[int, ...]:
+    if not steps or sorted(steps) != list(steps):
+        raise ValueError("expected one number of steps, or several that do not fall")
+    return steps
+
+
+Horizon = Annotated[tuple[PositiveCount, ...], BeforeValidator(_several), AfterValidator(_rising)]
+
+
+class Architecture(Strict):
+    """A preset of `pdcorrect.corrector.config.PRESETS`, and the values that differ from it."""
+
+    preset: str = "compact"
+    changes: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _possible(self) -> Architecture:
+        try:
+            self.config()
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        return self
+
+    def config(self) -> CorrectorConfig:
+        """The architecture."""
+        return preset(self.preset, **self.changes)
+
+
+class Loss(Strict):
+    """What is minimised; see `pdcorrect.corrector.losses`.
+
+    Attributes
+    ----------
+    kind
+        "relative": mean squared distance over that of the base model on the same
+        trajectory.  "absolute": positions in units of 1 / ``scale`` metres (thesis: 1000).
+    power
+        Of "absolute": 1 sums distances over nodes, 2 their squares.
+    """
+
+    kind: Literal["relative", "absolute"] = "relative"
+    power: Literal[1, 2] = 2
+    scale: Positive = 1000.0
+
+
+class Noise(Strict):
+    """Gaussian noise on what the network sees of the coarse solver's answer (eq. 5-5, 5-6).
+
+    The target makes good for it, too.
+
+    Attributes
+    ----------
+    tau
+        Deviation of a component, m; if ``relative``, in root mean squared one-step errors
+        (a component) of the base model on the same trajectory.
+    """
+
+    tau: NonNegative = 0.0
+    relative: bool = True
+
+
+class Rate(Strict):
+    """Adam's learning rate: linear rise, then half a cosine; constant if ``last`` is ``peak``.
+
+    Attributes
+    ----------
+    peak, last
+    warmup
+        Share of the stage.
+    """
+
+    peak: Positive = 1e-3
+    last: Positive = 1e-5
+    warmup: Share = 0.02
+
+
+class Every(Strict):
+    """How often: exactly one of both."""
+
+    seconds: Positive | None = None
+    iterations: PositiveCount | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Every:
+        if (self.seconds is None) == (self.iterations is None):
+            raise ValueError("expected exactly one of seconds, iterations")
+        return self
+
+
+class Stage(Strict):
+    """A part of training; Adam starts afresh in each.
+
+    Attributes
+    ----------
+    kind
+        "one-step": on the stored predictions of the base model, without the simulator.
+        "unrolled": steps of the hybrid, simulator included.
+    begin
+        From the best weights so far, or from the last ones of the stage before (averaged ones
+        if it had them).
+    steps
+        Of "unrolled"; several numbers share the stage equally, in order.
+    through_solver
+        Of "unrolled": whether derivatives go through the coarse solver.
+    start
+        Of "unrolled": states of the reference, or of a pool of the model's own rollouts,
+        each of which goes back to the reference with probability ``restart`` after it was used.
+    seconds, iterations, epochs
+        Exactly one; epochs only of "one-step".
+    batch
+        Windows or scenes, for each process.
+    clip
+        Largest norm of the gradient; None leaves it.
+    ema
+        Decay a step of the averaged weights that are validated and kept; None: no average.
+    amp
+        "bf16": matrix products of the network in bfloat16.
+    patience
+        Validations without a better result after which the stage ends; None: never.
+    """
+
+    kind: Literal["one-step", "unrolled"]
+    begin: Literal["best", "last"] = "best"
+    steps: Horizon = (1,)
+    through_solver: bool = False
+    start: Literal["reference", "pool"] = "reference"
+    restart: Share = 0.2
+    seconds: Positive | None = None
+    iterations: PositiveCount | None = None
+    epochs: PositiveCount | None = None
+    batch: PositiveCount = 16
+    rate: Rate = Rate()
+    loss: Loss = Loss()
+    noise: Noise = Noise()
+    clip: Positive | None = 1.0
+    ema: Decay | None = None
+    amp: Literal["none", "bf16"] = "none"
+    patience: PositiveCount | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Stage:
+        budgets = [self.seconds, self.iterations, self.epochs]
+        if sum(b is not None for b in budgets) != 1:
+            raise ValueError("expected exactly one of seconds, iterations, epochs")
+        if self.kind == "one-step":
+            told = {"steps": self.steps != (1,), "through_solver": self.through_solver,
+                    "start": self.start != "reference"}  # fmt: skip
+        else:
+            told = {"epochs": self.epochs is not None, "noise": self.noise.tau > 0.0}
+        for name, given in told.items():
+            if given:
+                raise ValueError(f"{name} has no meaning in a stage of kind {self.kind!r}")
+        return self
+
+    def horizon(self, progress: float) -> int:
+        """Steps at a share 0 to 1 of the stage."""
+        return self.steps[min(len(self.steps) - 1, int(progress * len(self.steps)))]
+
+
+class Fitting(Strict):
+    """Of the normalisation: most windows taken from the training split."""
+
+    windows: PositiveCount = 2000
+
+
+class TrainingConfig(Strict):
+    """A training.
+
+    Attributes
+    ----------
+    base
+        Whose steps are corrected: "plain", or `pdcorrect.best_coarse`'s ("best").
+    velocity
+        See `pdcorrect.corrector.batch_hybrid.BatchHybrid`.
+    validate_every, checkpoint_every, report_every
+        The last in iterations.
+    select
+        Of the validation's simulations, by which the best model is chosen.
+    most_skipped
+        Batches in a row whose loss or gradient is not finite, at which training fails.
+    workers
+        Processes that read windows ahead.
+    """
+
+    corrector: Architecture = Architecture()
+    base: Literal["plain", "best"] = "plain"
+    velocity: Literal["recomputed", "kept"] = "recomputed"
+    seed: Count = 0
+    fitting: Fitting = Fitting()
+    stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
+    validate_every: Every = Every(seconds=60.0)
+    checkpoint_every: Every = Every(seconds=60.0)
+    report_every: PositiveCount = 50
+    select: Literal["mean", "median"] = "mean"
+    most_skipped: PositiveCount = 20
+    workers: Count = 0
+
+    @model_validator(mode="after")
+    def _placed(self) -> TrainingConfig:
+        placement = self.corrector.config().placement
+        for k, stage in enumerate(self.stages):
+            if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
+                raise ValueError(
+                    f"stages.{k}: a correction of forces is only learned through the solver: "
+                    "expected kind = 'unrolled', through_solver = true"
+                )
+            if placement == "guess" and stage.kind == "unrolled":
+                raise ValueError(
+                    f"stages.{k}: a first guess does not change a step's result: expected kind = "
+                    "'one-step'"
+                )
+        return self
+
+    @classmethod
+    def load(cls, path: str | Path) -> TrainingConfig:
+        """Read a configuration from a TOML file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, is not TOML, or a key is wrong.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
+            raise InputError(f"{path}: cannot be read ({reason}).") from None
+        return cls.from_toml(text, str(path))
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "configuration") -> TrainingConfig:
+        """Read a configuration from TOML text; ``source`` names it in messages."""
+        try:
+            return cls(**tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{source}: not valid TOML: {error}.") from None
+        except ValidationError as error:
+            raise InputError(f"{source}: {_explain(error)}") from None
+
+    def to_toml(self) -> str:
+        """The configuration as TOML, with every default written out."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
+
+    def architecture(self) -> CorrectorConfig:
+        """Of the corrector."""
+        return self.corrector.config()
+
+
+def _explain(error: ValidationError) -> str:
+    sentences = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"]) or "the configuration"
+        if item["type"] == "extra_forbidden":
+            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
+        elif item["type"] == "missing":
+            sentences.append(f"{key}: missing; a value is required.")
+        else:
+            message = item["msg"].removeprefix("Value error, ")
+            sentences.append(f"{key} = {item['input']!r:.80}: {message}.")
+    return " ".join(sentences)

@@ -1,0 +1,235 @@
+"""Training batches of the hybrid's own steps, the simulator in the loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.batch.states import in_one
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.losses import body_losses, mean_of
+from pdcorrect.corrector.placements import Velocity
+from pdcorrect.corrector.precision import network_precision
+from pdcorrect.corrector.recordings import Base, Recording
+from pdcorrect.corrector.scenes import Frames, SceneGroup, grouped
+from pdcorrect.corrector.training_config import Stage
+from pdcorrect.errors import InputError
+
+Flags = NDArray[np.bool_]
+
+_LEAST_FREE = 0.2
+"""Of a GPU's memory, when a group is set up."""
+
+
+@dataclass(eq=False)
+class Rollouts:
+    """Where the scenes of a group are.
+
+    Attributes
+    ----------
+    positions, velocities : (B, N, 3) tensors
+        m and m/s.
+    correction : (n, 3) tensor
+        Of the last step, m; zero if there was none.
+    frames, ages : (B,) int
+        Frame of each scene, and steps since it was on the reference.
+    """
+
+    positions: Tensor
+    velocities: Tensor
+    correction: Tensor
+    frames: Frames
+    ages: Frames
+
+
+@dataclass(frozen=True, eq=False)
+class Unrolled:
+    """Outcome of some steps.
+
+    Attributes
+    ----------
+    losses : (B,) tensor
+        Mean over the steps.
+    alive : (B,) bool
+        Scenes whose steps all succeeded; losses of others are zero.
+    end : Rollouts
+        Without derivatives.
+    """
+
+    losses: Tensor
+    alive: Flags
+    end: Rollouts
+
+
+class UnrolledBatches:
+    """Draws groups and start frames, steps the hybrid, and compares it with the reference.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    base : {"plain", "best"}
+    stage : Stage
+    device : str or torch.device
+    seed, rank, world_size : int
+
+    Attributes
+    ----------
+    failed : int
+        Scenes that were left out because a step failed.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        base: Base,
+        stage: Stage,
+        *,
+        velocity: Velocity = "recomputed",
+        device: str | torch.device = "cpu",
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        longest = max(stage.steps)
+        usable = [r for r in recordings if r.steps >= longest]
+        self._chosen = grouped(usable, stage.batch, seed=seed, rank=rank, world_size=world_size)
+        if not self._chosen:
+            raise InputError(
+                f"{len(usable)} simulations of {longest} steps or more, in groups of "
+                f"{stage.batch}, for {world_size} processes: expected a group for each."
+            )
+        self._base, self._stage, self._velocity = base, stage, velocity
+        self._device = torch.device(device)
+        self._seed = (seed, rank)
+        self._groups: dict[int, SceneGroup] = {}
+        self._pool: dict[int, Rollouts] = {}
+        self.failed = 0
+
+    def __len__(self) -> int:
+        """Groups."""
+        return len(self._chosen)
+
+    def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
+        """The mean loss of a group over some steps; what is drawn depends on ``iteration``."""
+        rng = np.random.default_rng((*self._seed, 3, iteration))
+        number = self._turn(iteration)
+        group = self._group(number)
+        start = self._start(number, group, steps, rng)
+        found = unroll(group, corrector, start, steps, self._stage, self._velocity)
+        self.failed += int((~found.alive).sum())
+        if self._stage.start == "pool":
+            found.end.ages[~found.alive | group.lost(found.end.positions, found.end.frames)] = -1
+            self._pool[number] = found.end
+        return mean_of(found.losses, torch.from_numpy(found.alive).to(group.device))
+
+    def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """The pool: numbers, and tensors by name."""
+        numbers: dict[str, Any] = {"failed": self.failed, "pool": {}}
+        tensors: dict[str, Tensor] = {}
+        for k, at in self._pool.items():
+            numbers["pool"][str(k)] = {"frames": at.frames.tolist(), "ages": at.ages.tolist()}
+            tensors |= {f"{k}.positions": at.positions, f"{k}.velocities": at.velocities}
+            tensors[f"{k}.correction"] = at.correction
+        return numbers, tensors
+
+    def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        """Go on where a state was taken; pools of processes but the first begin anew."""
+        self.failed, self._pool = numbers["failed"], {}
+        if self._seed[1]:
+            return
+        for key, at in numbers["pool"].items():
+            positions, velocities, correction = (
+                tensors[f"{key}.{name}"].to(self._device)
+                for name in ("positions", "velocities", "correction")
+            )
+            self._pool[int(key)] = Rollouts(
+                positions, velocities, correction, np.array(at["frames"]), np.array(at["ages"])
+            )
+
+    def _turn(self, iteration: int) -> int:
+        """The group: all in random order, then again."""
+        epoch, place = divmod(iteration, len(self))
+        return int(np.random.default_rng((*self._seed, 4, epoch)).permutation(len(self))[place])
+
+    def _group(self, number: int) -> SceneGroup:
+        if number not in self._groups:
+            self._make_room()
+            self._groups[number] = SceneGroup(self._chosen[number], self._base, self._device)
+        return self._groups[number]
+
+    def _make_room(self) -> None:
+        """Forget groups, which are set up anew when they are needed, if a GPU is nearly full."""
+        if self._device.type != "cuda":
+            return
+        free, total = torch.cuda.mem_get_info(self._device)
+        while free < _LEAST_FREE * total and self._groups:
+            del self._groups[next(iter(self._groups))]
+            torch.cuda.empty_cache()
+            free, total = torch.cuda.mem_get_info(self._device)
+
+    def _start(
+        self, number: int, group: SceneGroup, steps: int, rng: np.random.Generator
+    ) -> Rollouts:
+        """States of the reference in random frames, or what the pool holds."""
+        frames = rng.integers(0, group.steps - steps + 1)
+        anew = rng.random(len(group)) < self._stage.restart
+        positions, velocities = group.states(frames)
+        none = torch.zeros(int(group.counts.sum()), 3, dtype=torch.float64, device=group.device)
+        drawn = Rollouts(positions, velocities, none, frames, np.zeros_like(frames))
+        before = self._pool.get(number)
+        if self._stage.start == "reference" or before is None:
+            return drawn
+        anew |= (before.ages < 0) | (before.frames + steps > group.steps)
+        return _mixed(group, before, drawn, anew)
+
+
+def unroll(
+    group: SceneGroup,
+    corrector: Corrector,
+    start: Rollouts,
+    steps: int,
+    stage: Stage,
+    velocity: Velocity = "recomputed",
+) -> Unrolled:
+    """Step a group and compare each frame with the reference."""
+    layer = group.layer(corrector, stage.through_solver, velocity)
+    positions, velocities, correction = start.positions, start.velocities, start.correction
+    frames, ages = start.frames, start.ages
+    total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
+    living = torch.ones(len(group), dtype=torch.bool, device=group.device)
+    for _ in range(steps):
+        with network_precision(corrector, stage.amp):
+            positions, velocities, correction = layer(
+                positions, velocities, group.times(frames), correction
+            )
+        fine = torch.tensor(in_one(layer.steps.statuses[-1]), device=group.device)
+        living = living & fine & torch.isfinite(positions).flatten(1).all(dim=1)
+        frames, ages = frames + 1, ages + 1
+        truth, at = group.truth(frames), living[:, None, None]
+        # Not a number times zero is not zero: it must not reach what all scenes share.
+        positions = torch.where(at, positions, truth)
+        velocities = torch.where(at, velocities, 0.0)
+        scale = group.errors.after(torch.from_numpy(ages).to(group.device))
+        total = total + body_losses(stage.loss, positions - truth, group.sums, group.counts, scale)
+    end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
+    return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
+
+
+def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:
+    """What a pool held, some scenes begun anew."""
+    which = torch.from_numpy(anew).to(group.device)
+    at = which[:, None, None]
+    of_nodes = which.repeat_interleave(group.mask.sum(dim=1))[:, None]
+    return Rollouts(
+        torch.where(at, drawn.positions, before.positions),
+        torch.where(at, drawn.velocities, before.velocities),
+        torch.where(of_nodes, 0.0, before.correction),
+        np.where(anew, drawn.frames, before.frames),
+        np.where(anew, 0, before.ages),
+    )

@@ -1,0 +1,93 @@
+"""The command ``pdcorrect train``.  It imports what it needs when it runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+if TYPE_CHECKING:
+    from pdcorrect.corrector.progress import Progress
+    from pdcorrect.corrector.training_config import TrainingConfig
+
+_UNFINISHED = 1
+"""Exit status if time was up before the training was finished."""
+
+
+def train(
+    config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
+    data: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
+    resume: Annotated[
+        bool, typer.Option(help="Go on from the folder's checkpoint, if there is one.")
+    ] = False,
+    seconds: Annotated[
+        Optional[float], typer.Option(help="Stop after so many seconds; --resume goes on.")
+    ] = None,
+    evaluate: Annotated[
+        Optional[str], typer.Option(help="Split on which the best model is judged at the end.")
+    ] = None,
+) -> None:
+    """Train a corrector; the best model is in OUTPUT/model (extra 'learn').
+
+    Several processes: torchrun --nproc-per-node N -m pdcorrect.cli train ...
+    Exit status 1 if time was up before the end.
+    """
+    from pdcorrect.corrector.training import MODEL, Training
+    from pdcorrect.corrector.training_config import TrainingConfig
+    from pdcorrect.corrector.world import joined
+
+    loaded = TrainingConfig.load(config)
+    with joined(device) as (world, own):
+        training = Training(
+            loaded, data, output, device=own, resume=resume, world=world, on_report=_tell
+        )
+        finished = training.run(seconds)
+        if not world.first:
+            return
+        metrics = training.progress.metrics
+    if not finished:
+        typer.echo(f"{output}: not finished after {training.progress.total} iterations; --resume")
+        raise typer.Exit(_UNFINISHED)
+    told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
+    typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
+    if evaluate is not None:
+        _judge(output / MODEL, data, evaluate, loaded, own)
+
+
+def _tell(at: Progress, row: Mapping[str, Any]) -> None:
+    numbers = "  ".join(
+        f"{name.replace('_', ' ')} {value:.4g}"
+        for name, value in row.items()
+        if name not in ("stage", "seconds")
+    )
+    typer.echo(f"{at.seconds:7.1f} s  stage {at.stage}  {at.total:6d}  {numbers}")
+
+
+def _judge(model: Path, data: Path, split: str, config: TrainingConfig, device: str) -> None:
+    """Print Omega of the free rollouts of a split."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdcorrect.corrector.model_io import load_model
+    from pdcorrect.corrector.recordings import load_recordings
+    from pdcorrect.corrector.validation import Validation
+
+    recordings = load_recordings(data, split, config.base)
+    judge = Validation(recordings, config.base, velocity=config.velocity, device=device)
+    scores = judge(load_model(model, device).corrector)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in ("simulation", "nodes", "frames", "Omega, %"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.columns[0].justify = "left"
+    for recording, omega in zip(recordings, scores.omegas, strict=True):
+        nodes, frames = str(len(recording.points)), str(recording.steps)
+        table.add_row(recording.name, nodes, frames, f"{omega:.1f}")
+    table.add_section()
+    for name in ("mean", "median", "least"):
+        table.add_row(name, "", "", f"{getattr(scores, name):.1f}")
+    Console().print(table)

@@ -1,0 +1,830 @@
+"""Training: what is minimised, by which rules, and that it goes on exactly where it stopped."""
+
+import csv
+import itertools
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import training_samples as samples  # noqa: E402
+from pdcorrect.corrector.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
+from pdcorrect.corrector.fitting import fit_normaliser  # noqa: E402
+from pdcorrect.corrector.losses import BaseErrors, body_losses  # noqa: E402
+from pdcorrect.corrector.model_io import load_model  # noqa: E402
+from pdcorrect.corrector.optimisation import Optimiser, rate_at  # noqa: E402
+from pdcorrect.corrector.progress import check_same  # noqa: E402
+from pdcorrect.corrector.recordings import base_errors, load_recordings  # noqa: E402
+from pdcorrect.corrector.scenes import SceneGroup, grouped  # noqa: E402
+from pdcorrect.corrector.sources import OneStepBatches, one_step_loss, share_done  # noqa: E402
+from pdcorrect.corrector.training import Training  # noqa: E402
+from pdcorrect.corrector.training_config import (  # noqa: E402
+    Loss,
+    Rate,
+    TrainingConfig,
+)
+from pdcorrect.corrector.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
+from pdcorrect.corrector.validation import Scores, Validation  # noqa: E402
+from pdcorrect.corrector.world import World  # noqa: E402
+from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.errors import (  # noqa: E402
+    ConvergenceError,
+    FileFormatError,
+    FileVersionError,
+    InputError,
+)
+from pdcorrect.metrics import error_corrected  # noqa: E402
+
+ROOT = Path(__file__).parent.parent
+BASIC = '[[stages]]\nkind = "one-step"\niterations = 1\n'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return samples.dataset(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory):
+    """The same with five frames."""
+    return samples.dataset(tmp_path_factory.mktemp("short"), frames=5)
+
+
+@pytest.fixture
+def few_threads():
+    """Small networks are quicker on one thread."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+pytestmark = pytest.mark.usefixtures("few_threads")
+
+
+# --- configuration -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("seeds = 1\n" + BASIC, "seeds: unknown key"),
+        (BASIC + "rates = 1.0\n", "stages.0.rates: unknown key"),
+        (BASIC + "seconds = 1.0\n", "stages.0 .*exactly one of seconds, iterations, epochs"),
+        (BASIC + "through_solver = true\n", "stages.0 .*through_solver has no meaning"),
+        (BASIC + "batch = 0\n", "stages.0.batch = 0"),
+        (BASIC.replace("one-step", "unrolled") + "steps = [4, 2]\n", "stages.0.steps"),
+        (BASIC.replace("one-step", "unrolled") + "steps = 0\n", "stages.0.steps"),
+        (BASIC.replace("one-step", "unrolled") + "[stages.noise]\ntau = 0.1\n", "noise has no"),
+        (BASIC.replace("one-step", "two-step"), "stages.0.kind = 'two-step'"),
+        ("stages = []\n", "stages"),
+        ('[corrector]\npreset = "huge"\n' + BASIC, "corrector .*preset 'huge'"),
+        ("[corrector]\nchanges = {widths = 3}\n" + BASIC, "corrector .*widths"),
+        ('[corrector]\nchanges = {placement = "force"}\n' + BASIC, "through the solver"),
+        ("[validate_every]\nseconds = 1.0\niterations = 2\n" + BASIC, "validate_every"),
+        ("base = 'plain", "not valid TOML"),
+    ],
+)
+def test_a_wrong_configuration_is_refused_by_its_key(text, told):
+    with pytest.raises(InputError, match=told):
+        TrainingConfig.from_toml(text)
+
+
+def test_a_configuration_comes_back_from_its_toml():
+    stage = samples.unrolled(steps=(1, 4), start="pool", rate=Rate(peak=0.1))
+    settings = samples.config(samples.one_step(clip=None), stage, select="median")
+    text = settings.to_toml()
+    again = TrainingConfig.from_toml(text)
+    assert again.stages[1] == stage
+    assert again.select == "median"
+    # TOML has no null: what is left out is the default.
+    assert again.stages[0].clip == 1.0
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "examples" / "training").glob("*.toml")), ids=str)
+def test_the_examples_can_be_read(path):
+    TrainingConfig.load(path)
+
+
+def test_the_thesis_is_an_example():
+    settings = TrainingConfig.load(ROOT / "examples" / "training" / "thesis.toml")
+    (stage,) = settings.stages
+    assert settings.corrector.preset == "thesis"
+    assert (stage.batch, stage.epochs, stage.horizon(0.5)) == (1, 20, 1)
+    assert (stage.loss.kind, stage.loss.scale) == ("absolute", 1000.0)
+
+
+def test_the_horizon_grows_in_equal_parts():
+    stage = samples.unrolled(steps=(1, 2, 8))
+    shares = (0.0, 0.3, 0.34, 0.65, 0.67, 0.99, 1.0)
+    assert [stage.horizon(s) for s in shares] == [1, 1, 2, 2, 8, 8, 8]
+
+
+def test_the_rate_rises_and_falls():
+    rate = Rate(peak=1.0, last=0.1, warmup=0.2)
+    assert rate_at(rate, 0.1) == pytest.approx(0.5)
+    assert rate_at(rate, 0.2) == pytest.approx(1.0)
+    assert rate_at(rate, 0.6) == pytest.approx(0.55)
+    assert rate_at(rate, 1.0) == pytest.approx(0.1)
+    assert 0 < rate_at(rate, 0.0) < 0.01
+    assert rate_at(Rate(peak=0.3, last=0.3, warmup=0.0), 0.7) == 0.3
+
+
+def test_budgets_are_counted_in_epochs_iterations_or_seconds():
+    assert share_done(samples.one_step(iterations=8), 100, 2, 50.0) == 0.25
+    stage = samples.one_step(iterations=None, epochs=2)
+    assert share_done(stage, 10, 5, 50.0) == 0.25
+    stage = samples.one_step(iterations=None, seconds=200.0)
+    assert share_done(stage, 10, 5, 50.0) == 0.25
+
+
+# --- losses ------------------------------------------------------------------------------
+
+
+def sums(values):
+    """Two bodies: of two nodes and of one."""
+    return torch.stack([values[0] + values[1], values[2]])
+
+
+ERRORS = torch.tensor([[0.003, 0.0, 0.004], [0.0, 0.0, 0.0], [0.0, 0.012, 0.005]]).double()
+
+
+@pytest.mark.parametrize(
+    ("loss", "expected"),
+    [
+        (Loss(kind="relative"), [25e-6 / (2 * 1e-5), 169e-6 / 4e-5]),
+        (Loss(kind="absolute", power=1), [5.0, 13.0]),
+        (Loss(kind="absolute", power=2), [25.0, 169.0]),
+        (Loss(kind="absolute", power=2, scale=1.0), [25e-6, 169e-6]),
+    ],
+)
+def test_losses_by_hand(loss, expected):
+    scale = torch.tensor([1e-5, 4e-5]).double()
+    found = body_losses(loss, ERRORS, sums, torch.tensor([2, 1]), scale)
+    assert found.tolist() == pytest.approx(expected)
+
+
+def test_the_gradient_of_a_distance_of_zero_is_zero():
+    errors = ERRORS.clone().requires_grad_()
+    body_losses(Loss(kind="absolute", power=1), errors, sums, None, None).sum().backward()
+    assert errors.grad[1].tolist() == [0.0, 0.0, 0.0]
+    assert errors.grad[0].tolist() == pytest.approx([600.0, 0.0, 800.0])
+
+
+def test_expected_errors_of_the_base_model_grow_to_those_of_its_rollout():
+    errors = BaseErrors(torch.tensor([1e-6, 1e-6, 1e-4]), torch.tensor([1e-3, 2e-5, 1e-6]))
+    assert errors.after(1).tolist() == pytest.approx([1e-6, 1e-6, 1e-4])
+    assert errors.after(2).tolist() == pytest.approx([9e-6, 9e-6, 1e-4])
+    steps = torch.tensor([3, 3, 1])
+    assert errors.after(steps).tolist() == pytest.approx([36e-6, 2e-5, 1e-4])
+
+
+@pytest.mark.parametrize("base", ["plain", "best"])
+def test_recorded_errors_are_mean_squared_distances(folder, base):
+    recordings = load_recordings(folder, "training", base)
+    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", (base,), (base,))
+    for recording, motion in zip(recordings[1:], motions, strict=True):
+        truth = motion.positions[1:].astype(np.float64)
+        for found, run in (
+            (recording.one_step, motion.predictions[base]),
+            (recording.rollout, motion.rollouts[base][1:]),
+        ):
+            assert found == pytest.approx(((run - truth) ** 2).sum(axis=2).mean(), rel=1e-6)
+
+
+# --- windows -----------------------------------------------------------------------------
+
+
+def test_a_window_asks_for_what_the_base_model_lacks(folder):
+    settings = samples.config(samples.one_step())
+    windows, recordings = samples.windows(folder, settings)
+    batch = windows.batch([3, 20 + 5])  # frame 3 of the first mesh, 5 of the second's first
+    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", ("plain",))
+    nodes = len(recordings[0].points)
+    motion = motions[0]
+    wanted = motion.positions[6].astype(float) - motion.predictions["plain"][5]
+    np.testing.assert_allclose(batch.target[nodes:].numpy(), wanted, atol=1e-8)
+    np.testing.assert_array_equal(
+        batch.snapshot.proposed[nodes:].numpy(), motion.predictions["plain"][5]
+    )
+    assert batch.scale.tolist() == [r.one_step for r in recordings[:2]]
+    assert batch.snapshot.correction is None
+
+
+def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder):
+    names = ("node-type", "previous-correction", "strain")
+    changes = {**samples.SMALL["changes"], "node_features": names}
+    architecture = {"preset": "compact", "changes": changes}
+    settings = samples.config(samples.one_step(), corrector=architecture)
+    windows, _ = samples.windows(folder, settings)
+    plain, _ = samples.windows(folder, samples.config(samples.one_step()))
+    found, before, now = windows.batch([3]), plain.batch([3]), plain.batch([4])
+    torch.testing.assert_close(found.snapshot.correction, before.target)
+    torch.testing.assert_close(found.target, now.target)
+    torch.testing.assert_close(found.snapshot.positions, now.snapshot.positions)
+    torch.testing.assert_close(
+        found.snapshot.velocities, now.snapshot.velocities, rtol=1e-5, atol=1e-5
+    )
+
+
+def test_a_first_guess_is_to_become_the_base_models_answer(folder):
+    changes = {**samples.SMALL["changes"], "placement": "guess"}
+    settings = samples.config(
+        samples.one_step(), corrector={"preset": "compact", "changes": changes}
+    )
+    guess = samples.windows(folder, settings)[0].batch([7])
+    state = samples.windows(folder, samples.config(samples.one_step()))[0].batch([7])
+    torch.testing.assert_close(
+        guess.snapshot.proposed + guess.target, state.snapshot.proposed, rtol=0, atol=1e-12
+    )
+    h, bodies = 0.01, state.bodies
+    moved = h * state.snapshot.velocities
+    moved = moved + h**2 * state.snapshot.forces / bodies.mass[:, None] * bodies.free
+    torch.testing.assert_close(guess.snapshot.proposed, state.snapshot.positions + moved)
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_noise_is_seen_and_to_be_corrected(folder, relative):
+    settings = samples.config(samples.one_step())
+    batch = samples.windows(folder, settings)[0].batch(list(range(0, 60, 4)))
+    generator = torch.Generator().manual_seed(1)
+    tau = 0.5 if relative else 2e-3
+    noisy = batch.with_noise(tau, relative, generator)
+    noise = noisy.snapshot.proposed - batch.snapshot.proposed
+    torch.testing.assert_close(
+        noisy.snapshot.proposed + noisy.target, batch.snapshot.proposed + batch.target
+    )
+    assert not noise[~batch.bodies.free].any()
+    free = batch.bodies.free.all(dim=1)
+    unit = batch.bodies.by_node((batch.scale / 3).sqrt())[:, None] if relative else 1.0
+    sizes = (noise / unit)[free]
+    assert float(sizes.square().mean().sqrt()) == pytest.approx(tau, rel=0.05)
+    assert abs(float(sizes.mean())) < 0.1 * tau
+    assert noisy.snapshot.positions is batch.snapshot.positions
+
+
+def test_what_is_known_of_the_rest_is_that_of_the_bodies(folder):
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    bodies = windows.batch([3, 45, 4]).bodies
+    anew = bodies.to()
+    for name in ("rest_inverses", "rest_frames", "rest_edges", "rest_turns"):
+        torch.testing.assert_close(getattr(bodies, name), getattr(anew, name))
+        assert len(getattr(bodies, name)) > 50
+
+
+# --- normalisation -----------------------------------------------------------------------
+
+
+def test_the_normaliser_has_zero_mean_and_unit_deviation_on_the_training_split(folder):
+    architecture = {"preset": "thesis", "changes": {"layers": 1, "width": 8}}
+    settings = samples.config(samples.one_step(), corrector=architecture)
+    corrector = samples.fitted(folder, settings)
+    windows, _ = samples.windows(folder, settings)
+    fit_normaliser(corrector, windows, 10**6)
+    every = windows.batch(range(len(windows.dataset)))
+    normaliser = corrector.normaliser
+    np.testing.assert_allclose(
+        normaliser.force__mean.numpy(), every.snapshot.forces.mean(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.force__deviation.numpy(),
+        every.snapshot.forces.std(dim=0, correction=0).numpy(),
+    )
+    target = every.target[every.bodies.free.all(dim=1)]
+    assert float(normaliser.output_scale) == pytest.approx(float(target.square().mean().sqrt()))
+
+
+def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    found = []
+    for seed in (0, 0, 1):
+        corrector = samples.fitted(folder, settings)
+        fit_normaliser(corrector, windows, 10, seed)
+        found.append(corrector.normaliser.state_dict())
+    for name, x in found[0].items():
+        assert torch.equal(x, found[1][name])
+    assert found[0]["output_scale"] != found[2]["output_scale"]
+
+
+# --- steps of the optimiser --------------------------------------------------------------
+
+
+def weights(corrector):
+    return torch.cat([p.detach().reshape(-1).clone() for p in corrector.network.parameters()])
+
+
+def test_batches_without_a_finite_gradient_change_nothing_and_are_counted(folder):
+    settings = samples.config(samples.one_step())
+    corrector = samples.fitted(folder, settings)
+    optimiser = Optimiser(corrector, settings.stages[0], None, World())
+    some = next(iter(corrector.network.parameters()))
+
+    def loss(factor):
+        return factor * sum(p.square().sum() for p in corrector.network.parameters())
+
+    optimiser.step(loss(1.0), 0.5)
+    before, moments = weights(corrector), optimiser.state_dict()
+    moments = {n: x.clone() for n, x in moments.items() if n.startswith("adam")}
+    optimiser.step(loss(torch.nan), 0.5)
+    optimiser.step((some - some.detach()).abs().sqrt().sum(), 0.5)  # infinite derivatives only
+    assert torch.equal(weights(corrector), before)
+    for name, x in optimiser.state_dict().items():
+        if name.startswith("adam"):
+            assert torch.equal(x, moments[name]), name
+    told = optimiser.take_report()
+    assert (told["count"], told["skipped"], told["longest"]) == (1, 2, 2)
+    optimiser.step(loss(1.0), 0.5)
+    assert not torch.equal(weights(corrector), before)
+    optimiser.step(loss(torch.inf), 0.5)
+    told = optimiser.take_report()
+    assert (told["count"], told["skipped"], told["longest"]) == (1, 1, 2)
+    assert optimiser.take_report()["longest"] == 1
+
+
+def test_training_ends_with_an_error_after_many_such_batches(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        OneStepBatches, "loss",
+        lambda self, corrector, *_: torch.nan * next(corrector.network.parameters()).sum(),
+    )  # fmt: skip
+    settings = samples.config(
+        samples.one_step(iterations=20), most_skipped=5, report_every=2, base="plain"
+    )
+    training = Training(settings, folder, tmp_path / "out")
+    with pytest.raises(ConvergenceError, match="stage 0, iteration 6: 6 batches in a row"):
+        training.run()
+
+
+def test_gradients_are_clipped(folder):
+    settings = samples.config(samples.one_step(clip=0.25))
+    corrector = samples.fitted(folder, settings)
+    optimiser = Optimiser(corrector, settings.stages[0], None, World())
+    optimiser.step(1e3 * sum(p.square().sum() for p in corrector.network.parameters()), 0.5)
+    grads = [p.grad for p in corrector.network.parameters()]
+    assert float(torch.nn.utils.get_total_norm(grads)) == pytest.approx(0.25, rel=1e-4)
+
+
+def test_averaged_weights_follow_by_their_decay(folder):
+    settings = samples.config(samples.one_step(ema=0.75))
+    corrector, averaged = samples.fitted(folder, settings), samples.fitted(folder, settings)
+    before = weights(averaged)
+    optimiser = Optimiser(corrector, settings.stages[0], averaged, World())
+    optimiser.step(sum(p.square().sum() for p in corrector.network.parameters()), 0.5)
+    torch.testing.assert_close(weights(averaged), 0.75 * before + 0.25 * weights(corrector))
+    assert not torch.equal(weights(averaged), before)
+
+
+def test_bfloat16_is_close_to_full_precision_but_not_the_same(folder):
+    settings = samples.config(samples.one_step())
+    corrector = samples.fitted(folder, settings)
+    batch = samples.windows(folder, settings)[0].batch([3, 30])
+    full, half = (
+        one_step_loss(corrector, batch, samples.one_step(amp=amp)).item()
+        for amp in ("none", "bf16")
+    )
+    assert half == pytest.approx(full, rel=0.05)
+    assert half != full
+    assert one_step_loss(corrector, batch, samples.one_step()).item() == full
+
+
+# --- scenes ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def group(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    return SceneGroup(recordings, "plain", "cpu")
+
+
+def started(group, frames):
+    positions, velocities = group.states(frames)
+    none = torch.zeros(int(group.counts.sum()), 3, dtype=torch.float64)
+    return Rollouts(positions, velocities, none, frames, np.zeros_like(frames))
+
+
+def test_groups_hold_all_simulations_once_and_meshes_stay_together():
+    recordings = load_recordings(samples.TINY, "training", "plain")
+    every = [
+        group
+        for rank in (0, 1)
+        for group in grouped(recordings, 3, seed=5, rank=rank, world_size=2)
+    ]
+    assert sorted(r.name for g in every for r in g) == sorted(r.name for r in recordings)
+    whole = [r for g in grouped(recordings, 3, seed=5) for r in g]
+    meshes = [r.mesh for r in whole]
+    assert len([1 for a, b in itertools.pairwise(meshes) if a != b]) == 5
+    assert meshes != [r.mesh for g in grouped(recordings, 3, seed=6) for r in g]
+
+
+def test_states_of_the_reference_have_backward_differences(group):
+    frames = np.array([0, 4, 20])
+    positions, velocities = group.states(frames)
+    truth = group.recordings[1].reference.astype(float)
+    count = truth.shape[1]
+    np.testing.assert_array_equal(positions[1, :count].numpy(), truth[4])
+    np.testing.assert_allclose(velocities[1, :count].numpy(), (truth[4] - truth[3]) / 0.01)
+    assert not velocities[0].any()
+    assert not positions[0, group.stepper.node_counts[0] :].any()
+
+
+def test_one_unrolled_step_without_correction_has_the_loss_of_the_stored_prediction(group, folder):
+    settings = samples.config(samples.unrolled())
+    silent = samples.fitted(folder, settings, silent=True)
+    frames = np.array([2, 7, 11])
+    found = unroll(group, silent, started(group, frames), 1, settings.stages[0])
+    windows, _ = samples.windows(folder, settings)
+    batch = windows.batch([2, 20 + 7, 40 + 11])
+    squares = batch.bodies.body_means(batch.target.square().sum(dim=1)) / batch.scale
+    assert found.alive.all()
+    torch.testing.assert_close(found.losses, squares, rtol=2e-3, atol=0)
+
+
+def test_unrolled_losses_are_means_over_steps_and_ages_count(group, folder):
+    settings = samples.config(samples.unrolled(steps=2))
+    silent = samples.fitted(folder, settings, silent=True)
+    start = replace(started(group, np.array([2, 7, 11])), ages=np.array([0, 3, 0]))
+    both = unroll(group, silent, start, 2, settings.stages[0])
+    first = unroll(group, silent, start, 1, settings.stages[0])
+    second = unroll(group, silent, first.end, 1, settings.stages[0])
+    torch.testing.assert_close(both.losses, (first.losses + second.losses) / 2)
+    assert both.end.ages.tolist() == [2, 5, 2]
+    assert both.end.frames.tolist() == [4, 9, 13]
+    errors = base_errors(group.recordings).after(torch.tensor([2, 5, 2]))
+    truth = group.truth(np.array([4, 9, 13]))
+    squares = group.sums((both.end.positions - truth).square().sum(dim=2)) / group.counts
+    torch.testing.assert_close(second.losses, squares / errors)
+
+
+@pytest.mark.parametrize("through_solver", [False, True])
+def test_weights_get_the_derivative_of_the_unrolled_loss(group, folder, through_solver):
+    settings = samples.config(samples.unrolled(through_solver=through_solver))
+    corrector = samples.fitted(folder, settings)
+    start = started(group, np.array([5, 6, 7]))
+    steps = 2 if through_solver else 1  # what is left out without is only what is earlier
+    bias = corrector.network.decoder[-1].bias
+
+    def loss():
+        return unroll(group, corrector, start, steps, settings.stages[0]).losses.mean()
+
+    loss().backward()
+    slope, h = float(bias.grad[1]), 1e-3
+    values = []
+    with torch.no_grad():
+        for sign in (1, -1):
+            bias[1] += sign * h
+            values.append(loss().item())
+            bias[1] -= sign * h
+    assert slope == pytest.approx((values[0] - values[1]) / (2 * h), rel=2e-3)
+
+
+def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
+    settings = samples.config(samples.unrolled(batch=3))
+    corrector = samples.fitted(folder, settings)
+    fine = unroll(group, corrector, started(group, np.array([5, 6, 7])), 2, settings.stages[0])
+    start = started(group, np.array([5, 6, 7]))
+    start.positions[1, 20] = torch.nan
+    found = unroll(group, corrector, start, 2, settings.stages[0])
+    assert found.alive.tolist() == [True, False, True]
+    assert found.losses[1] == 0.0
+    torch.testing.assert_close(found.losses[[0, 2]], fine.losses[[0, 2]])
+    batches = UnrolledBatches(group.recordings, "plain", settings.stages[0])
+    monkeypatch.setattr("pdcorrect.corrector.unrolled.unroll", lambda *_: found)
+    loss = batches.loss(corrector, 0, 2)
+    assert loss.item() == pytest.approx(found.losses[[0, 2]].mean().item())
+    assert batches.failed == 1
+
+
+def test_a_pool_goes_on_where_it_was(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(start="pool", restart=0.0, steps=2)
+    corrector = samples.fitted(folder, samples.config(stage), silent=True)
+    batches = UnrolledBatches(recordings, "plain", stage)
+    ages = []
+    for iteration in range(3):
+        batches.loss(corrector, iteration, 2)
+        numbers, _ = batches.state_dict()
+        ages.append(numbers["pool"]["0"]["ages"])
+        assert all(f <= 20 for f in numbers["pool"]["0"]["frames"])
+    assert ages[0] == [2, 2, 2]
+    assert any(age == 4 for age in ages[1])
+    always = UnrolledBatches(recordings, "plain", stage.model_copy(update={"restart": 1.0}))
+    for iteration in range(2):
+        always.loss(corrector, iteration, 2)
+        assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
+
+
+def test_too_long_a_horizon_is_refused(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    with pytest.raises(InputError, match="0 simulations of 21 steps or more"):
+        UnrolledBatches(recordings, "plain", samples.unrolled(steps=21))
+
+
+# --- validation --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", ["plain", "best"])
+def test_a_silent_corrector_has_the_omega_of_its_base_model(folder, base):
+    settings = samples.config(samples.one_step(), base=base)
+    recordings = load_recordings(folder, "validation", base)
+    scores = Validation(recordings, base)(samples.fitted(folder, settings, silent=True))
+    _, motions = read_arrays(folder / "validation" / "mesh-0001.h5", (), ("plain", "best"))
+    expected = [
+        error_corrected(m.rollouts[base], m.rollouts["plain"], m.positions) for m in motions
+    ]
+    assert scores.failed == 0
+    np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
+    assert scores.mean == pytest.approx(np.mean(scores.omegas))
+
+
+def test_a_corrector_that_ruins_rollouts_has_the_least_omega(folder):
+    settings = samples.config(samples.one_step())
+    corrector = samples.fitted(folder, settings)
+    corrector.normaliser.output_scale.fill_(1e9)
+    scores = Validation(load_recordings(folder, "validation", "plain"), "plain")(corrector)
+    assert scores.omegas.tolist() == [-100.0, -100.0]
+
+
+# --- files -------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_comes_back(tmp_path):
+    tensors = {"a": torch.tensor([1.0, np.pi]), "b": torch.tensor(3), "c": torch.zeros(0, 2)}
+    write_checkpoint(tmp_path / "c", {"x": 0.1 + 0.2, "list": [1, None]}, tensors)
+    content, found = read_checkpoint(tmp_path / "c")
+    assert content == {"x": 0.1 + 0.2, "list": [1, None]}
+    assert all(torch.equal(found[n], x) and found[n].dtype == x.dtype for n, x in tensors.items())
+
+
+def test_every_damaged_checkpoint_is_refused_by_name(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    write_checkpoint(path, {"iteration": 12}, {"a": torch.arange(6.0), "b": torch.ones(2, 2)})
+    whole = path.read_bytes()
+    for i in range(len(whole)):
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ 0x41]) + whole[i + 1 :])
+        try:
+            content, tensors = read_checkpoint(path)
+        except FileFormatError as error:
+            assert path.name in str(error)
+        else:  # a byte that means nothing, such as padding
+            assert content == {"iteration": 12}
+            assert torch.equal(tensors["a"], torch.arange(6.0))
+            assert torch.equal(tensors["b"], torch.ones(2, 2))
+    path.write_bytes(whole[:-3])
+    with pytest.raises(FileFormatError, match=path.name):
+        read_checkpoint(path)
+    path.write_bytes(whole.replace(b'"version":"1"', b'"version":"9"'))
+    with pytest.raises(FileVersionError, match="version 9"):
+        read_checkpoint(path)
+
+
+def test_other_settings_are_refused_by_their_key():
+    one = {"config": {"stages": [{"batch": 3}, {"batch": 4}]}, "data": "a"}
+    check_same(one, json.loads(json.dumps(one)), "file")
+    other = {"config": {"stages": [{"batch": 3}, {"batch": 5}]}, "data": "a"}
+    with pytest.raises(InputError, match=r"file: was begun with config.stages.1.batch = 4"):
+        check_same(one, other, "file")
+
+
+# --- whole trainings ---------------------------------------------------------------------
+
+MIXED = (
+    samples.one_step(iterations=7, noise={"tau": 0.2}, ema=0.9),
+    samples.unrolled(iterations=5, steps=(1, 2), start="pool", batch=2, restart=0.5),
+)
+
+
+def trained(settings, folder, output, **options):
+    training = Training(settings, folder, output, **options)
+    training.run()
+    return training
+
+
+def rows(output):
+    """The history without its times."""
+    with (output / "history.csv").open() as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+OFTEN = {
+    "checkpoint_every": {"iterations": 2}, "validate_every": {"iterations": 4}, "report_every": 3,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(short, tmp_path_factory):
+    """A training of both kinds of stages in one go, and its folder."""
+    torch.set_num_threads(1)
+    output = tmp_path_factory.mktemp("whole")
+    return trained(samples.config(*MIXED, **OFTEN), short, output), output
+
+
+def same_files(one, other):
+    """Whether two trainings have the same weights, moments and histories, bit by bit."""
+    (_, mine), (_, others) = (read_checkpoint(x / "checkpoint.safetensors") for x in (one, other))
+    assert mine.keys() == others.keys()
+    assert all(torch.equal(x, others[name]) for name, x in mine.items())
+    assert rows(one) == rows(other)
+    assert len(rows(one)) > 5
+
+
+@pytest.mark.parametrize("stop", [random.Random(os.getpid()).randrange(1, 7), 10])
+def test_a_training_that_was_interrupted_ends_with_the_same_bits(
+    short, uninterrupted, tmp_path, stop, monkeypatch
+):
+    settings = samples.config(*MIXED, **OFTEN)
+    whole, folder_of_whole = uninterrupted
+    step, done = Optimiser.step, []
+
+    def interrupted(self, *arguments):
+        if len(done) == stop:
+            raise KeyboardInterrupt
+        done.append(1)
+        step(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Optimiser, "step", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            trained(settings, short, tmp_path)
+    torch.randn(3)  # the program's own random numbers have no say
+    parts = trained(settings, short, tmp_path, resume=True)
+    assert parts.progress.total == whole.progress.total == 12
+    assert torch.equal(weights(parts.corrector), weights(whole.corrector)), f"stop = {stop}"
+    same_files(folder_of_whole, tmp_path)
+
+
+def test_a_training_leaves_the_best_model_with_its_record(short, tmp_path):
+    settings = samples.config(samples.one_step(iterations=6), validate_every={"iterations": 3})
+    training = trained(settings, short, tmp_path / "out")
+    found = load_model(tmp_path / "out" / "model")
+    table = [row for row in rows(tmp_path / "out") if row["omega_mean"]]
+    best = max(float(row["omega_mean"]) for row in table)
+    assert len(table) == 2
+    assert found.record.metrics["omega_mean"] == pytest.approx(best, rel=1e-4)
+    assert found.record.dataset == "tiny"
+    assert found.record.training["config"]["stages"][0]["iterations"] == 6
+    assert len(found.record.dataset_hash) == 64
+    assert torch.equal(weights(found.corrector), weights(training.corrector))
+    scores = Validation(load_recordings(short, "validation", "plain"), "plain")(found.corrector)
+    assert scores.mean == pytest.approx(best, rel=1e-4)
+    assert TrainingConfig.load(tmp_path / "out" / "config.toml") == settings
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
+
+
+@pytest.mark.parametrize("begin", ["best", "last"])
+def test_a_stage_begins_from_the_best_or_the_last_weights(short, tmp_path, begin, monkeypatch):
+    settings = samples.config(
+        samples.one_step(iterations=3), samples.one_step(iterations=1, begin=begin),
+        validate_every={"iterations": 1},
+    )  # fmt: skip
+    found, shown = [], iter([5.0, 7.0, 6.0, 1.0])
+
+    def judge(self, corrector):
+        found.append(weights(corrector))
+        return Scores(np.array([next(shown)]), 0)
+
+    monkeypatch.setattr(Validation, "__call__", judge)
+    monkeypatch.setattr(
+        Optimiser, "step", lambda self, *_: [w.data.add_(1.0) for w in self._weights]
+    )
+    training = trained(settings, short, tmp_path / "out")
+    torch.testing.assert_close(found[3], found[1 if begin == "best" else 2] + 1.0)
+    assert torch.equal(weights(training.corrector), found[1])
+
+
+def test_training_ends_early_when_it_no_longer_helps(short, tmp_path):
+    stage = samples.one_step(iterations=50, patience=2, rate={"peak": 1e-12, "last": 1e-12})
+    settings = samples.config(stage, validate_every={"iterations": 1})
+    training = trained(settings, short, tmp_path / "out")
+    assert training.progress.total < 25
+    assert training.progress.stage == 1
+
+
+def test_a_training_without_a_validation_split_keeps_its_last_weights(tmp_path):
+    data = samples.dataset(tmp_path / "data", training=(0,), validation=())
+    training = trained(samples.config(samples.one_step()), data, tmp_path / "out")
+    found = load_model(tmp_path / "out" / "model").corrector
+    assert torch.equal(weights(found), weights(training.corrector))
+
+
+def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
+    text = samples.config(samples.one_step(iterations=3), report_every=1).to_toml()
+    (tmp_path / "c.toml").write_text(text)
+    call = ("train", tmp_path / "c.toml", "--data", short, "-o", tmp_path / "out")
+    status, out, err = program(*call, "--seconds", 1e-6)
+    assert status == 1, err
+    assert "not finished after 1 iterations" in out
+    status, _, err = program(*call)
+    assert status == 2
+    assert "--resume" in err
+    status, out, err = program(*call, "--resume", "--evaluate", "validation")
+    assert status == 0, err
+    assert "validation/mesh-0001/1" in out
+    assert "median" in out
+    assert [row["iteration"] for row in rows(tmp_path / "out") if row["loss"]] == ["1", "2", "3"]
+    status, out, err = program(*call, "--resume")
+    assert status == 0, err
+    (tmp_path / "c.toml").write_text(text.replace("batch = 3", "batch = 2"))
+    status, _, err = program(*call, "--resume")
+    assert status == 2
+    assert "config.stages.0.batch = 3" in err
+
+
+# --- several processes -------------------------------------------------------------------
+
+_WORKER = """
+import sys
+from pdcorrect.corrector.training import Training
+from pdcorrect.corrector.training_config import TrainingConfig
+from pdcorrect.corrector.world import joined
+import torch
+torch.set_num_threads(1)
+with joined("cpu") as (world, device):
+    assert world.size == 2
+    Training(TrainingConfig.load(sys.argv[1]), sys.argv[2], sys.argv[3], world=world).run()
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
+    settings = samples.config(
+        samples.one_step(iterations=3, batch=2), checkpoint_every={"iterations": 3}
+    )
+    (tmp_path / "c.toml").write_text(settings.to_toml())
+    script = tmp_path / "worker.py"
+    script.write_text(_WORKER)
+    command = [
+        sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone",
+        str(script), str(tmp_path / "c.toml"), str(folder), str(tmp_path / "out"),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert len(rows(tmp_path / "out")) == 2
+
+    corrector = Training(settings, folder, tmp_path / "one").corrector
+    windows, _ = samples.windows(folder, settings)
+    stage = settings.stages[0]
+    optimiser = Optimiser(corrector, stage, None, World())
+    from pdcorrect.corrector.sources import make_source
+
+    parts = [make_source(stage, 0, settings, windows, [], World(rank, 2)) for rank in (0, 1)]
+    for k in range(3):
+        loss = sum(part.loss(corrector, k, 1) for part in parts) / 2
+        optimiser.step(loss, k / 3)
+    found = load_model(tmp_path / "out" / "model").corrector
+    torch.testing.assert_close(weights(found), weights(corrector), rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_killed_training_ends_with_the_same_bits(short, uninterrupted, tmp_path):
+    settings = samples.config(*MIXED, **OFTEN)
+    (tmp_path / "c.toml").write_text(settings.to_toml())
+    output = tmp_path / "out"
+    call = [
+        sys.executable, "-m", "pdcorrect.cli", "train", tmp_path / "c.toml", "--data", short,
+        "-o", output, "--resume",
+    ]  # fmt: skip
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    killed = 0
+    for _ in range(3):
+        known = [r["iteration"] for r in rows(output)] if (output / "history.csv").exists() else []
+        process = subprocess.Popen(call, env=environment, stdout=subprocess.PIPE, text=True)
+        process.stdout.readline()
+        time.sleep(random.Random(f"{os.getpid()} {known}").uniform(0, 0.5))
+        process.kill()
+        process.communicate()
+        killed += process.returncode == -9
+    assert killed
+    assert subprocess.run(call, env=environment, stdout=subprocess.PIPE).returncode == 0
+    same_files(uninterrupted[1], output)
+
+
+# --- slow --------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_one_trajectory_is_learned_by_heart(tmp_path):
+    data = samples.dataset(tmp_path / "data", training=(0,), validation=())
+    (data / "validation").mkdir(exist_ok=True)
+    text = (data / "training" / "mesh-0000.h5").read_bytes()
+    (data / "validation" / "mesh-0000.h5").write_bytes(text)
+    architecture = {"preset": "compact", "changes": {"layers": 3, "width": 48}}
+    settings = samples.config(
+        samples.one_step(iterations=500, batch=20, rate={"peak": 4e-3}, noise={"tau": 0.03}),
+        samples.unrolled(
+            begin="last", iterations=60, steps=(5, 10, 20), batch=1, through_solver=True,
+            rate={"peak": 6e-4},
+        ),
+        corrector=architecture, validate_every={"iterations": 520}, base="best",
+    )  # fmt: skip
+    training = trained(settings, data, tmp_path / "out")
+    assert training.progress.best >= 99.9
