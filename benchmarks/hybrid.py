@@ -23,13 +23,13 @@ from typing import Any
 
 import torch
 
-from pdcorrect.corrector.candidates import saved_candidates
-from pdcorrect.corrector.speed import measure_speed
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.rebuild import rebuilt_problems
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.environment import environment
+from pdcorrect.evaluation.candidates import saved_candidates
+from pdcorrect.evaluation.speed import measure_speed
 
 
 def options() -> argparse.Namespace:

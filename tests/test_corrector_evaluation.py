@@ -19,25 +19,25 @@ from typer.testing import CliRunner  # noqa: E402
 import pdcorrect as pc  # noqa: E402
 from pdcorrect.batch.states import BatchState  # noqa: E402
 from pdcorrect.cli import app  # noqa: E402
-from pdcorrect.corrector import evaluation_table as tables  # noqa: E402
-from pdcorrect.corrector.candidates import saved_candidates  # noqa: E402
-from pdcorrect.corrector.cases import Case, read_cases  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
-from pdcorrect.corrector.evaluation import Candidate, evaluate  # noqa: E402
-from pdcorrect.corrector.measures import (  # noqa: E402
+from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
+from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
+from pdcorrect.evaluation import tables  # noqa: E402
+from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
+from pdcorrect.evaluation.cases import Case, read_cases  # noqa: E402
+from pdcorrect.evaluation.evaluation import Candidate, evaluate  # noqa: E402
+from pdcorrect.evaluation.measures import (  # noqa: E402
     Outcome,
     TrajectoryMeasures,
     measure,
     time_within,
 )
-from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
-from pdcorrect.corrector.resampling import mean_interval, over_seeds, summarise  # noqa: E402
-from pdcorrect.corrector.rollouts import roll_out, single_steps  # noqa: E402
-from pdcorrect.corrector.speed import _loosest, measure_speed  # noqa: E402
-from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
-from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
+from pdcorrect.evaluation.resampling import mean_interval, over_seeds, summarise  # noqa: E402
+from pdcorrect.evaluation.rollouts import roll_out, single_steps  # noqa: E402
+from pdcorrect.evaluation.speed import _loosest, measure_speed  # noqa: E402
 from pdcorrect.figures.learning import plot_omega  # noqa: E402
 from pdcorrect.metrics import error_corrected, mean_squared_error  # noqa: E402
 from pdcorrect.state import State, Status  # noqa: E402

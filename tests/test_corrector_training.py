@@ -18,24 +18,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.corrector.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
-from pdcorrect.corrector.fitting import fit_normaliser  # noqa: E402
-from pdcorrect.corrector.losses import BaseErrors, body_losses  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
-from pdcorrect.corrector.optimisation import Optimiser, rate_at  # noqa: E402
-from pdcorrect.corrector.progress import check_same  # noqa: E402
-from pdcorrect.corrector.recordings import base_errors, load_recordings  # noqa: E402
-from pdcorrect.corrector.scenes import SceneGroup, grouped  # noqa: E402
-from pdcorrect.corrector.sources import OneStepBatches, one_step_loss, share_done  # noqa: E402
-from pdcorrect.corrector.training import Training  # noqa: E402
-from pdcorrect.corrector.training_config import (  # noqa: E402
-    Loss,
-    Rate,
-    TrainingConfig,
-)
-from pdcorrect.corrector.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
-from pdcorrect.corrector.validation import Scores, Validation  # noqa: E402
-from pdcorrect.corrector.world import World  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
     ConvergenceError,
@@ -44,6 +27,23 @@ from pdcorrect.errors import (  # noqa: E402
     InputError,
 )
 from pdcorrect.metrics import error_corrected  # noqa: E402
+from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
+from pdcorrect.training.config import (  # noqa: E402
+    Loss,
+    Rate,
+    TrainingConfig,
+)
+from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
+from pdcorrect.training.losses import BaseErrors, body_losses  # noqa: E402
+from pdcorrect.training.optimisation import Optimiser, rate_at  # noqa: E402
+from pdcorrect.training.progress import check_same  # noqa: E402
+from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
+from pdcorrect.training.sources import OneStepBatches, one_step_loss, share_done  # noqa: E402
+from pdcorrect.training.training import Training  # noqa: E402
+from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
+from pdcorrect.training.validation import Scores, Validation  # noqa: E402
+from pdcorrect.training.world import World  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 BASIC = '[[stages]]\nkind = "one-step"\niterations = 1\n'
@@ -498,7 +498,7 @@ def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
     assert found.losses[1] == 0.0
     torch.testing.assert_close(found.losses[[0, 2]], fine.losses[[0, 2]])
     batches = UnrolledBatches(group.recordings, "plain", settings.stages[0])
-    monkeypatch.setattr("pdcorrect.corrector.unrolled.unroll", lambda *_: found)
+    monkeypatch.setattr("pdcorrect.training.unrolled.unroll", lambda *_: found)
     loss = batches.loss(corrector, 0, 2)
     assert loss.item() == pytest.approx(found.losses[[0, 2]].mean().item())
     assert batches.failed == 1
@@ -743,9 +743,9 @@ def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
 
 _WORKER = """
 import sys
-from pdcorrect.corrector.training import Training
-from pdcorrect.corrector.training_config import TrainingConfig
-from pdcorrect.corrector.world import joined
+from pdcorrect.training.training import Training
+from pdcorrect.training.config import TrainingConfig
+from pdcorrect.training.world import joined
 import torch
 torch.set_num_threads(1)
 with joined("cpu") as (world, device):
@@ -774,7 +774,7 @@ def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
     windows, _ = samples.windows(folder, settings)
     stage = settings.stages[0]
     optimiser = Optimiser(corrector, stage, None, World())
-    from pdcorrect.corrector.sources import make_source
+    from pdcorrect.training.sources import make_source
 
     parts = [make_source(stage, 0, settings, windows, [], World(rank, 2)) for rank in (0, 1)]
     for k in range(3):

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 
-from pdcorrect.corrector.fitting import fit_normaliser
-from pdcorrect.corrector.recordings import load_recordings
-from pdcorrect.corrector.training_config import Stage, TrainingConfig
-from pdcorrect.corrector.windows import StepWindows
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.training.config import Stage, TrainingConfig
+from pdcorrect.training.fitting import fit_normaliser
+from pdcorrect.training.recordings import load_recordings
+from pdcorrect.training.windows import StepWindows
 
 TINY = Path(__file__).parent.parent / "datasets" / "tiny"
 SMALL = {"preset": "compact", "changes": {"layers": 1, "width": 8}}

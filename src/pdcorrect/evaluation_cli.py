@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 if TYPE_CHECKING:
-    from pdcorrect.corrector.candidates import SavedCandidate
-    from pdcorrect.corrector.evaluation import Evaluation
+    from pdcorrect.evaluation.candidates import SavedCandidate
+    from pdcorrect.evaluation.evaluation import Evaluation
 
 
 def evaluate(
@@ -46,9 +46,9 @@ def evaluate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from pdcorrect.corrector.candidates import saved_candidates
-    from pdcorrect.corrector.evaluation import evaluate as run
-    from pdcorrect.corrector.evaluation_table import write_evaluation
+    from pdcorrect.evaluation.candidates import saved_candidates
+    from pdcorrect.evaluation.evaluation import evaluate as run
+    from pdcorrect.evaluation.tables import write_evaluation
 
     *models, folder = paths
     if output and figures:
@@ -94,7 +94,7 @@ def _print(found: Evaluation, notes: list[str], seed: int) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pdcorrect.corrector.evaluation_table import tables
+    from pdcorrect.evaluation.tables import tables
 
     # Without a terminal lines are not broken, so that the tables remain Markdown.
     console = Console() if sys.stdout.isatty() else Console(width=400)
@@ -139,8 +139,8 @@ def _device(device: str) -> str:
 def _draw(found: Evaluation, folder: Path) -> list[Path]:
     import numpy as np
 
-    from pdcorrect.corrector.evaluation_table import mean_errors
     from pdcorrect.data.schema import PLAIN, REFERENCE
+    from pdcorrect.evaluation.tables import mean_errors
     from pdcorrect.figures.curves import plot_error_over_time
     from pdcorrect.figures.learning import plot_omega
 

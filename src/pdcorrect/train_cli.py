@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 if TYPE_CHECKING:
-    from pdcorrect.corrector.progress import Progress
-    from pdcorrect.corrector.training_config import TrainingConfig
+    from pdcorrect.training.config import TrainingConfig
+    from pdcorrect.training.progress import Progress
 
 _UNFINISHED = 1
 """Exit status if time was up before the training was finished."""
@@ -36,9 +36,9 @@ def train(
     Several processes: torchrun --nproc-per-node N -m pdcorrect.cli train ...
     Exit status 1 if time was up before the end.
     """
-    from pdcorrect.corrector.training import MODEL, Training
-    from pdcorrect.corrector.training_config import TrainingConfig
-    from pdcorrect.corrector.world import joined
+    from pdcorrect.training.config import TrainingConfig
+    from pdcorrect.training.training import MODEL, Training
+    from pdcorrect.training.world import joined
 
     loaded = TrainingConfig.load(config)
     with joined(device) as (world, own):
@@ -74,8 +74,8 @@ def _judge(model: Path, data: Path, split: str, config: TrainingConfig, device: 
     from rich.table import Table
 
     from pdcorrect.corrector.model_io import load_model
-    from pdcorrect.corrector.recordings import load_recordings
-    from pdcorrect.corrector.validation import Validation
+    from pdcorrect.training.recordings import load_recordings
+    from pdcorrect.training.validation import Validation
 
     recordings = load_recordings(data, split, config.base)
     judge = Validation(recordings, config.base, velocity=config.velocity, device=device)

@@ -27,7 +27,7 @@ class Corrector(nn.Module):
     Attributes
     ----------
     normaliser : Normaliser
-        To be fitted before the first call; see `pdcorrect.corrector.fitting`.
+        To be fitted before the first call; see `pdcorrect.training.fitting`.
     network : MeshGraphNetwork
     """
 

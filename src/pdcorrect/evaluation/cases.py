@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.physics import energies
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
@@ -17,6 +16,7 @@ from pdcorrect.data.rebuild import COARSE, rebuilt_problems
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.errors import InputError
+from pdcorrect.evaluation.physics import energies
 from pdcorrect.fem.problem import Problem
 from pdcorrect.metrics import EnergyBalance
 

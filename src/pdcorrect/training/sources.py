@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.losses import body_losses
-from pdcorrect.corrector.precision import network_precision
-from pdcorrect.corrector.recordings import Recording
-from pdcorrect.corrector.training_config import Stage, TrainingConfig
-from pdcorrect.corrector.unrolled import UnrolledBatches
-from pdcorrect.corrector.windows import StepBatch, StepWindows
-from pdcorrect.corrector.world import World
+from pdcorrect.training.config import Stage, TrainingConfig
+from pdcorrect.training.losses import body_losses
+from pdcorrect.training.precision import network_precision
+from pdcorrect.training.recordings import Recording
+from pdcorrect.training.unrolled import UnrolledBatches
+from pdcorrect.training.windows import StepBatch, StepWindows
+from pdcorrect.training.world import World
 
 
 class Source(Protocol):

@@ -9,7 +9,7 @@ from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
 from pdcorrect.corrector.normaliser import Moments
-from pdcorrect.corrector.windows import StepWindows
+from pdcorrect.training.windows import StepWindows
 
 _AT_ONCE = 32
 """Windows."""

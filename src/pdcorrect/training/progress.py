@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from pdcorrect.corrector.training_config import Every
 from pdcorrect.errors import InputError
+from pdcorrect.training.config import Every
 
 
 @dataclass

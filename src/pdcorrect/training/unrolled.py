@@ -13,13 +13,13 @@ from torch import Tensor
 
 from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.losses import body_losses, mean_of
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.corrector.precision import network_precision
-from pdcorrect.corrector.recordings import Base, Recording
-from pdcorrect.corrector.scenes import Frames, SceneGroup, grouped
-from pdcorrect.corrector.training_config import Stage
 from pdcorrect.errors import InputError
+from pdcorrect.training.config import Stage
+from pdcorrect.training.losses import body_losses, mean_of
+from pdcorrect.training.precision import network_precision
+from pdcorrect.training.recordings import Base, Recording
+from pdcorrect.training.scenes import Frames, SceneGroup, grouped
 
 Flags = NDArray[np.bool_]
 

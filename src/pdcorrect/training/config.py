@@ -50,7 +50,7 @@ class Architecture(Strict):
 
 
 class Loss(Strict):
-    """What is minimised; see `pdcorrect.corrector.losses`.
+    """What is minimised; see `pdcorrect.training.losses`.
 
     Attributes
     ----------

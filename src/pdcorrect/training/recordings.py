@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.losses import LEAST_ERROR, BaseErrors
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
 from pdcorrect.data.shard_arrays import read_header
@@ -20,6 +19,7 @@ from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
 Base = Literal["plain", "best"]
 Array = NDArray[Any]
@@ -43,7 +43,7 @@ class Recording:
     reference, plain : (T+1, N, 3)
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
-        Mean squared errors of the base model, m2, see `pdcorrect.corrector.losses`.
+        Mean squared errors of the base model, m2, see `pdcorrect.training.losses`.
     """
 
     dataset: str

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.evaluation import EvaluatedRun, Evaluation
-from pdcorrect.corrector.measures import TrajectoryMeasures
-from pdcorrect.corrector.resampling import SeedSummary, Summary, over_seeds, summarise
 from pdcorrect.data.schema import REFERENCE
+from pdcorrect.evaluation.evaluation import EvaluatedRun, Evaluation
+from pdcorrect.evaluation.measures import TrajectoryMeasures
+from pdcorrect.evaluation.resampling import SeedSummary, Summary, over_seeds, summarise
 from pdcorrect.replacement import make_folder, write_text
 
 VERSION = 1

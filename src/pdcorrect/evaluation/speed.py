@@ -13,8 +13,8 @@ import torch
 
 from pdcorrect.batch.states import BatchState
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.corrector.rollouts import Hybrid
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.evaluation.rollouts import Hybrid
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State

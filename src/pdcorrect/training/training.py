@@ -15,23 +15,23 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.checks import usable_device
-from pdcorrect.corrector.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.fitting import fit_normaliser
-from pdcorrect.corrector.history import History
 from pdcorrect.corrector.model_io import ModelRecord, save_model
-from pdcorrect.corrector.optimisation import Optimiser, rate_at
-from pdcorrect.corrector.progress import Progress, check_same
-from pdcorrect.corrector.recordings import data_hash, load_recordings
-from pdcorrect.corrector.sources import Source, make_source, share_done
-from pdcorrect.corrector.training_config import Stage, TrainingConfig
-from pdcorrect.corrector.validation import Validation
-from pdcorrect.corrector.windows import StepWindows
-from pdcorrect.corrector.world import World
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import splits_of
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
+from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
+from pdcorrect.training.config import Stage, TrainingConfig
+from pdcorrect.training.fitting import fit_normaliser
+from pdcorrect.training.history import History
+from pdcorrect.training.optimisation import Optimiser, rate_at
+from pdcorrect.training.progress import Progress, check_same
+from pdcorrect.training.recordings import data_hash, load_recordings
+from pdcorrect.training.sources import Source, make_source, share_done
+from pdcorrect.training.validation import Validation
+from pdcorrect.training.windows import StepWindows
+from pdcorrect.training.world import World
 
 CHECKPOINT, MODEL, CONFIG = "checkpoint.safetensors", "model", "config.toml"
 

@@ -11,12 +11,12 @@ from typing import Any
 
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
-from pdcorrect.corrector.evaluation import Candidate
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
-from pdcorrect.corrector.rollouts import Hybrid
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
+from pdcorrect.evaluation.evaluation import Candidate
+from pdcorrect.evaluation.rollouts import Hybrid
 
 _GROUP_DIGITS = 8
 

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.corrector.cases import Case, read_cases
-from pdcorrect.corrector.measures import Measured, Outcome, TrajectoryMeasures, measure
-from pdcorrect.corrector.rollouts import Hybrid, roll_out, single_steps
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
+from pdcorrect.evaluation.cases import Case, read_cases
+from pdcorrect.evaluation.measures import Measured, Outcome, TrajectoryMeasures, measure
+from pdcorrect.evaluation.rollouts import Hybrid, roll_out, single_steps
 
 Array = NDArray[np.float64]
 OnCases = Callable[[int, int], None]

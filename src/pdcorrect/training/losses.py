@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.training_config import Loss
+from pdcorrect.training.config import Loss
 
 LEAST_ERROR = 1e-30
 """d1 and D count as at least this, m2."""

@@ -14,9 +14,9 @@ from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.corrector.recordings import Base, Recording
-from pdcorrect.corrector.scenes import SceneGroup
-from pdcorrect.corrector.world import World
+from pdcorrect.training.recordings import Base, Recording
+from pdcorrect.training.scenes import SceneGroup
+from pdcorrect.training.world import World
 
 LEAST = -100.0
 """Omega of a simulation whose rollout failed or is worse than this, per cent."""

@@ -13,7 +13,7 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.corrector.recordings import Base, Recording, base_errors, make_problems
+from pdcorrect.training.recordings import Base, Recording, base_errors, make_problems
 
 Frames = NDArray[np.int64]
 

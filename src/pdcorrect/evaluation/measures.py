@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.cases import Case
-from pdcorrect.corrector.physics import energies, stress_error
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import PLAIN
+from pdcorrect.evaluation.cases import Case
+from pdcorrect.evaluation.physics import energies, stress_error
 from pdcorrect.metrics import (
     angular_momentum,
     error_over_time,

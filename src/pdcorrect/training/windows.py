@@ -18,10 +18,10 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
-from pdcorrect.corrector.recordings import Base, Recording
 from pdcorrect.data.config import TRAINING
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.sampling import ShardShuffle
+from pdcorrect.training.recordings import Base, Recording
 
 _SHARE_OF_DEVICE = 0.3
 """Of a GPU's free memory, which the windows may fill."""

@@ -1,0 +1,1 @@
+"""Training of correctors, one-step and with the simulator in the loop."""
