@@ -725,6 +725,12 @@ def test_components_that_never_change_become_zero(constant):
     assert largest(other) == pytest.approx(1.0 if constant else 0.0)
 
 
+def test_rounding_of_stored_positions_is_not_enlarged():
+    rng = np.random.default_rng(0)
+    x = tensor((1.0 + 1e-7 * rng.normal(size=1000))[:, None])
+    assert largest(fitted(a=x).joined({"a": x}, None)) < 1e-6
+
+
 def test_inputs_bend_towards_the_clip():
     x = tensor(np.linspace(-1.0, 1.0, 50)[:, None])
     normaliser = fitted(a=x)

@@ -457,12 +457,15 @@ def test_what_states_remember_is_taken_up_again(program, scene_file, tmp_path, m
     ("number", "status"), [(signal.SIGINT, cli.INTERRUPTED), (signal.SIGTERM, cli.TERMINATED)]
 )
 def test_a_signal_closes_the_file_and_the_run_can_go_on(
-    program, scene_file, tmp_path, monkeypatch, number, status
+    program, scene_file, tmp_path, monkeypatch, request, number, status
 ):
     path, expected = tmp_path / "run.h5", tmp_path / "expected.h5"
     program("simulate", scene_file, "-o", expected)
     real = pc.ProjectiveDynamics.__call__
     handler = signal.getsignal(signal.SIGTERM)
+    # a shell without job control lets what it starts in the background ignore SIGINT
+    interrupt = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, interrupt))
 
     def stopped(self, state, *rest):
         if state.time > 0.035:

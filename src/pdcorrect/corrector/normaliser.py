@@ -10,8 +10,11 @@ from torch import Tensor, nn
 from pdcorrect.corrector.features import UNSCALED
 from pdcorrect.errors import InputError
 
-_LEAST_DEVIATION = 1e-8
-"""Of the largest magnitude; below it a component counts as constant."""
+_LEAST_DEVIATION = 1e-5
+"""Of the largest magnitude; below it a component counts as constant.
+
+Stored positions are rounded to single precision, which alone is 1e-7 of an edge.
+"""
 
 
 class Moments:
