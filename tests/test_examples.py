@@ -81,7 +81,7 @@ _names: dict = {}
 @pytest.fixture
 def example_folder(tmp_path):
     """A folder that looks like the checkout, where the pages' relative paths hold."""
-    for name in ("examples", "datasets"):
+    for name in ("examples", "datasets", "models"):
         (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
 
