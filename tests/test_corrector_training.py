@@ -34,7 +34,7 @@ from pdcorrect.training.config import (  # noqa: E402
     TrainingConfig,
 )
 from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
-from pdcorrect.training.losses import BaseErrors, body_losses  # noqa: E402
+from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402, mean_of
 from pdcorrect.training.optimisation import Optimiser, rate_at  # noqa: E402
 from pdcorrect.training.progress import check_same  # noqa: E402
 from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
@@ -828,3 +828,10 @@ def test_one_trajectory_is_learned_by_heart(tmp_path):
     )  # fmt: skip
     training = trained(settings, data, tmp_path / "out")
     assert training.progress.best >= 99.9
+
+
+def test_a_batch_without_a_scene_that_stepped_has_no_loss():
+    values, none = torch.ones(2), torch.zeros(2, dtype=torch.bool)
+    assert torch.isnan(mean_of(values, none))
+    values = torch.tensor([1.0, torch.nan])
+    assert mean_of(values, ~torch.isnan(values)) == 1.0

@@ -77,6 +77,6 @@ def body_losses(
 
 
 def mean_of(values: Tensor, chosen: Tensor) -> Tensor:
-    """Mean of the chosen values; zero, with a zero gradient, where none is chosen."""
+    """Mean of the chosen values; NaN where none is chosen, so that the batch does not count."""
     kept = torch.where(chosen, values, 0.0)
-    return kept.sum() / chosen.sum().clamp_min(1)
+    return kept.sum() / chosen.sum()

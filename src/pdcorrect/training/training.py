@@ -149,13 +149,14 @@ class Training:
             at.stepped(self._tick())
             if at.total % self.config.report_every == 0:
                 self._report(stage, optimiser, source, share)
+            kept = False
             if at.due(self.config.validate_every, at.validated):
-                self._validate(shown)
+                kept = self._validate(shown)
                 if stage.patience is not None and at.stale >= stage.patience:
                     break
             late = at.seconds >= self._limit
-            if late or at.due(self.config.checkpoint_every, at.saved):
-                self._save(optimiser, source)
+            if late or kept or at.due(self.config.checkpoint_every, at.saved):
+                self._save(optimiser, source)  # with new best weights, of which model/ is made
             if late:
                 return False
         self._report(stage, optimiser, source, 1.0)
@@ -208,12 +209,12 @@ class Training:
                 skipped=int(told["skipped"]), failed_scenes=int(failed),
             )  # fmt: skip
 
-    def _validate(self, shown: Corrector) -> None:
-        """Free rollouts; the best weights are kept."""
+    def _validate(self, shown: Corrector) -> bool:
+        """Free rollouts; whether these weights are the best so far and were kept."""
         at = self.progress
         at.validated = at.now()
         if self._validation is None:
-            return
+            return False
         scores = self._validation(shown)
         at.passed(self._tick())
         at.validated = at.now()
@@ -221,9 +222,11 @@ class Training:
         self._tell(**metrics)
         value = metrics[f"omega_{self.config.select}"]
         at.stale += 1
-        if at.best is None or value > at.best:
-            at.best, at.stale = value, 0
-            self._keep(shown, metrics)
+        if at.best is not None and not value > at.best:
+            return False
+        at.best, at.stale = value, 0
+        self._keep(shown, metrics)
+        return True
 
     def _tell(self, **values: Any) -> None:
         at = self.progress
