@@ -710,3 +710,32 @@ def test_a_state_that_is_none_is_refused():
 def test_a_gate_without_meaning_is_refused(changes):
     with pytest.raises(ValueError, match=next(iter(changes))):
         Gate(**changes)
+
+
+@pytest.mark.parametrize("through_solver", [True, False])
+def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(through_solver):
+    scenes = problems((3, 1, 1), (2, 1, 1))
+    corrector = fitted(scenes, size=0.05)
+    weights = list(corrector.parameters())
+
+    def gradients(chosen, spoil):
+        stepper = pc.BatchStepper(chosen, 1e-12)
+        options = {"through_solver": through_solver, "on_failure": "zero"}
+        layer = HybridLayer(stepper, corrector, **options)
+        start = stepper.rest_state()
+        p, v = start.positions, start.velocities.clone()
+        if spoil:
+            v[1] = torch.nan
+        loss, nodes = 0.0, len(scenes[0].positions)
+        for k in range(2):
+            p, v, correction = layer(p, v, [k * stepper.time_step] * len(chosen))
+            if k == 0:
+                assert not (spoil and correction[nodes:].any())
+            loss = loss + (p - start.positions)[0, :nodes].square().sum()
+            loss = loss + correction[:nodes].square().sum()
+        return torch.autograd.grad(loss, weights)
+
+    found, expected = gradients(scenes, spoil=True), gradients(scenes[:1], spoil=False)
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, abs=1e-3 * float(other.abs().max()))
+    assert any(g.any() for g in found)

@@ -331,14 +331,37 @@ class HybridLayer(nn.Module):
             previous = None if previous is None else previous.detach()
         before = BatchState(positions, velocities, start_times(cells, times))
         if hybrid.placement == "state":
-            after = self._step(before, None)
-            correction = self.corrector.of_view(hybrid.view(before, after.positions, previous))
-            after = hybrid.moved(before, after, correction)
+            after, correction = self._corrected(before, self._step(before, None), previous)
         else:
             correction = self.corrector.of_view(hybrid.view(before, None, previous))
             force = hybrid.placement == "force"
             after = self._step(before, hybrid.nodes.forces(correction) if force else None)
         return after.positions, after.velocities, correction
+
+    def _corrected(
+        self, before: BatchState, after: BatchState, previous: Tensor | None
+    ) -> tuple[BatchState, Tensor]:
+        """The state after a step, corrected; scenes whose step failed have no part in it."""
+        hybrid = self._hybrid
+        stepped = torch.tensor(
+            [s.ok for s in self.steps.statuses[-1]], device=self.bodies.rest.device
+        )
+        ok, at_nodes = stepped[:, None, None], self.bodies.by_node(stepped)[:, None]
+        rest = hybrid.stepper.cells.rest[:, : before.positions.shape[1]]
+        seen = replace(
+            before, positions=torch.where(ok, before.positions, rest),
+            velocities=torch.where(ok, before.velocities, 0.0),
+        )  # fmt: skip
+        proposed = torch.where(ok, after.positions, rest)
+        known = None if previous is None else torch.where(at_nodes, previous, 0.0)
+        correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
+        correction = torch.where(at_nodes, correction, 0.0)
+        moved = hybrid.moved(before, after, correction)
+        final = replace(
+            moved, positions=torch.where(ok, moved.positions, after.positions.detach()),
+            velocities=torch.where(ok, moved.velocities, after.velocities.detach()),
+        )  # fmt: skip
+        return final, correction
 
     def _step(self, before: BatchState, forces: Tensor | None) -> BatchState:
         positions, velocities = self.steps(
