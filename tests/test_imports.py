@@ -119,6 +119,7 @@ ORDER = [
     "figures.curves",
     "figures.learning",
     "figures",
+    "toml_config",
     "data",
     "data.config",
     "data.families",

@@ -85,7 +85,26 @@ class _Hybrid:
         return replace(after, positions=positions, velocities=velocities, memory=memory)
 
 
-class BatchHybrid:
+class _WithNodes:
+    """Nodal values of all scenes with and without padding."""
+
+    _hybrid: _Hybrid
+
+    @property
+    def bodies(self) -> BodyGraph:
+        """The scenes as the network knows them, float64, on the stepper's device."""
+        return self._hybrid.nodes.graph
+
+    def flat(self, x: Tensor) -> Tensor:
+        """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
+        return self._hybrid.nodes.flat(x)
+
+    def padded(self, x: Tensor) -> Tensor:
+        """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
+        return self._hybrid.nodes.padded(x)
+
+
+class BatchHybrid(_WithNodes):
     """Steps many scenes and corrects each; no gradients.
 
     A scene whose correction is exactly zero, or refused, keeps its coarse step bit for bit.
@@ -119,19 +138,6 @@ class BatchHybrid:
         self._hybrid = _Hybrid(stepper, corrector, velocity)
         self.stepper, self.corrector, self.gate = stepper, corrector, gate
         check_gate(gate, corrector)
-
-    @property
-    def bodies(self) -> BodyGraph:
-        """The scenes as the network knows them, float64, on the stepper's device."""
-        return self._hybrid.nodes.graph
-
-    def flat(self, x: Tensor) -> Tensor:
-        """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return self._hybrid.nodes.flat(x)
-
-    def padded(self, x: Tensor) -> Tensor:
-        """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
-        return self._hybrid.nodes.padded(x)
 
     @torch.no_grad()
     def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
@@ -234,7 +240,7 @@ class BatchHybrid:
         return self.bodies.node_sums((correction != 0.0).any(dim=1).to(correction)) > 0.0
 
 
-class HybridLayer(nn.Module):
+class HybridLayer(_WithNodes, nn.Module):
     """One corrected step of many scenes, differentiable by the network's weights.
 
     Call it again with what it returned for more steps.  The corrector is a submodule.
@@ -284,19 +290,6 @@ class HybridLayer(nn.Module):
         self._hybrid = _Hybrid(stepper, corrector, velocity)
         self.corrector, self.through_solver = corrector, through_solver
         self.steps = PDLayer(stepper, on_failure=on_failure)
-
-    @property
-    def bodies(self) -> BodyGraph:
-        """The scenes as the network knows them, float64, on the stepper's device."""
-        return self._hybrid.nodes.graph
-
-    def flat(self, x: Tensor) -> Tensor:
-        """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return self._hybrid.nodes.flat(x)
-
-    def padded(self, x: Tensor) -> Tensor:
-        """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
-        return self._hybrid.nodes.padded(x)
 
     def forward(
         self,

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tomllib
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tomli_w
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import Count, NonNegative, Poisson, Positive, PositiveCount, Strict
+from pdcorrect.toml_config import TomlConfig
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
@@ -134,7 +131,7 @@ class ExtraSplit(Split):
     refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None
 
 
-class DatasetConfig(Strict):
+class DatasetConfig(TomlConfig):
     """A data set, up to the machine that computes it.
 
     Attributes
@@ -191,52 +188,7 @@ class DatasetConfig(Strict):
             raise ValueError("expected each extra split to have a name of its own")
         return self
 
-    @classmethod
-    def load(cls, path: str | Path) -> DatasetConfig:
-        """Read a configuration from a TOML file.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, is not TOML, or a key is wrong.
-        """
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
-            raise InputError(f"{path}: cannot be read ({reason}).") from None
-        return cls.from_toml(text, str(path))
-
-    @classmethod
-    def from_toml(cls, text: str, source: str = "configuration") -> DatasetConfig:
-        """Read a configuration from TOML text; ``source`` names it in messages."""
-        try:
-            return cls(**tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{source}: not valid TOML: {error}.") from None
-        except ValidationError as error:
-            raise InputError(f"{source}: {_explain(error)}") from None
-
-    def to_toml(self) -> str:
-        """The configuration as TOML, with every default written out."""
-        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
-
     def hash(self) -> str:
         """SHA-256 of the configuration's content."""
         content: Any = self.model_dump(mode="json")
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _explain(error: ValidationError) -> str:
-    sentences = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"]) or "the configuration"
-        if item["type"] == "extra_forbidden":
-            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
-        elif item["type"] == "missing":
-            sentences.append(f"{key}: missing; a value is required.")
-        else:
-            message = item["msg"].removeprefix("Value error, ")
-            sentences.append(f"{key} = {item['input']!r:.80}: {message}.")
-    return " ".join(sentences)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import tomllib
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tomli_w
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pdcorrect.corrector.config import CorrectorConfig, preset
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
+from pdcorrect.toml_config import TomlConfig
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
@@ -186,7 +184,7 @@ class Fitting(Strict):
     windows: PositiveCount = 2000
 
 
-class TrainingConfig(Strict):
+class TrainingConfig(TomlConfig):
     """A training.
 
     Attributes
@@ -234,51 +232,6 @@ class TrainingConfig(Strict):
                 )
         return self
 
-    @classmethod
-    def load(cls, path: str | Path) -> TrainingConfig:
-        """Read a configuration from a TOML file.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, is not TOML, or a key is wrong.
-        """
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
-            raise InputError(f"{path}: cannot be read ({reason}).") from None
-        return cls.from_toml(text, str(path))
-
-    @classmethod
-    def from_toml(cls, text: str, source: str = "configuration") -> TrainingConfig:
-        """Read a configuration from TOML text; ``source`` names it in messages."""
-        try:
-            return cls(**tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{source}: not valid TOML: {error}.") from None
-        except ValidationError as error:
-            raise InputError(f"{source}: {_explain(error)}") from None
-
-    def to_toml(self) -> str:
-        """The configuration as TOML, with every default written out."""
-        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
-
     def architecture(self) -> CorrectorConfig:
         """Of the corrector."""
         return self.corrector.config()
-
-
-def _explain(error: ValidationError) -> str:
-    sentences = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"]) or "the configuration"
-        if item["type"] == "extra_forbidden":
-            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
-        elif item["type"] == "missing":
-            sentences.append(f"{key}: missing; a value is required.")
-        else:
-            message = item["msg"].removeprefix("Value error, ")
-            sentences.append(f"{key} = {item['input']!r:.80}: {message}.")
-    return " ".join(sentences)
