@@ -28,8 +28,9 @@ from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # no
 from pdcorrect.evaluation import tables  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.evaluation.cases import Case, read_cases  # noqa: E402
-from pdcorrect.evaluation.evaluation import Candidate, evaluate  # noqa: E402
+from pdcorrect.evaluation.evaluation import Candidate, EvaluatedRun, evaluate  # noqa: E402
 from pdcorrect.evaluation.measures import (  # noqa: E402
+    Measured,
     Outcome,
     TrajectoryMeasures,
     measure,
@@ -217,6 +218,33 @@ def _cut(run, case):
     """The rollout held until the case's last frame."""
     more = case.steps + 1 - len(run.positions)
     return np.concatenate([run.positions, np.stack([run.positions[-1]] * more)])
+
+
+@pytest.mark.parametrize("away", [1e5, 1e160])
+def test_a_scene_that_flies_away_has_failed(pair, away):
+    chosen, stepper = pair
+
+    def leaving(case, t, x):
+        gone = case is chosen[0] and t >= 2
+        return perfect(case, t, x) + (away if gone else 0.0)
+
+    one, other = roll_out(Fake(stepper, chosen, leaving), stepper, [5, 5])
+    assert (one.failed, other.failed) == (3, None)
+    np.testing.assert_array_equal(one.positions[3:], np.stack([one.positions[2]] * 3))
+
+
+def test_a_run_that_cannot_be_measured_is_not_left_out(cases):
+    gone = cases[0].reference.copy()
+    gone[5:] *= 1e160
+    with np.errstate(over="ignore"), pytest.raises(ConvergenceError, match="omega is -inf"):
+        measure(cases[0], Outcome(gone))
+
+
+def test_measures_that_some_trajectories_lack_are_counted():
+    measured = [Measured(TrajectoryMeasures(0, k, omega=1.0)) for k in range(3)]
+    measured.append(Measured(TrajectoryMeasures(0, 3, omega=2.0, stress_error=0.1)))
+    run = EvaluatedRun("run", None, None, tuple(measured))
+    assert run.gaps() == {"stress_error": 3}
 
 
 def test_a_step_that_does_not_converge_is_a_failure(pair):
@@ -608,7 +636,10 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()
-    training = {"config": {"base": base, "seed": seed, "velocity": "recomputed"}, "seconds": seed}
+    training = {
+        "config": {"base": base, "seed": seed, "velocity": "recomputed"}, "seconds": seed,
+        "config_hash": "x",
+    }  # fmt: skip
     record = ModelRecord(dataset=dataset, dataset_hash="abc", training=training)
     return save_model(corrector, folder, record=record)
 
@@ -622,8 +653,12 @@ def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_see
     assert groups[0] == groups[1] != groups[2]
     assert [one.candidate.base for one in found] == ["plain", "plain", "best"]
     assert found[1].record()["seed"] == 1
-    assert found[0].warnings("tiny", "x") == []
-    assert "trained on 'tiny', not on 'large'" in found[0].warnings("large", "x")[0]
+    assert found[0].warnings("tiny", "x", "evaluation") == []
+    assert "trained on 'tiny', not on 'large'" in found[0].warnings("large", "x", "evaluation")[0]
+    (told,) = found[0].warnings("tiny", "y", "evaluation")
+    assert "trained on 'tiny' of another configuration" in told
+    assert "trained on this split" in found[0].warnings("tiny", "x", "training")[0]
+    assert "chosen by this split" in found[0].warnings("tiny", "x", "validation")[0]
     with pytest.raises(InputError, match="comes twice"):
         saved_candidates([paths[0], paths[0]])
 

@@ -76,8 +76,13 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
     notes = [f"left out: {text}" for text in found.damaged.values()]
     for one in saved:
-        notes += one.warnings(found.dataset, found.config_hash)
+        notes += one.warnings(found.dataset, found.config_hash, found.split)
     for name, run in found.runs.items():
+        notes += [
+            f"{name}: {count} of {len(run.trajectories)} trajectories have no {measure}; its mean "
+            "is that of the others."
+            for measure, count in run.gaps().items()
+        ]
         failures = run.failures()
         if failures:
             first = failures[0]

@@ -13,6 +13,7 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
+from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.evaluation import Candidate
@@ -53,15 +54,22 @@ class SavedCandidate:
             "code_digest": found.code_digest,
         }
 
-    def warnings(self, dataset: str, config_hash: str) -> list[str]:
-        """What speaks against comparing its errors with those on its own data."""
-        record = self.model.record
-        if config_hash == record.dataset_hash or dataset == record.dataset:
-            return []
-        return [
-            f"{self.candidate.name} was trained on {record.dataset!r}, not on {dataset!r}: bodies, "
-            "loads, materials and the coarse model's setting may be others than it knows."
-        ]
+    def warnings(self, dataset: str, config_hash: str, split: str) -> list[str]:
+        """What speaks against taking its errors for those on unseen meshes of its own data."""
+        record, name = self.model.record, self.candidate.name
+        known = record.training.get("config_hash")
+        if dataset != record.dataset or (known is not None and known != config_hash):
+            other = "" if dataset != record.dataset else " of another configuration"
+            return [
+                f"{name} was trained on {record.dataset!r}{other}, not on {dataset!r}: bodies, "
+                "loads, materials and the coarse model's setting may be others than it knows, and "
+                "its training meshes may be among these."
+            ]
+        if split == TRAINING:
+            return [f"{name} was trained on this split: these are not unseen meshes."]
+        if split == VALIDATION:
+            return [f"{name}'s weights were chosen by this split: the figures are too good."]
+        return []
 
 
 def saved_candidates(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
@@ -68,6 +68,13 @@ class EvaluatedRun:
         found = [(getattr(m, measure), m.mesh) for m in every]
         known = [(float(x), mesh) for x, mesh in found if x is not None]
         return [x for x, _ in known], [mesh for _, mesh in known]
+
+    def gaps(self) -> dict[str, int]:
+        """Of measures that some trajectories have and others lack: how many lack them."""
+        names = [f.name for f in fields(TrajectoryMeasures) if f.name != "failed"]
+        every = len(self.trajectories)
+        missing = {name: every - len(self.values(name)[0]) for name in names}
+        return {name: count for name, count in missing.items() if 0 < count < every}
 
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import PLAIN
+from pdcorrect.errors import ConvergenceError
 from pdcorrect.evaluation.cases import Case
 from pdcorrect.evaluation.physics import energies, stress_error
 from pdcorrect.metrics import (
@@ -127,7 +128,13 @@ class Measured:
 
 
 def measure(case: Case, outcome: Outcome) -> Measured:
-    """Measure a run of a case."""
+    """Measure a run of a case.
+
+    Raises
+    ------
+    ConvergenceError
+        If the run is so far away that a measure is not finite: means cannot leave it out.
+    """
     found: dict[str, float | None] = {}
     if outcome.predictions is not None:
         found |= _of_steps(case, outcome.predictions)
@@ -138,7 +145,13 @@ def measure(case: Case, outcome: Outcome) -> Measured:
         found |= _of_physics(case, outcome.positions, outcome.base)
     if outcome.refused is not None:
         found["gate_rate"] = 100.0 * float(outcome.refused.mean())
-    numbers = {name: x for name, x in found.items() if x is not None and np.isfinite(x)}
+    numbers = {name: x for name, x in found.items() if x is not None}
+    wild = next((name for name, x in numbers.items() if not np.isfinite(x)), None)
+    if wild is not None:
+        raise ConvergenceError(
+            f"mesh {case.mesh}, simulation {case.simulation}: {wild} is {numbers[wild]}: expected "
+            "a run whose errors can be measured."
+        )
     measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
     return Measured(measures, errors)
 

@@ -18,6 +18,9 @@ from pdcorrect.state import State
 
 Array = NDArray[np.float64]
 
+LOST = 1e3
+"""Of a body's size: a node that is further away from its place at rest has failed."""
+
 
 class HybridResult(Protocol):
     """What a step of a hybrid gives; see `pdcorrect.corrector.batch_hybrid`."""
@@ -57,8 +60,8 @@ class Rollout:
     refused : (T,) bool
         Steps without correction; never after a failure.
     failed : int or None
-        First step that did not converge, or gave numbers that are not finite.  The body is
-        held where it was before.
+        First step that did not converge, or gave numbers that are not finite or a node that is
+        `LOST`.  The body is held where it was before.
     """
 
     positions: Array
@@ -78,7 +81,7 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
     failed: list[int | None] = [None] * len(steps)
     for number in range(1, max(steps) + 1):
         result = hybrid(state, previous)
-        fine = _fine(result)
+        fine = _fine(result) & _near(result.state.positions, rest.positions, stepper.node_mask)
         for i, good in enumerate(fine.tolist()):
             if not good and failed[i] is None and number <= steps[i]:
                 failed[i] = number
@@ -147,6 +150,15 @@ def _fine(result: HybridResult) -> Tensor:
     finite = torch.isfinite(state.positions) & torch.isfinite(state.velocities)
     converged = torch.tensor([s.ok for s in result.coarse.statuses], device=finite.device)
     return finite.all(dim=2).all(dim=1) & converged
+
+
+def _near(positions: Tensor, rest: Tensor, mask: Tensor) -> Tensor:
+    """Scenes (B,) none of whose nodes is lost."""
+    own = mask[..., None]
+    low, high = (torch.where(own, rest, x) for x in (torch.inf, -torch.inf))
+    size = torch.linalg.vector_norm(high.amax(dim=1) - low.amin(dim=1), dim=1)
+    away = torch.linalg.vector_norm(torch.where(own, positions - rest, 0.0), dim=2)
+    return away.amax(dim=1) <= LOST * size
 
 
 def _where(scenes: Tensor, x: Tensor, y: Any) -> Tensor:

@@ -34,7 +34,7 @@ class Recording:
 
     Attributes
     ----------
-    dataset, split : str
+    dataset, config_hash, split : str
     mesh, number : int
         Of the mesh in its split, and on the mesh.
     scene_toml : str
@@ -47,6 +47,7 @@ class Recording:
     """
 
     dataset: str
+    config_hash: str
     split: str
     mesh: int
     number: int
@@ -139,6 +140,7 @@ def _recording(
     rollout = _positions(simulation, base, path, number)
     return Recording(
         dataset=str(shard.attributes["dataset"]),
+        config_hash=str(shard.attributes["config_hash"]),
         split=split,
         mesh=int(shard.attributes["number"]),
         number=number,

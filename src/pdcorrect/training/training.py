@@ -253,7 +253,8 @@ class Training:
         self.progress.metrics = metrics
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
-            training = {**self._identity, "iterations": self.progress.total,
+            training = {**self._identity, "config_hash": self._recordings[0].config_hash,
+                        "iterations": self.progress.total,
                         "seconds": self.progress.seconds, "processes": self.world.size}  # fmt: skip
             record = ModelRecord(
                 dataset=self._recordings[0].dataset, dataset_hash=self._identity["data"],
