@@ -725,6 +725,17 @@ def test_components_that_never_change_become_zero(constant):
     assert largest(other) == pytest.approx(1.0 if constant else 0.0)
 
 
+def test_what_never_changed_in_training_is_known_to_a_hundredth():
+    one, zero = torch.full((9, 1), 2.5), torch.zeros(9, 1)
+    normaliser = fitted(a=one.double(), b=zero.double())
+    assert normaliser.excess("a", tensor([[2.5], [2.55], [1.0]])).flatten().tolist() == (
+        pytest.approx([0.0, 2.0, 60.0], abs=1e-12)
+    )
+    assert normaliser.excess("b", tensor([[0.0], [1.0]])).flatten().tolist() == (
+        pytest.approx([0.0, 100.0], abs=1e-12)
+    )
+
+
 def test_rounding_of_stored_positions_is_not_enlarged():
     rng = np.random.default_rng(0)
     x = tensor((1.0 + 1e-7 * rng.normal(size=1000))[:, None])

@@ -16,6 +16,8 @@ _LEAST_DEVIATION = 1e-5
 Stored positions are rounded to single precision, which alone is 1e-7 of an edge.
 """
 
+_CONSTANT_UNIT = 0.01
+
 
 class Moments:
     """Mean, deviation and range of values that come in parts.
@@ -133,8 +135,14 @@ class Normaliser(nn.Module):
         return out if clip is None else clip * torch.tanh(out / clip)
 
     def excess(self, name: str, x: Tensor) -> Tensor:
-        """How far components (m, k) lie outside the range seen, in deviations, at least 0."""
-        low, high, unit = (self._part(name, p).to(x) for p in ("low", "high", "deviation"))
+        """How far components (m, k) lie outside the range seen, in deviations, at least 0.
+
+        In hundredths of the value, or of one, where a component was constant.
+        """
+        low, high, deviation = (self._part(name, p).to(x) for p in ("low", "high", "deviation"))
+        size = torch.maximum(low.abs(), high.abs())
+        constant = high - low <= _LEAST_DEVIATION * size
+        unit = torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
         return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
 
     def _part(self, name: str, part: str) -> Tensor:
