@@ -38,7 +38,7 @@ from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: 
 from pdcorrect.training.optimisation import Optimiser, rate_at  # noqa: E402
 from pdcorrect.training.progress import check_same  # noqa: E402
 from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups, grouped  # noqa: E402
 from pdcorrect.training.sources import OneStepBatches, one_step_loss, share_done  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
@@ -497,7 +497,7 @@ def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
     assert found.alive.tolist() == [True, False, True]
     assert found.losses[1] == 0.0
     torch.testing.assert_close(found.losses[[0, 2]], fine.losses[[0, 2]])
-    batches = UnrolledBatches(group.recordings, "plain", settings.stages[0])
+    batches = UnrolledBatches(SceneGroups(group.recordings, "plain"), settings.stages[0])
     monkeypatch.setattr("pdcorrect.training.unrolled.unroll", lambda *_: found)
     loss = batches.loss(corrector, 0, 2)
     assert loss.item() == pytest.approx(found.losses[[0, 2]].mean().item())
@@ -508,7 +508,7 @@ def test_a_pool_goes_on_where_it_was(folder):
     recordings = load_recordings(folder, "training", "plain")
     stage = samples.unrolled(start="pool", restart=0.0, steps=2)
     corrector = samples.fitted(folder, samples.config(stage), silent=True)
-    batches = UnrolledBatches(recordings, "plain", stage)
+    batches = UnrolledBatches(SceneGroups(recordings, "plain"), stage)
     ages = []
     for iteration in range(3):
         batches.loss(corrector, iteration, 2)
@@ -517,7 +517,9 @@ def test_a_pool_goes_on_where_it_was(folder):
         assert all(f <= 20 for f in numbers["pool"]["0"]["frames"])
     assert ages[0] == [2, 2, 2]
     assert any(age == 4 for age in ages[1])
-    always = UnrolledBatches(recordings, "plain", stage.model_copy(update={"restart": 1.0}))
+    always = UnrolledBatches(
+        SceneGroups(recordings, "plain"), stage.model_copy(update={"restart": 1.0})
+    )
     for iteration in range(2):
         always.loss(corrector, iteration, 2)
         assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
@@ -526,7 +528,7 @@ def test_a_pool_goes_on_where_it_was(folder):
 def test_too_long_a_horizon_is_refused(folder):
     recordings = load_recordings(folder, "training", "plain")
     with pytest.raises(InputError, match="0 simulations of 21 steps or more"):
-        UnrolledBatches(recordings, "plain", samples.unrolled(steps=21))
+        UnrolledBatches(SceneGroups(recordings, "plain"), samples.unrolled(steps=21))
 
 
 # --- validation --------------------------------------------------------------------------
@@ -776,7 +778,10 @@ def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
     optimiser = Optimiser(corrector, stage, None, World())
     from pdcorrect.training.sources import make_source
 
-    parts = [make_source(stage, 0, settings, windows, [], World(rank, 2)) for rank in (0, 1)]
+    parts = [
+        make_source(stage, 0, settings, windows, SceneGroups([], "plain"), World(rank, 2))
+        for rank in (0, 1)
+    ]
     for k in range(3):
         loss = sum(part.loss(corrector, k, 1) for part in parts) / 2
         optimiser.step(loss, k / 3)

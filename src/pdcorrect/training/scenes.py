@@ -13,12 +13,15 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
+from pdcorrect.errors import InputError
 from pdcorrect.training.recordings import Base, Recording, base_errors, make_problems
 
 Frames = NDArray[np.int64]
 
 _LOST = 100.0
 """Squared distance from the reference over that of the base model's rollout."""
+_LEAST_FREE = 0.2
+"""Of a GPU's memory, when a group is set up."""
 
 
 class SceneGroup:
@@ -111,6 +114,69 @@ class SceneGroup:
             row[: len(run), : run.shape[1]] = run
             row[len(run) :, : run.shape[1]] = run[-1]
         return torch.from_numpy(out).to(self.device)
+
+
+class SceneGroups:
+    """A rank's groups of simulations, set up when they are first needed and then kept.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+    base : {"plain", "best"}
+    device : str or torch.device
+    seed, rank, world_size : int
+        See `grouped`.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        base: Base,
+        device: str | torch.device = "cpu",
+        *,
+        seed: int = 0,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        self.recordings, self.device = tuple(recordings), torch.device(device)
+        self.rank = rank
+        self._base, self._place = base, {"seed": seed, "rank": rank, "world_size": world_size}
+        self._known: dict[tuple[str, ...], SceneGroup] = {}
+
+    def of(self, size: int, shortest: int) -> list[list[Recording]]:
+        """The simulations of at least so many steps, in groups of at most ``size``.
+
+        Raises
+        ------
+        InputError
+            If there is none for this rank.
+        """
+        usable = [r for r in self.recordings if r.steps >= shortest]
+        found = grouped(usable, size, **self._place)
+        if not found:
+            raise InputError(
+                f"{len(usable)} simulations of {shortest} steps or more, in groups of {size}, "
+                f"for {self._place['world_size']} processes: expected a group for each."
+            )
+        return found
+
+    def __call__(self, recordings: Sequence[Recording]) -> SceneGroup:
+        """The group of some simulations."""
+        key = tuple(r.name for r in recordings)
+        if key not in self._known:
+            self._make_room()
+            self._known[key] = SceneGroup(recordings, self._base, self.device)
+        return self._known[key]
+
+    def _make_room(self) -> None:
+        """Forget groups, which are set up anew when they are needed, if a GPU is nearly full."""
+        if self.device.type != "cuda":
+            return
+        free, total = torch.cuda.mem_get_info(self.device)
+        while free < _LEAST_FREE * total and self._known:
+            del self._known[next(iter(self._known))]
+            torch.cuda.empty_cache()
+            free, total = torch.cuda.mem_get_info(self.device)
 
 
 def grouped(

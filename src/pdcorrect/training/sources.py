@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.training.config import Stage, TrainingConfig
 from pdcorrect.training.losses import body_losses
 from pdcorrect.training.precision import network_precision
-from pdcorrect.training.recordings import Recording
+from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.windows import StepBatch, StepWindows
 from pdcorrect.training.world import World
@@ -94,17 +94,14 @@ def make_source(
     number: int,
     config: TrainingConfig,
     windows: StepWindows,
-    recordings: Sequence[Recording],
+    groups: SceneGroups,
     world: World,
 ) -> Source:
     """The source of stage ``number`` of a training."""
     seed = _seed(config.seed, number)
     if stage.kind == "one-step":
         return OneStepBatches(windows, stage, seed, world)
-    return UnrolledBatches(
-        recordings, config.base, stage, velocity=config.velocity, device=windows.device,
-        seed=seed, rank=world.rank, world_size=world.size,
-    )  # fmt: skip
+    return UnrolledBatches(groups, stage, velocity=config.velocity, seed=seed)
 
 
 def share_done(stage: Stage, epoch: int, iteration: int, seconds: float) -> float:

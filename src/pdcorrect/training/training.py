@@ -28,6 +28,7 @@ from pdcorrect.training.history import History
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recordings import data_hash, load_recordings
+from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
@@ -96,6 +97,10 @@ class Training:
             data, self._recordings, config.architecture(), config.base, device=self.device,
             workers=config.workers,
         )  # fmt: skip
+        self._groups = SceneGroups(
+            self._recordings, config.base, self.device, seed=config.seed, rank=self.world.rank,
+            world_size=self.world.size,
+        )  # fmt: skip
         self.corrector = self._new_corrector(fit=found is None)
         self._averaged = copy.deepcopy(self.corrector)
         self._best: dict[str, Tensor] = {}
@@ -138,9 +143,7 @@ class Training:
     def _run_stage(self, stage: Stage) -> bool:
         """One stage, or what is left of it; whether it came to its end."""
         at = self.progress
-        source = make_source(
-            stage, at.stage, self.config, self._windows, self._recordings, self.world
-        )
+        source = make_source(stage, at.stage, self.config, self._windows, self._groups, self.world)
         optimiser = self._optimiser(stage, source)
         shown = self.corrector if stage.ema is None else self._averaged
         while (share := share_done(stage, len(source), at.iteration, at.stage_seconds)) < 1.0:

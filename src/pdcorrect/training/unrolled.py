@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,17 +14,12 @@ from torch import Tensor
 from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.errors import InputError
 from pdcorrect.training.config import Stage
 from pdcorrect.training.losses import body_losses, mean_of
 from pdcorrect.training.precision import network_precision
-from pdcorrect.training.recordings import Base, Recording
-from pdcorrect.training.scenes import Frames, SceneGroup, grouped
+from pdcorrect.training.scenes import Frames, SceneGroup, SceneGroups
 
 Flags = NDArray[np.bool_]
-
-_LEAST_FREE = 0.2
-"""Of a GPU's memory, when a group is set up."""
 
 
 @dataclass(eq=False)
@@ -72,42 +67,34 @@ class UnrolledBatches:
 
     Parameters
     ----------
-    recordings : sequence of Recording
-    base : {"plain", "best"}
+    groups : SceneGroups
     stage : Stage
-    device : str or torch.device
-    seed, rank, world_size : int
+    velocity : {"recomputed", "kept"}
+    seed : int
 
     Attributes
     ----------
     failed : int
         Scenes that were left out because a step failed.
+
+    Raises
+    ------
+    InputError
+        If no simulation is long enough for the stage.
     """
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
-        base: Base,
+        groups: SceneGroups,
         stage: Stage,
         *,
         velocity: Velocity = "recomputed",
-        device: str | torch.device = "cpu",
         seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
     ) -> None:
-        longest = max(stage.steps)
-        usable = [r for r in recordings if r.steps >= longest]
-        self._chosen = grouped(usable, stage.batch, seed=seed, rank=rank, world_size=world_size)
-        if not self._chosen:
-            raise InputError(
-                f"{len(usable)} simulations of {longest} steps or more, in groups of "
-                f"{stage.batch}, for {world_size} processes: expected a group for each."
-            )
-        self._base, self._stage, self._velocity = base, stage, velocity
-        self._device = torch.device(device)
-        self._seed = (seed, rank)
-        self._groups: dict[int, SceneGroup] = {}
+        self._groups = groups
+        self._chosen = groups.of(stage.batch, max(stage.steps))
+        self._stage, self._velocity = stage, velocity
+        self._seed = (seed, groups.rank)
         self._pool: dict[int, Rollouts] = {}
         self.failed = 0
 
@@ -119,7 +106,7 @@ class UnrolledBatches:
         """The mean loss of a group over some steps; what is drawn depends on ``iteration``."""
         rng = np.random.default_rng((*self._seed, 3, iteration))
         number = self._turn(iteration)
-        group = self._group(number)
+        group = self._groups(self._chosen[number])
         start = self._start(number, group, steps, rng)
         found = unroll(group, corrector, start, steps, self._stage, self._velocity)
         self.failed += int((~found.alive).sum())
@@ -145,7 +132,7 @@ class UnrolledBatches:
             return
         for key, at in numbers["pool"].items():
             positions, velocities, correction = (
-                tensors[f"{key}.{name}"].to(self._device)
+                tensors[f"{key}.{name}"].to(self._groups.device)
                 for name in ("positions", "velocities", "correction")
             )
             self._pool[int(key)] = Rollouts(
@@ -156,22 +143,6 @@ class UnrolledBatches:
         """The group: all in random order, then again."""
         epoch, place = divmod(iteration, len(self))
         return int(np.random.default_rng((*self._seed, 4, epoch)).permutation(len(self))[place])
-
-    def _group(self, number: int) -> SceneGroup:
-        if number not in self._groups:
-            self._make_room()
-            self._groups[number] = SceneGroup(self._chosen[number], self._base, self._device)
-        return self._groups[number]
-
-    def _make_room(self) -> None:
-        """Forget groups, which are set up anew when they are needed, if a GPU is nearly full."""
-        if self._device.type != "cuda":
-            return
-        free, total = torch.cuda.mem_get_info(self._device)
-        while free < _LEAST_FREE * total and self._groups:
-            del self._groups[next(iter(self._groups))]
-            torch.cuda.empty_cache()
-            free, total = torch.cuda.mem_get_info(self._device)
 
     def _start(
         self, number: int, group: SceneGroup, steps: int, rng: np.random.Generator
