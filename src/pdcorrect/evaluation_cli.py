@@ -25,6 +25,7 @@ def evaluate(
     split: Annotated[str, typer.Option(help="Split of the data set.")] = "evaluation",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     batch: Annotated[int, typer.Option(help="Simulations at once.", min=1)] = 32,
+    workers: Annotated[int, typer.Option(help="Processes that measure.", min=1)] = 1,
     output: Annotated[
         Optional[Path],
         typer.Option("-o", "--output", help="Folder for JSON, CSV, Markdown and figures."),
@@ -60,7 +61,7 @@ def evaluate(
         task = progress.add_task("evaluating", total=None)
         found = run(
             [one.candidate for one in saved], folder, split, device=device, batch=batch,
-            skip_damaged=skip_damaged,
+            workers=workers, skip_damaged=skip_damaged,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
     notes = _notes(saved, found)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -116,6 +120,7 @@ def evaluate(
     *,
     device: str = "cpu",
     batch: int = 32,
+    workers: int = 1,
     skip_damaged: bool = False,
     on_cases: OnCases | None = None,
 ) -> Evaluation:
@@ -135,6 +140,8 @@ def evaluate(
     device : str
     batch : int
         Simulations that are stepped together.
+    workers : int
+        Processes that measure; the results do not depend on their number.
     skip_damaged : bool
         Leave out files that are damaged.
     on_cases : callable, optional
@@ -149,6 +156,8 @@ def evaluate(
     """
     if batch < 1:
         raise InputError(f"batch = {batch}: expected 1 or more.")
+    if workers < 1:
+        raise InputError(f"workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
     stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
@@ -160,18 +169,19 @@ def evaluate(
         )
     measured: dict[str, dict[int, Measured]] = {name: {} for name in (*names, *stored, REFERENCE)}
     done = 0
-    for numbers in _batches(found.cases, bases, batch):
-        cases = [found.cases[i] for i in numbers]
-        for name, outcomes in _outcomes(candidates, cases, device):
-            for i, case, outcome in zip(numbers, cases, outcomes, strict=True):
-                measured[name][i] = measure(case, outcome)
-        for i, case in zip(numbers, cases, strict=True):
-            for name, outcome in _stored(case).items():
-                measured[name][i] = measure(case, outcome)
-            measured[REFERENCE][i] = measure(case, Outcome(case.reference))
-        done += len(cases)
-        if on_cases:
-            on_cases(done, len(found.cases))
+    with _pool(workers) as each:
+        for numbers in _batches(found.cases, bases, batch):
+            cases = [found.cases[i] for i in numbers]
+            outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in cases]
+            for name, new in _outcomes(candidates, cases, device):
+                for by_name, outcome in zip(outcomes, new, strict=True):
+                    by_name[name] = outcome
+            for i, results in zip(numbers, each(_measure_all, cases, outcomes), strict=True):
+                for name, one in results.items():
+                    measured[name][i] = one
+                done += 1
+                if on_cases:
+                    on_cases(done, len(found.cases))
     known = {candidate.name: candidate for candidate in candidates}
     runs = {
         name: EvaluatedRun(
@@ -187,6 +197,23 @@ def evaluate(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
         float(about["time_step"]), runs, found.shards, found.damaged,
     )  # fmt: skip
+
+
+def _measure_all(case: Case, outcomes: Mapping[str, Outcome]) -> dict[str, Measured]:
+    return {name: measure(case, outcome) for name, outcome in outcomes.items()}
+
+
+@contextlib.contextmanager
+def _pool(workers: int) -> Iterator[Callable[..., Iterator[dict[str, Measured]]]]:
+    """A `map` over processes, each of one thread; the built-in one for one process."""
+    if workers == 1:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")  # a GPU's driver does not survive a fork
+    with ProcessPoolExecutor(
+        workers, context, initializer=numba.set_num_threads, initargs=(1,)
+    ) as pool:
+        yield pool.map
 
 
 def _stored(case: Case) -> dict[str, Outcome]:
