@@ -168,16 +168,19 @@ def evaluate(
             f"({', '.join(stored)})."
         )
     measured: dict[str, dict[int, Measured]] = {name: {} for name in (*names, *stored, REFERENCE)}
-    done = 0
     with _pool(workers) as each:
+        started: list[tuple[list[int], Iterator[dict[str, Measured]]]] = []
         for numbers in _batches(found.cases, bases, batch):
             cases = [found.cases[i] for i in numbers]
             outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in cases]
             for name, new in _outcomes(candidates, cases, device):
                 for by_name, outcome in zip(outcomes, new, strict=True):
                     by_name[name] = outcome
-            for i, results in zip(numbers, each(_measure_all, cases, outcomes), strict=True):
-                for name, one in results.items():
+            started.append((numbers, each(_measure_all, cases, outcomes)))
+        done = 0
+        for numbers, results in started:  # other processes measure while the next ones move
+            for i, by_run in zip(numbers, results, strict=True):
+                for name, one in by_run.items():
                     measured[name][i] = one
                 done += 1
                 if on_cases:

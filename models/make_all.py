@@ -1,0 +1,211 @@
+"""Generate data, train recipes on them and evaluate the models; start again to go on.
+
+python models/make_all.py WORK [RECIPE ...] [--device cuda] [--generators 8] [--together 4]
+    [--measurers 16] [--seconds 1000]
+
+A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  WORK gets
+
+    data/DATASET                 splits as needed, by ``pdcorrect dataset generate``
+    trainings/DATASET/NAME       by ``pdcorrect train``
+    evaluations/DATASET          all recipes' best models side by side, by ``pdcorrect evaluate``
+    logs/                        what these commands said
+
+Data are generated in the order of the recipes, each training begins as soon as its data are
+there, several at a time on each GPU, and a data set's models are evaluated when all its
+trainings have ended.  Trainings that are still running after ``--seconds`` are stopped; their
+best models so far are evaluated, and the next start goes on with them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.schema import CONFIG
+from pdcorrect.training.training import MODEL
+
+HERE = Path(__file__).parent
+DATASETS = HERE.parent / "datasets"
+LEARNT = (TRAINING, VALIDATION)
+STOPPED = 1
+"""Exit status of a command whose time was up."""
+
+
+@dataclass(eq=False)
+class Job:
+    """A command, on one of the machine's GPUs or on all.
+
+    Attributes
+    ----------
+    name : str
+        Of its log.
+    arguments : list of str
+        Of ``pdcorrect``.
+    after : sequence of Job
+        To be finished before.
+    queue : str
+        Jobs of one queue wait for a place in it.
+    until : float or None
+        `time.time` at which the command is to stop by itself.
+    """
+
+    name: str
+    arguments: list[str]
+    after: Sequence[Job]
+    queue: str
+    until: float | None = None
+    status: int | None = None
+    process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+    gpu: int | None = None
+
+
+class Machine:
+    """Runs jobs, so many at a time of each queue.
+
+    Parameters
+    ----------
+    logs : path
+    gpus : int
+        0 for a machine whose CPU is used.
+    places : dict of str to int
+        Of each queue; of "train" for each GPU.
+    """
+
+    def __init__(self, logs: Path, gpus: int, places: dict[str, int]) -> None:
+        self._logs, self._gpus, self._places = logs, gpus, places
+        logs.mkdir(parents=True, exist_ok=True)
+
+    def run(self, jobs: Sequence[Job]) -> bool:
+        """Run all; whether all were successful."""
+        started = time.monotonic()
+        try:
+            while any(job.status is None for job in jobs):
+                for job in jobs:
+                    if job.process is not None and job.status is None:
+                        job.status = job.process.poll()
+                        if job.status is not None:
+                            self._tell(started, job, f"ended with {job.status}")
+                    elif job.status is None and self._may_start(job, jobs):
+                        self._start(job, jobs)
+                        self._tell(started, job, "started")
+                time.sleep(0.2)
+        finally:
+            for job in jobs:
+                if job.process is not None and job.process.poll() is None:
+                    job.process.terminate()
+        return all(job.status == 0 for job in jobs)
+
+    def _may_start(self, job: Job, jobs: Sequence[Job]) -> bool:
+        """Whether a waiting job can be started now; one that never can counts as failed."""
+        if any(j.status not in (None, 0, STOPPED) for j in job.after):
+            job.status = next(j.status for j in job.after if j.status not in (None, 0, STOPPED))
+            return False
+        if any(j.status is None for j in job.after):
+            return False
+        places = self._places[job.queue] * (max(1, self._gpus) if job.queue == "train" else 1)
+        return sum(1 for _ in self._running(job.queue, jobs)) < places
+
+    @staticmethod
+    def _running(queue: str, jobs: Sequence[Job]) -> Iterator[Job]:
+        return (j for j in jobs if j.queue == queue and j.process is not None and j.status is None)
+
+    def _start(self, job: Job, jobs: Sequence[Job]) -> None:
+        environment = dict(os.environ)
+        if self._gpus and job.queue != "generate":
+            busy = [j.gpu for j in jobs if j.process is not None and j.status is None]
+            job.gpu = min(range(self._gpus), key=busy.count)
+            environment["CUDA_VISIBLE_DEVICES"] = str(job.gpu)
+        limit = [] if job.until is None else ["--seconds", str(max(0.0, job.until - time.time()))]
+        with (self._logs / f"{job.name}.log").open("ab") as log:
+            job.process = subprocess.Popen(
+                [sys.executable, "-m", "pdcorrect.cli", *job.arguments, *limit],
+                stdout=log, stderr=subprocess.STDOUT, env=environment,
+            )  # fmt: skip
+
+    @staticmethod
+    def _tell(started: float, job: Job, what: str) -> None:
+        print(f"{time.monotonic() - started:7.1f} s  {job.name} {what}", flush=True)
+
+
+def plan(work: Path, recipes: Sequence[Path], options: argparse.Namespace) -> list[Job]:
+    """All jobs for some recipes."""
+    until = None if options.seconds is None else time.time() + options.seconds
+    jobs: list[Job] = []
+    names = list(dict.fromkeys(recipe.parent.name for recipe in recipes))
+    ready = {name: _generation(work, name, LEARNT, options) for name in names}
+    judged = {name: _generation(work, name, (EVALUATION,), options) for name in names}
+    jobs += [*ready.values(), *judged.values()]
+    for name in names:
+        own = [recipe for recipe in recipes if recipe.parent.name == name]
+        trainings = [_training(work, recipe, ready[name], until, options) for recipe in own]
+        models = [str(work / "trainings" / name / recipe.stem / MODEL) for recipe in own]
+        output = work / "evaluations" / name
+        shutil.rmtree(output, ignore_errors=True)
+        evaluation = Job(
+            f"evaluate-{name}",
+            ["evaluate", *models, str(work / "data" / name), "--device", options.device,
+             "--batch", "50", "--workers", str(options.measurers), "-o", str(output),
+             "--no-figures"],
+            [*trainings, judged[name]],
+            "evaluate",
+        )  # fmt: skip
+        jobs += [*trainings, evaluation]
+    return jobs
+
+
+def _generation(work: Path, name: str, splits: Sequence[str], options: argparse.Namespace) -> Job:
+    chosen = [part for split in splits for part in ("--split", split)]
+    return Job(
+        f"generate-{name}-{splits[0]}",
+        ["dataset", "generate", str(DATASETS / name / CONFIG), "-o", str(work / "data" / name),
+         "--workers", str(options.generators), "--device", options.device,
+         "--batch", str(options.batch), *chosen],
+        [],
+        "generate",
+    )  # fmt: skip
+
+
+def _training(
+    work: Path, recipe: Path, data: Job, until: float | None, options: argparse.Namespace
+) -> Job:
+    name = recipe.parent.name
+    output = work / "trainings" / name / recipe.stem
+    arguments = [
+        "train", str(recipe), "--data", str(work / "data" / name), "-o", str(output),
+        "--device", options.device, "--resume",
+    ]  # fmt: skip
+    return Job(f"train-{name}-{recipe.stem}", arguments, [data], "train", until)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("work", type=Path)
+    parser.add_argument("recipes", nargs="*", type=Path, metavar="RECIPE")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--generators", type=int, default=1, help="processes that generate data")
+    parser.add_argument("--batch", type=int, default=60, help="simulations that each computes")
+    parser.add_argument("--together", type=int, default=1, help="trainings at a time on a GPU")
+    parser.add_argument("--measurers", type=int, default=1, help="processes that measure")
+    parser.add_argument("--seconds", type=float, default=None, help="when trainings are stopped")
+    options = parser.parse_args()
+    recipes = options.recipes or sorted((HERE / "recipes").glob("*/*.toml"))
+    gpus = 0
+    if options.device == "cuda":
+        import torch
+
+        gpus = torch.cuda.device_count()
+    places = {"generate": 1, "train": options.together, "evaluate": max(1, gpus)}
+    machine = Machine(options.work / "logs", gpus, places)
+    sys.exit(0 if machine.run(plan(options.work, recipes, options)) else 1)
+
+
+if __name__ == "__main__":
+    main()
