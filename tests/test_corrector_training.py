@@ -27,6 +27,7 @@ from pdcorrect.errors import (  # noqa: E402
     InputError,
 )
 from pdcorrect.metrics import error_corrected  # noqa: E402
+from pdcorrect.scene import Scene  # noqa: E402
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
 from pdcorrect.training.config import (  # noqa: E402
     Loss,
@@ -37,7 +38,7 @@ from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
 from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402, mean_of
 from pdcorrect.training.optimisation import Optimiser, rate_at  # noqa: E402
 from pdcorrect.training.progress import check_same  # noqa: E402
-from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
+from pdcorrect.training.recordings import _mean_square, base_errors, load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, SceneGroups, grouped  # noqa: E402
 from pdcorrect.training.sources import OneStepBatches, one_step_loss, share_done  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
@@ -548,6 +549,29 @@ def test_a_silent_corrector_has_the_omega_of_its_base_model(folder, base):
     assert scores.mean == pytest.approx(np.mean(scores.omegas))
 
 
+def test_where_the_plain_model_has_no_error_there_is_only_error_to_add(folder):
+    recordings = load_recordings(folder, "validation", "plain")
+    perfect = [replace(r, plain=r.reference) for r in recordings]
+    corrector = samples.fitted(folder, samples.config(samples.one_step()), silent=True)
+    assert Validation(perfect, "plain")(corrector).omegas.tolist() == [-100.0] * len(perfect)
+    same = [replace(r, reference=r.reference[:1].repeat(3, axis=0)) for r in recordings]
+    still = [replace(r, plain=r.reference, scene_toml=_unloaded(r)) for r in same]
+    assert (Validation(still, "plain")(corrector).omegas >= 0.0).all()
+
+
+def _unloaded(recording):
+    scene = Scene.from_toml(recording.scene_toml)
+    return scene.model_copy(update={"loads": ()}).to_toml()
+
+
+def test_errors_below_the_rounding_of_storage_are_not_learned():
+    x = np.linspace(1.0, 2.0, 12, dtype=np.float32).reshape(1, 4, 3)
+    rounding = (2.0 * np.finfo(np.float32).eps) ** 2
+    assert _mean_square(x, x) == pytest.approx(rounding)
+    y = x + np.float32(0.01)
+    assert _mean_square(y, x) == pytest.approx(3e-4, rel=1e-3)
+
+
 def test_a_corrector_that_ruins_rollouts_has_the_least_omega(folder):
     settings = samples.config(samples.one_step())
     corrector = samples.fitted(folder, settings)
@@ -730,8 +754,10 @@ def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
     assert "--resume" in err
     status, out, err = program(*call, "--resume", "--evaluate", "validation")
     assert status == 0, err
-    assert "validation/mesh-0001/1" in out
-    assert "median" in out
+    assert "removed, %" in out
+    summary = json.loads((tmp_path / "out" / "evaluation" / "summary.json").read_text())
+    assert summary["data"]["split"] == "validation"
+    assert summary["gate"]
     assert [row["iteration"] for row in rows(tmp_path / "out") if row["loss"]] == ["1", "2", "3"]
     status, out, err = program(*call, "--resume")
     assert status == 0, err

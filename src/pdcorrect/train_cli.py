@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 if TYPE_CHECKING:
-    from pdcorrect.training.config import TrainingConfig
     from pdcorrect.training.progress import Progress
 
+EVALUATION = "evaluation"
+"""Folder, inside a training's, of what ``--evaluate`` finds."""
 _UNFINISHED = 1
 """Exit status if time was up before the training was finished."""
 
@@ -28,7 +29,10 @@ def train(
         Optional[float], typer.Option(help="Stop after so many seconds; --resume goes on.")
     ] = None,
     evaluate: Annotated[
-        Optional[str], typer.Option(help="Split on which the best model is judged at the end.")
+        Optional[str],
+        typer.Option(
+            help="Split on which the best model is judged at the end, as by pdcorrect evaluate."
+        ),
     ] = None,
 ) -> None:
     """Train a corrector; the best model is in OUTPUT/model (extra 'learn').
@@ -55,7 +59,12 @@ def train(
     told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
-        _judge(output / MODEL, data, evaluate, loaded, own)
+        from pdcorrect.evaluation_cli import evaluate as judge
+
+        judge(
+            [str(output / MODEL), str(data)], split=evaluate, device=own,
+            output=output / EVALUATION, figures=False,
+        )  # fmt: skip
 
 
 def _tell(at: Progress, row: Mapping[str, Any]) -> None:
@@ -65,29 +74,3 @@ def _tell(at: Progress, row: Mapping[str, Any]) -> None:
         if name not in ("stage", "seconds")
     )
     typer.echo(f"{at.seconds:7.1f} s  stage {at.stage}  {at.total:6d}  {numbers}")
-
-
-def _judge(model: Path, data: Path, split: str, config: TrainingConfig, device: str) -> None:
-    """Print Omega of the free rollouts of a split."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
-
-    from pdcorrect.corrector.model_io import load_model
-    from pdcorrect.training.recordings import load_recordings
-    from pdcorrect.training.validation import Validation
-
-    recordings = load_recordings(data, split, config.base)
-    judge = Validation(recordings, config.base, velocity=config.velocity, device=device)
-    scores = judge(load_model(model, device).corrector)
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for heading in ("simulation", "nodes", "frames", "Omega, %"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.columns[0].justify = "left"
-    for recording, omega in zip(recordings, scores.omegas, strict=True):
-        nodes, frames = str(len(recording.points)), str(recording.steps)
-        table.add_row(recording.name, nodes, frames, f"{omega:.1f}")
-    table.add_section()
-    for name in ("mean", "median", "least"):
-        table.add_row(name, "", "", f"{getattr(scores, name):.1f}")
-    Console().print(table)

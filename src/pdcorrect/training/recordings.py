@@ -161,9 +161,19 @@ def _positions(simulation: Simulation, run: str, path: Path, number: int) -> Arr
 
 
 def _mean_square(x: Array, y: Array) -> float:
-    """Mean over frames and nodes of the squared distance, m2."""
+    """Mean over frames and nodes of the squared distance, m2.
+
+    At least that of positions which differ by the rounding of their storage, which is
+    nothing that can be learned.
+    """
     distance = x.astype(np.float64) - y
-    return max(float((distance**2).sum(axis=2).mean()), LEAST_ERROR)
+    return max(float((distance**2).sum(axis=2).mean()), rounding(y), LEAST_ERROR)
+
+
+def rounding(positions: Array) -> float:
+    """Squared distance that storing positions in their type may make, m2."""
+    size = float(np.abs(positions).max(initial=0.0))
+    return (size * float(np.finfo(positions.dtype).eps)) ** 2
 
 
 def _check_mesh(recording: Recording, problem: Problem) -> None:

@@ -1,4 +1,9 @@
-"""Free rollouts of the hybrid from rest, and the share of the plain model's error they remove."""
+"""Free rollouts of the hybrid from rest, and the share of the plain model's error they remove.
+
+For choosing weights while training, without a gate and with a lower bound, so that one bad
+rollout does not hide what the others say.  What a model is worth is told by
+`pdcorrect.evaluation`.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +19,7 @@ from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.training.recordings import Base, Recording
+from pdcorrect.training.recordings import Base, Recording, rounding
 from pdcorrect.training.scenes import SceneGroup
 from pdcorrect.training.world import World
 
@@ -130,8 +135,10 @@ class Validation:
 
 
 def _squares(recording: Recording) -> float:
-    """Of the plain model's rollout, over all frames and nodes, m2."""
-    return float(((recording.plain[1:].astype(np.float64) - recording.reference[1:]) ** 2).sum())
+    """Of the plain model's rollout, over all frames and nodes, m2; at least what rounding makes."""
+    distance = recording.plain[1:].astype(np.float64) - recording.reference[1:]
+    least = recording.steps * len(recording.points) * rounding(recording.reference)
+    return max(float((distance**2).sum()), least)
 
 
 def _where(ok: Tensor, state: BatchState, rest: BatchState) -> BatchState:
