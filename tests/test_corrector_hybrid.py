@@ -712,30 +712,44 @@ def test_a_gate_without_meaning_is_refused(changes):
         Gate(**changes)
 
 
+def gradients_beside(scenes, corrector, through_solver, spoil=None):
+    """Gradients of a loss on scene 0 after two steps; ``spoil`` changes the start of scene 1."""
+    stepper = pc.BatchStepper(scenes, 1e-12)
+    layer = HybridLayer(stepper, corrector, through_solver=through_solver, on_failure="zero")
+    start = stepper.rest_state()
+    p, v, given = start.positions.clone(), start.velocities.clone(), None
+    if spoil is not None:
+        spoil(p, v)
+        given = torch.zeros_like(layer.bodies.rest)
+    loss, nodes = 0.0, len(scenes[0].positions)
+    for k in range(2):
+        p, v, given = layer(p, v, [k * stepper.time_step] * len(scenes), given)
+        if spoil is not None and k == 0:
+            assert not layer.steps.statuses[-1][1].ok
+            assert not given[nodes:].any()
+        assert layer.steps.statuses[-1][0].ok
+        loss = loss + (p - start.positions)[0, :nodes].square().sum()
+        loss = loss + given[:nodes].square().sum()
+    return torch.autograd.grad(loss, list(corrector.parameters()))
+
+
+def lost(p, v):
+    v[1] = torch.nan
+
+
+def far_away(p, v):
+    v[1] = 1e200  # whose square is infinite
+
+
+@pytest.mark.parametrize("spoil", [lost, far_away])
 @pytest.mark.parametrize("through_solver", [True, False])
-def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(through_solver):
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(placement, through_solver, spoil):
     scenes = problems((3, 1, 1), (2, 1, 1))
-    corrector = fitted(scenes, size=0.05)
-    weights = list(corrector.parameters())
-
-    def gradients(chosen, spoil):
-        stepper = pc.BatchStepper(chosen, 1e-12)
-        options = {"through_solver": through_solver, "on_failure": "zero"}
-        layer = HybridLayer(stepper, corrector, **options)
-        start = stepper.rest_state()
-        p, v = start.positions, start.velocities.clone()
-        if spoil:
-            v[1] = torch.nan
-        loss, nodes = 0.0, len(scenes[0].positions)
-        for k in range(2):
-            p, v, correction = layer(p, v, [k * stepper.time_step] * len(chosen))
-            if k == 0:
-                assert not (spoil and correction[nodes:].any())
-            loss = loss + (p - start.positions)[0, :nodes].square().sum()
-            loss = loss + correction[:nodes].square().sum()
-        return torch.autograd.grad(loss, weights)
-
-    found, expected = gradients(scenes, spoil=True), gradients(scenes[:1], spoil=False)
+    features = (*preset("compact").node_features, "previous-correction")
+    corrector = fitted(scenes, placement=placement, node_features=features)
+    found = gradients_beside(scenes, corrector, through_solver, spoil)
+    expected = gradients_beside(scenes[:1], corrector, through_solver)
     for one, other in zip(found, expected, strict=True):
         assert one == pytest.approx(other, abs=1e-3 * float(other.abs().max()))
     assert any(g.any() for g in found)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.batch.checks import check_nodal, start_times
+from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.batch.threads import one_thread
@@ -326,38 +327,82 @@ class HybridLayer(_WithNodes, nn.Module):
         if hybrid.placement == "state":
             after, correction = self._corrected(before, self._step(before, None), previous)
         else:
-            correction = self.corrector.of_view(hybrid.view(before, None, previous))
-            force = hybrid.placement == "force"
-            after = self._step(before, hybrid.nodes.forces(correction) if force else None)
+            after, correction = self._stepped(before, previous)
         return after.positions, after.velocities, correction
 
     def _corrected(
         self, before: BatchState, after: BatchState, previous: Tensor | None
     ) -> tuple[BatchState, Tensor]:
         """The state after a step, corrected; scenes whose step failed have no part in it."""
-        hybrid = self._hybrid
-        stepped = torch.tensor(
-            [s.ok for s in self.steps.statuses[-1]], device=self.bodies.rest.device
-        )
-        ok, at_nodes = stepped[:, None, None], self.bodies.by_node(stepped)[:, None]
-        rest = hybrid.stepper.cells.rest[:, : before.positions.shape[1]]
-        seen = replace(
-            before, positions=torch.where(ok, before.positions, rest),
-            velocities=torch.where(ok, before.velocities, 0.0),
-        )  # fmt: skip
-        proposed = torch.where(ok, after.positions, rest)
-        known = None if previous is None else torch.where(at_nodes, previous, 0.0)
+        hybrid, ok = self._hybrid, self._converged()
+        at_nodes = self.bodies.by_node(ok)[:, None]
+        seen, known = self._at_rest_unless(ok, before, previous)
+        proposed = torch.where(by_scene(ok), after.positions, seen.positions)
         correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
         correction = torch.where(at_nodes, correction, 0.0)
-        moved = hybrid.moved(before, after, correction)
+        moved, ok = hybrid.moved(before, after, correction), by_scene(ok)
         final = replace(
             moved, positions=torch.where(ok, moved.positions, after.positions.detach()),
             velocities=torch.where(ok, moved.velocities, after.velocities.detach()),
         )  # fmt: skip
         return final, correction
 
+    def _stepped(self, before: BatchState, previous: Tensor | None) -> tuple[BatchState, Tensor]:
+        """The state after a step with corrected loads or guess; failed scenes as above.
+
+        The network is asked before it is known which steps fail: again, where its inputs or
+        answer are not finite, and what it is shown of scenes that fail later has no derivatives.
+        """
+        hybrid, nodes = self._hybrid, self._hybrid.nodes
+        with torch.no_grad():
+            flat = torch.cat([nodes.flat(before.positions), nodes.flat(before.velocities)], dim=1)
+            flat = flat if previous is None else torch.cat([flat, previous], dim=1)
+            sound = nodes.sound(flat)
+        while True:
+            seen, known = self._at_rest_unless(sound, before, previous)
+            correction = self.corrector.of_view(hybrid.view(seen, None, known))
+            still = sound & nodes.sound(correction)
+            if torch.equal(still, sound):
+                break
+            sound = still
+        correction = torch.where(self.bodies.by_node(sound)[:, None], correction, 0.0)
+        force = hybrid.placement == "force"
+        after = self._step(before, nodes.forces(correction) if force else None)
+        ok = sound & self._converged()
+        at_nodes = self.bodies.by_node(ok)[:, None]
+        for x, mask in (
+            (seen.positions, by_scene(ok)), (seen.velocities, by_scene(ok)),
+            (known, at_nodes), (correction, at_nodes),
+        ):  # fmt: skip
+            _without_derivatives(x, ~mask)
+        return after, torch.where(at_nodes, correction, 0.0)
+
+    def _converged(self) -> Tensor:
+        """Whether each scene's last step did, (B,) bool."""
+        statuses = self.steps.statuses[-1]
+        return torch.tensor([s.ok for s in statuses], device=self.bodies.rest.device)
+
+    def _at_rest_unless(
+        self, ok: Tensor, before: BatchState, previous: Tensor | None
+    ) -> tuple[BatchState, Tensor | None]:
+        """What the network is shown of a state: other scenes than those (B,) as at rest."""
+        rest = self._hybrid.stepper.cells.rest[:, : before.positions.shape[1]]
+        seen = replace(
+            before, positions=torch.where(by_scene(ok), before.positions, rest),
+            velocities=torch.where(by_scene(ok), before.velocities, 0.0),
+        )  # fmt: skip
+        if previous is not None:
+            previous = torch.where(self.bodies.by_node(ok)[:, None], previous, 0.0)
+        return seen, previous
+
     def _step(self, before: BatchState, forces: Tensor | None) -> BatchState:
         positions, velocities = self.steps(
             before.positions, before.velocities, forces, times=before.times
         )
         return BatchState(positions, velocities, before.times)
+
+
+def _without_derivatives(x: Tensor | None, where: Tensor) -> None:
+    """Make a tensor of a graph that exists already pass no derivatives back in some places."""
+    if x is not None and x.requires_grad:
+        x.register_hook(lambda grad: torch.where(where, 0.0, grad))  # type: ignore[no-untyped-call]
