@@ -93,11 +93,6 @@ class BatchBodies:
         """Nodal forces (B, N, 3), N, for a correction (n, 3)."""
         return self.padded(as_forces(correction, self._stepper.time_step, self.graph.mass))
 
-    def sound(self, x: Tensor) -> Tensor:
-        """Whether all values (n, ...) of each body are finite, (B,)."""
-        faults = (~torch.isfinite(x)).flatten(1).any(dim=1).to(self.graph.rest.dtype)
-        return self.graph.node_sums(faults) == 0.0
-
 
 def external_forces(stepper: BatchStepper, state: BatchState) -> Tensor:
     """All loads of the scenes (B, N, 3), N, in the step from a state.

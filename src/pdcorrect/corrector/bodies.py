@@ -154,6 +154,11 @@ class BodyGraph:
         counts = torch.bincount(self.graph, minlength=self.bodies).to(values.dtype)
         return self.node_sums(values) / counts.reshape(-1, *[1] * (values.ndim - 1))
 
+    def sound(self, values: Tensor) -> Tensor:
+        """Whether all values (n, ...) of each body are finite, (B,)."""
+        faults = (~torch.isfinite(values)).flatten(1).any(dim=1).to(self.rest.dtype)
+        return self.node_sums(faults) == 0.0
+
     def to(
         self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
     ) -> BodyGraph:
