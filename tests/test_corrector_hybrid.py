@@ -130,6 +130,42 @@ def test_the_network_is_told_all_loads_of_the_step(load):
     assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
+def proposed(problem, state):
+    """What the network is shown before the coarse solver was asked, one by one and in a batch."""
+    bodies = BodyGraph.of([problem], dtype=torch.float64)
+    one = SingleCoarseStep(pc.ProjectiveDynamics(problem), bodies, "recomputed", state)
+    stepper = pc.BatchStepper([problem])
+    many = BatchBodies(stepper).snapshot(stepper.state([state]), None, None)
+    return one.view(None).snapshot.proposed.numpy(), many.proposed.numpy()
+
+
+def test_moving_clamps_are_proposed_where_they_will_be():
+    turn = {"times": [0.0, 0.1], "rotation": [0.0, 40.0], "centre": [0, 0.01, 0.01], "axis": "x"}
+    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": turn}]
+    problem = pc.discretise(soft_beam(clamps=clamps, loads=[TORSION]))
+    coarse, state = pc.ProjectiveDynamics(problem), problem.rest_state()
+    for _ in range(2):
+        after = coarse(state).state
+        for found in proposed(problem, state):
+            held_at = ~problem.free
+            assert np.array_equal(found[held_at], after.positions[held_at])
+            assert np.abs(found - state.positions)[held_at].max() > 1e-2 * CELL
+        state = after
+
+
+def test_clamps_that_do_not_move_and_free_nodes_are_proposed_by_inertia_and_loads():
+    problem = pc.discretise(soft_beam(loads=[TORSION], clamps=[{
+        "region": {"plane": "x", "at": 0.0}, "components": ["x", "z"],
+    }]))  # fmt: skip
+    h, state = problem.time_step, pc.rollout(pc.ProjectiveDynamics(problem), 3).state()
+    loads = problem.external_forces(state.time, state.time + h)
+    expected = state.positions + h * state.velocities
+    expected += h**2 * loads * problem.free / problem.mass[:, None]
+    one, many = proposed(problem, state)
+    assert np.array_equal(one, expected)
+    assert np.allclose(many, expected, rtol=0, atol=1e-15)
+
+
 # --- placements ------------------------------------------------------------------------------
 
 

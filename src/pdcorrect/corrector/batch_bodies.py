@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -76,18 +77,15 @@ class BatchBodies:
         self, state: BatchState, coarse: Tensor | None, previous: Tensor | None
     ) -> Snapshot:
         """A step from ``state``, with the coarse answer (B, N, 3) if there is one."""
-        forces = external_forces(self._stepper, state)
-        flat = Snapshot(
-            self.flat(state.positions), self.flat(state.velocities),
-            self.flat(state.positions), self.flat(forces), previous,
-        )  # fmt: skip
-        h, graph = self._stepper.time_step, self.graph
-        proposed = (
-            ballistic(flat, h, flat.forces, graph.mass, graph.free)
-            if coarse is None
-            else self.flat(coarse)
+        positions, velocities, forces = map(
+            self.flat, (state.positions, state.velocities, external_forces(self._stepper, state))
         )
-        return Snapshot(flat.positions, flat.velocities, proposed, flat.forces, previous)
+        if coarse is not None:
+            return Snapshot(positions, velocities, self.flat(coarse), forces, previous)
+        h, graph = self._stepper.time_step, self.graph
+        start = Snapshot(positions, velocities, positions, forces, previous)
+        held = self.flat(self._stepper.staging.prescribed([t + h for t in state.times]))
+        return replace(start, proposed=ballistic(start, h, forces, graph.mass, graph.free, held))
 
     def forces(self, correction: Tensor) -> Tensor:
         """Nodal forces (B, N, 3), N, for a correction (n, 3)."""

@@ -63,9 +63,9 @@ class SingleCoarseStep:
     def view(self, answer: StepResult | None) -> View:
         """See `CoarseStep`."""
         state, problem = self._state, self._problem
-        h = self._coarse.time_step
+        h, mass, free = self._coarse.time_step, problem.mass, problem.free
         proposed: Array = (
-            ballistic(state, h, self._loads, problem.mass, problem.free)
+            ballistic(state, h, self._loads, mass, free, problem.clamped_positions(state.time + h))
             if answer is None
             else answer.state.positions
         )
