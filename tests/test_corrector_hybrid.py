@@ -166,6 +166,56 @@ def test_clamps_that_do_not_move_and_free_nodes_are_proposed_by_inertia_and_load
     assert np.allclose(many, expected, rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("mass", ["lumped", "averaged", "per-node"])
+def test_the_network_knows_the_material_that_the_stepper_has_now(mass):
+    scenes = [pc.discretise(p.scene, mass=mass) for p in problems((3, 1, 1), (2, 2, 1))]
+    stepper = pc.BatchStepper(scenes)
+    layer = HybridLayer(stepper, fitted(scenes), through_solver=False)
+    nodes, own = BatchBodies(stepper), BodyGraph.of(scenes, dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    young, poisson, density = (
+        low + (high - low) * torch.rand(2, 4, generator=random, dtype=torch.float64)
+        for low, high in ((1e4, 1e5), (0.1, 0.4), (500.0, 2000.0))
+    )
+    known = nodes.graph.rest_frames
+    stepper.set_material(young, poisson, density)
+    changed = [
+        p.with_material(*(m[i, : len(p.cells)].numpy() for m in (young, poisson, density)))
+        for i, p in enumerate(scenes)
+    ]
+    expected = BodyGraph.of(changed, dtype=torch.float64)
+    late = BatchBodies(stepper)
+    for found in (nodes.graph, layer.bodies, late.graph):
+        for name in ("mass", "young", "poisson", "density"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+            assert not torch.allclose(getattr(found, name), getattr(own, name))
+        assert torch.equal(found.rest_frames, own.rest_frames)
+    assert nodes.graph is nodes.graph
+    assert nodes.graph.rest_frames is known
+    stepper.set_material()
+    for found in (nodes.graph, layer.bodies, late.graph):
+        for name in ("mass", "young", "poisson", "density"):
+            assert torch.equal(getattr(found, name), getattr(own, name))
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_batch_of_another_material_is_corrected_as_scenes_of_that_material(placement):
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, placement=placement)
+    stepper = pc.BatchStepper(scenes, 1e-11)
+    hybrid = BatchHybrid(stepper, corrector)
+    before = hybrid(stepper.rest_state())
+    stepper.set_material(young=2e5, density=700.0)
+    other = pc.BatchStepper([stepper.problem_now(i) for i in range(2)], 1e-11)
+    found, expected = (
+        hybrid(stepper.rest_state()),
+        BatchHybrid(other, corrector)(other.rest_state()),
+    )
+    torch.testing.assert_close(found.correction, expected.correction, rtol=1e-6, atol=1e-12)
+    size = float(before.correction.abs().max())
+    assert float((found.correction - before.correction).abs().max()) > 1e-2 * size
+
+
 # --- placements ------------------------------------------------------------------------------
 
 

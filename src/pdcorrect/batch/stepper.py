@@ -265,6 +265,11 @@ class BatchStepper:
         """The present material, for `using`."""
         return self._material
 
+    @property
+    def own(self) -> BatchMaterial:
+        """The problems' material."""
+        return self._own
+
     def _with(self, base: BatchMaterial, given: Sequence[Tensor | None]) -> BatchMaterial:
         if all(m is None for m in given):
             return base

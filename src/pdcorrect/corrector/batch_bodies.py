@@ -44,28 +44,38 @@ def check_corrector(corrector: object, device: torch.device) -> Corrector:
 
 
 class BatchBodies:
-    """The scenes of a stepper as the bodies of a graph: n nodes without padding.
-
-    Attributes
-    ----------
-    graph : BodyGraph
-        float64, on the stepper's device.  Of the stepper's problems: a material that the
-        stepper was given later is not seen.
-    """
+    """The scenes of a stepper as the bodies of a graph: n nodes without padding."""
 
     def __init__(self, stepper: BatchStepper) -> None:
         if not isinstance(stepper, BatchStepper):
             raise InputError(f"stepper is a {type(stepper).__name__}: expected a BatchStepper.")
-        self._stepper = stepper
-        self.graph = BodyGraph.of(
+        self._stepper, self._material = stepper, stepper.own
+        self._own = self._graph = BodyGraph.of(
             stepper.problems, stepper.time_step, device=stepper.device, dtype=torch.float64
         )
         self._shape = tuple(stepper.node_mask.shape)
         self._rows = stepper.node_mask.reshape(-1).nonzero()[:, 0]
 
+    @property
+    def graph(self) -> BodyGraph:
+        """With the material that the stepper has now; float64, on its device."""
+        stepper, material = self._stepper, self._stepper.present
+        if material is not self._material:
+            cells, nodes = stepper.cells, self._shape[1]
+            self._graph = (
+                self._own
+                if material is stepper.own
+                else self._own.with_material(
+                    self.flat(stepper.objective.mass.nodal[:, :nodes]),
+                    *(values[cells.present_cells] for values in material.values),
+                )
+            )
+            self._material = material
+        return self._graph
+
     def flat(self, x: Tensor) -> Tensor:
         """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return x.reshape(-1, *x.shape[2:])[self._rows].to(self.graph.rest.dtype)
+        return x.reshape(-1, *x.shape[2:])[self._rows].to(self._own.rest.dtype)
 
     def padded(self, x: Tensor) -> Tensor:
         """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
