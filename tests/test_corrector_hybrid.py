@@ -300,6 +300,48 @@ def test_a_corrected_guess_leads_to_the_coarse_answer():
         assert result.iterations != expected.iterations
 
 
+def test_a_guess_may_lead_to_another_minimum():
+    """A beam that is pressed together at its ends bows to the side of the guess."""
+    push = {"times": [0.0, 0.01], "displacement": [[0, 0, 0], [-CELL, 0, 0]]}
+    clamps = [
+        {"region": {"plane": "x", "at": "min"}},
+        {"region": {"plane": "x", "at": "max"}, "motion": push},
+    ]
+    time = {"integrator": "quasi-static"}
+    problem = pc.discretise(soft_beam((8, 1, 1), clamps=clamps, loads=[], time=time))
+    bow = np.zeros_like(problem.positions)
+    bow[:, 2] = CELL * np.sin(np.pi * problem.positions[:, 0] / (8 * CELL)) ** 2
+    coarse, ways = pc.ProjectiveDynamics(problem, 1e-7), []
+    plain = coarse(problem.rest_state())
+    for side in (1.0, -1.0):
+        corrector = prescribed(problem, side * bow, placement="guess")
+        result = HybridStepper(coarse, corrector)(problem.rest_state())
+        assert result.status is pc.Status.CONVERGED
+        assert result.stats["elastic_energy"] < 0.99 * plain.stats["elastic_energy"]
+        ways.append((result.state.positions - problem.positions)[:, 2])
+    assert ways[0].max() > 0.5 * CELL
+    assert ways[0].min() > -1e-3 * CELL
+    assert ways[1].min() < -0.5 * CELL
+    assert ways[1].max() < 1e-3 * CELL
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+def test_neutral_corrections_leave_a_free_body_the_momentum_of_its_coarse_step(placement):
+    problem, before = flying()
+    momenta = {}
+    for neutral in (True, False):
+        corrector = fitted([pc.discretise(soft_beam())], size=0.5, placement=placement,
+                           momentum_neutral=neutral)  # fmt: skip
+        stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), corrector)
+        bent = pc.State(problem.positions + bumped(problem), before.velocities)
+        found, coarse = stepper(bent), stepper.coarse(bent)
+        assert found.stats["correction"] > 1e-5 * CELL
+        change = problem.mass[:, None] * (found.state.velocities - coarse.state.velocities)
+        momenta[neutral] = np.abs(change.sum(axis=0)).max() / np.abs(change).sum()
+    assert momenta[True] < 1e-6
+    assert momenta[False] > 1e-3
+
+
 @pytest.mark.parametrize("integrator", ["backward-euler", "midpoint", "bdf2"])
 @pytest.mark.parametrize("kind", [pc.ProjectiveDynamics, pc.Newton])
 def test_a_step_that_begins_at_its_answer_ends_at_once(kind, integrator):

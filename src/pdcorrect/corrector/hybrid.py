@@ -45,7 +45,8 @@ class HybridStepper:
     corrector : Corrector
         Fitted, on the CPU.  Its placement says what is corrected: the answer ("state"), the
         loads ("force": m delta/h2 is added, with the row sums of the mass matrix, and the
-        converged answer to that is the result), or only the first iterate ("guess").
+        converged answer to that is the result), or only the first iterate ("guess": where the
+        step has several minima the result may be another one than without).
     velocity : {"recomputed", "kept"}
         Of corrected answers: what the integrator makes of the corrected positions, by
         backward Euler v = (p - p_before)/h, or the coarse solver's own.
