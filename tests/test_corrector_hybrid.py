@@ -1,5 +1,7 @@
 """Corrected steps: what they are made of, and what must not change."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -19,16 +21,19 @@ from hybrid_samples import (
 )
 from pdcorrect.corrector.batch_bodies import BatchBodies, external_forces
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.gate import Gate, Reason, refusals
+from pdcorrect.corrector.gate import Gate, Measured, Reason, refusals
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
+from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.solvers.resume import check_same_run
 
 CELL = 0.02
-OPEN = Gate(margin=None, volume=None, energy=None)
+OPEN = Gate(margin=None, volume=None, crushing=None, energy=None)
 
 
 def same(a, b):
@@ -125,6 +130,92 @@ def test_the_network_is_told_all_loads_of_the_step(load):
     assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
+def proposed(problem, state):
+    """What the network is shown before the coarse solver was asked, one by one and in a batch."""
+    bodies = BodyGraph.of([problem], dtype=torch.float64)
+    one = SingleCoarseStep(pc.ProjectiveDynamics(problem), bodies, "recomputed", state)
+    stepper = pc.BatchStepper([problem])
+    many = BatchBodies(stepper).snapshot(stepper.state([state]), None, None)
+    return one.view(None).snapshot.proposed.numpy(), many.proposed.numpy()
+
+
+def test_moving_clamps_are_proposed_where_they_will_be():
+    turn = {"times": [0.0, 0.1], "rotation": [0.0, 40.0], "centre": [0, 0.01, 0.01], "axis": "x"}
+    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": turn}]
+    problem = pc.discretise(soft_beam(clamps=clamps, loads=[TORSION]))
+    coarse, state = pc.ProjectiveDynamics(problem), problem.rest_state()
+    for _ in range(2):
+        after = coarse(state).state
+        for found in proposed(problem, state):
+            held_at = ~problem.free
+            assert np.array_equal(found[held_at], after.positions[held_at])
+            assert np.abs(found - state.positions)[held_at].max() > 1e-2 * CELL
+        state = after
+
+
+def test_clamps_that_do_not_move_and_free_nodes_are_proposed_by_inertia_and_loads():
+    problem = pc.discretise(soft_beam(loads=[TORSION], clamps=[{
+        "region": {"plane": "x", "at": 0.0}, "components": ["x", "z"],
+    }]))  # fmt: skip
+    h, state = problem.time_step, pc.rollout(pc.ProjectiveDynamics(problem), 3).state()
+    loads = problem.external_forces(state.time, state.time + h)
+    expected = state.positions + h * state.velocities
+    expected += h**2 * loads * problem.free / problem.mass[:, None]
+    one, many = proposed(problem, state)
+    assert np.array_equal(one, expected)
+    assert np.allclose(many, expected, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "averaged", "per-node"])
+def test_the_network_knows_the_material_that_the_stepper_has_now(mass):
+    scenes = [pc.discretise(p.scene, mass=mass) for p in problems((3, 1, 1), (2, 2, 1))]
+    stepper = pc.BatchStepper(scenes)
+    layer = HybridLayer(stepper, fitted(scenes), through_solver=False)
+    nodes, own = BatchBodies(stepper), BodyGraph.of(scenes, dtype=torch.float64)
+    random = torch.Generator().manual_seed(0)
+    young, poisson, density = (
+        low + (high - low) * torch.rand(2, 4, generator=random, dtype=torch.float64)
+        for low, high in ((1e4, 1e5), (0.1, 0.4), (500.0, 2000.0))
+    )
+    known = nodes.graph.rest_frames
+    stepper.set_material(young, poisson, density)
+    changed = [
+        p.with_material(*(m[i, : len(p.cells)].numpy() for m in (young, poisson, density)))
+        for i, p in enumerate(scenes)
+    ]
+    expected = BodyGraph.of(changed, dtype=torch.float64)
+    late = BatchBodies(stepper)
+    for found in (nodes.graph, layer.bodies, late.graph):
+        for name in ("mass", "young", "poisson", "density"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+            assert not torch.allclose(getattr(found, name), getattr(own, name))
+        assert torch.equal(found.rest_frames, own.rest_frames)
+    assert nodes.graph is nodes.graph
+    assert nodes.graph.rest_frames is known
+    stepper.set_material()
+    for found in (nodes.graph, layer.bodies, late.graph):
+        for name in ("mass", "young", "poisson", "density"):
+            assert torch.equal(getattr(found, name), getattr(own, name))
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_batch_of_another_material_is_corrected_as_scenes_of_that_material(placement):
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, placement=placement)
+    stepper = pc.BatchStepper(scenes, 1e-11)
+    hybrid = BatchHybrid(stepper, corrector)
+    before = hybrid(stepper.rest_state())
+    stepper.set_material(young=2e5, density=700.0)
+    other = pc.BatchStepper([stepper.problem_now(i) for i in range(2)], 1e-11)
+    found, expected = (
+        hybrid(stepper.rest_state()),
+        BatchHybrid(other, corrector)(other.rest_state()),
+    )
+    torch.testing.assert_close(found.correction, expected.correction, rtol=1e-6, atol=1e-12)
+    size = float(before.correction.abs().max())
+    assert float((found.correction - before.correction).abs().max()) > 1e-2 * size
+
+
 # --- placements ------------------------------------------------------------------------------
 
 
@@ -207,6 +298,48 @@ def test_a_corrected_guess_leads_to_the_coarse_answer():
         state, plain = result.state, expected.state
         assert np.abs(state.positions - plain.positions).max() < 1e-7 * CELL
         assert result.iterations != expected.iterations
+
+
+def test_a_guess_may_lead_to_another_minimum():
+    """A beam that is pressed together at its ends bows to the side of the guess."""
+    push = {"times": [0.0, 0.01], "displacement": [[0, 0, 0], [-CELL, 0, 0]]}
+    clamps = [
+        {"region": {"plane": "x", "at": "min"}},
+        {"region": {"plane": "x", "at": "max"}, "motion": push},
+    ]
+    time = {"integrator": "quasi-static"}
+    problem = pc.discretise(soft_beam((8, 1, 1), clamps=clamps, loads=[], time=time))
+    bow = np.zeros_like(problem.positions)
+    bow[:, 2] = CELL * np.sin(np.pi * problem.positions[:, 0] / (8 * CELL)) ** 2
+    coarse, ways = pc.ProjectiveDynamics(problem, 1e-7), []
+    plain = coarse(problem.rest_state())
+    for side in (1.0, -1.0):
+        corrector = prescribed(problem, side * bow, placement="guess")
+        result = HybridStepper(coarse, corrector)(problem.rest_state())
+        assert result.status is pc.Status.CONVERGED
+        assert result.stats["elastic_energy"] < 0.99 * plain.stats["elastic_energy"]
+        ways.append((result.state.positions - problem.positions)[:, 2])
+    assert ways[0].max() > 0.5 * CELL
+    assert ways[0].min() > -1e-3 * CELL
+    assert ways[1].min() < -0.5 * CELL
+    assert ways[1].max() < 1e-3 * CELL
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+def test_neutral_corrections_leave_a_free_body_the_momentum_of_its_coarse_step(placement):
+    problem, before = flying()
+    momenta = {}
+    for neutral in (True, False):
+        corrector = fitted([pc.discretise(soft_beam())], size=0.5, placement=placement,
+                           momentum_neutral=neutral)  # fmt: skip
+        stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), corrector)
+        bent = pc.State(problem.positions + bumped(problem), before.velocities)
+        found, coarse = stepper(bent), stepper.coarse(bent)
+        assert found.stats["correction"] > 1e-5 * CELL
+        change = problem.mass[:, None] * (found.state.velocities - coarse.state.velocities)
+        momenta[neutral] = np.abs(change.sum(axis=0)).max() / np.abs(change).sum()
+    assert momenta[True] < 1e-6
+    assert momenta[False] > 1e-3
 
 
 @pytest.mark.parametrize("integrator", ["backward-euler", "midpoint", "bdf2"])
@@ -450,9 +583,13 @@ def strange(problem):
 
 CASES = {
     Reason.NOT_FINITE: (OPEN, lambda p: np.full(p.positions.shape, np.nan), False),
-    Reason.FEATURES: (Gate(volume=None, energy=None), lambda p: 0.01 * bumped(p), True),
+    Reason.FEATURES: (
+        Gate(volume=None, crushing=None, energy=None),
+        lambda p: 0.01 * bumped(p),
+        True,
+    ),
     Reason.INVERSION: (Gate(margin=None, energy=None), folded, False),
-    Reason.ENERGY: (Gate(margin=None, volume=None), wild, False),
+    Reason.ENERGY: (Gate(margin=None, volume=None, crushing=None), wild, False),
 }
 
 
@@ -574,8 +711,183 @@ def test_a_failed_coarse_step_is_not_corrected(placement):
     assert not plain.status.ok
     assert result.status is plain.status
     assert same(result.state, plain.state)
-    if placement != "guess":
-        assert result.stats["gate"] == Reason.SOLVER
+    assert result.stats["gate"] == Reason.SOLVER
+    assert result.stats["correction"] == 0.0
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_failed_step_of_a_batch_is_the_plain_one(placement):
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, placement=placement)
+    stepper = pc.BatchStepper(scenes, 1e-13, max_iterations=1, recover=False)
+    state = stepper.state([shaken(p) for p in scenes])
+    result, plain = BatchHybrid(stepper, corrector)(state), stepper(state)
+    assert result.reasons.tolist() == [Reason.SOLVER] * 2
+    assert torch.equal(result.state.positions, plain.state.positions)
+    assert not result.correction.any()
+
+
+def measured(ratios, stored=1.0, work=0.0):
+    """Of scenes with some smallest det F in their cells."""
+    ratios = torch.tensor(ratios, dtype=torch.float64)
+    one = torch.ones(len(ratios), dtype=torch.float64)
+    return Measured(ratios, stored * one, work * one)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "passes"),
+    [
+        ([-1.0, 0.9], True),  # as it was
+        ([-0.5, 0.9], True),  # better, though not good
+        ([-1.0, -0.5], False),  # inverts a cell that was not the worst one
+        ([0.5, -1e-9], False),
+        ([-1.1, 0.9], False),  # worse than inverted
+        ([-1.0, 0.091], True),
+        ([-1.0, 0.089], False),  # below a tenth of the coarse answer's
+        ([np.nan, 0.9], False),
+        ([-1.0, np.nan], False),
+    ],
+)
+def test_a_gate_looks_at_each_cell(ratios, passes):
+    coarse = measured([[-1.0, 0.9, np.inf], [1.0, 1.0, 1.0]])
+    answer = measured([[*ratios, np.inf], [1.0, 1.0, 1.0]])
+    found = Gate().reasons(answer, coarse, None)
+    assert found.tolist() == [0 if passes else Reason.INVERSION, 0]
+    found = Gate().reasons(
+        measured([[1.0, 1.0, 1.0], [*ratios, 1.0]]), measured([[1.0] * 3, [-1.0, 0.9, 1.0]]), None
+    )
+    assert found.tolist() == [0, 0 if passes else Reason.INVERSION]
+
+
+def test_tests_of_volume_are_switched_off_one_by_one():
+    coarse = measured([[1.0, 1.0]])
+    crushed, inverted = measured([[1.0, 0.05]]), measured([[1.0, -0.5]])
+    for gate, expected in (
+        (Gate(crushing=None), (0, Reason.INVERSION)),
+        (Gate(volume=None), (Reason.INVERSION, Reason.INVERSION)),
+        (Gate(volume=None, crushing=None), (0, 0)),
+        (Gate(crushing=0.05), (0, Reason.INVERSION)),
+    ):
+        found = [int(gate.reasons(x, coarse, None)) for x in (crushed, inverted)]
+        assert found == list(expected)
+
+
+def test_a_crushed_cell_refuses_a_correction():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    flat = -(problem.positions - problem.positions[0]) * [0.0, 0.0, 1.0]
+    held_at = problem.positions[:, :1] / (3 * CELL)  # the held end stays
+    corrector = prescribed(problem, flat * held_at)
+    stepper = pc.BatchStepper([problem])
+    for gate, reason in (
+        (Gate(margin=None, energy=None), Reason.INVERSION),
+        (Gate(margin=None, energy=None, crushing=None), Reason.NONE),
+    ):
+        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+        assert hybrid(problem.rest_state()).stats["gate"] == reason
+        many = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+        assert many.reasons.tolist() == [reason]
+
+
+def flying(speed=0.5):
+    """A free body in uniform motion along x, and its state."""
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2))
+    velocities = np.zeros_like(problem.positions)
+    velocities[:, 0] = speed
+    return problem, pc.State(problem.positions, velocities)
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize(
+    ("push", "refused"), [(0.999, False), (1.001, True), (100.0, True), (-1.5, False), (-3.1, True)]
+)
+def test_the_bound_on_energy_does_not_grow_with_the_correction(placement, push, refused):
+    """A push of x times the way makes the energy (1 + x)^2 times as large; 4 is allowed."""
+    problem, before = flying()
+    way = np.zeros_like(problem.positions)
+    way[:, 0] = push * problem.time_step * before.velocities[:, 0]
+    corrector = prescribed(problem, way, placement=placement)
+    gate = Gate(margin=None, energy=3.0)
+    result = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)(before)
+    assert result.stats["gate"] == (Reason.ENERGY if refused else 0)
+    stepper = pc.BatchStepper([problem], 1e-10)
+    many = BatchHybrid(stepper, corrector, gate=gate)(stepper.state([before]))
+    assert many.reasons.tolist() == [Reason.ENERGY if refused else 0]
+
+
+@pytest.mark.parametrize(
+    ("push", "steps"), [(-0.5, ["forced"]), (0.5, ["forced", "plain"]), (9.0, ["forced", "plain"])]
+)
+def test_the_plain_step_is_solved_only_where_energy_rises_beyond_the_loads_work(push, steps):
+    problem, before = flying()
+    way = np.zeros_like(problem.positions)
+    way[:, 0] = push * problem.time_step * before.velocities[:, 0]
+    corrector = prescribed(problem, way, placement="force")
+    taken = []
+
+    class Counting(pc.ProjectiveDynamics):
+        def __call__(self, state, forces=None, *args, **options):
+            taken.append("plain" if forces is None else "forced")
+            return super().__call__(state, forces, *args, **options)
+
+    gate = Gate(margin=None, energy=3.0)
+    result = HybridStepper(Counting(problem), corrector, gate=gate)(before)
+    assert taken == steps
+    assert result.stats["refused"] == (push == 9.0)
+
+
+@pytest.mark.parametrize("push", [False, True])
+def test_the_work_of_a_correction_s_forces_is_no_work_of_loads(push):
+    problem = pc.discretise(soft_beam(loads=[PRESSURE]))
+    corrector = prescribed(problem, bumped(problem), placement="force")
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    before = shaken(problem)
+    extra = np.full(problem.positions.shape, 1e-3) if push else None
+    result = stepper(before, extra)
+    loads = problem.external_forces(0.0, problem.time_step) + (0.0 if extra is None else extra)
+    work = np.vdot(loads, result.state.positions - before.positions)
+    assert result.stats["correction"] > 0.0
+    assert result.stats["external_work"] == pytest.approx(work, rel=1e-9)
+    other = stepper.coarse(before, extra).stats["external_work"]
+    assert abs(other - work) > 0.1 * abs(work)
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("integrator", ["backward-euler", "midpoint"])
+def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element):
+    scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
+    corrector, shifts = fitted(scenes), [bumped(p) for p in scenes]
+    stepper = pc.BatchStepper(scenes, 1e-12, integrator=integrator)
+    states = [pc.State(disturbed(p, 0.1), shaken(p).velocities) for p in scenes]
+    many = BatchCoarseStep(
+        BatchParts(stepper, corrector, "recomputed"), stepper.state(states), None
+    )
+    answer = many.solved()
+    many.view(answer)
+    moved = many.moved(answer, torch.tensor(np.concatenate(shifts)))
+    for i, (problem, state, shift) in enumerate(zip(scenes, states, shifts, strict=True)):
+        coarse = pc.ProjectiveDynamics(problem, 1e-12, integrator=integrator)
+        bodies = BodyGraph.of([problem], dtype=torch.float64)
+        one = SingleCoarseStep(coarse, bodies, "recomputed", state)
+        alone = one.solved()
+        pairs = (
+            (many.measured(answer), one.measured(alone), True),
+            (many.measured(moved), one.measured(one.moved(alone, torch.tensor(shift))), False),
+            (many.before(), one.before(), True),
+        )
+        for found, expected, same_modes in pairs:
+            if found is None:
+                assert element == "hex8-bubble"
+                continue
+            count = len(problem.cells)
+            ratios = found.ratios[i, :count].numpy()
+            assert ratios == pytest.approx(expected.ratios[0].numpy(), rel=1e-8)
+            assert torch.isinf(found.ratios[i, count:]).all()
+            assert float(found.work[i]) == pytest.approx(float(expected.work), rel=1e-8)
+            stored, least = float(found.stored[i]), float(expected.stored[0])
+            if same_modes or element == "hex8" or integrator == "midpoint":
+                assert stored == pytest.approx(least, rel=1e-8)
+            else:
+                assert stored > least
 
 
 def test_refusals_are_counted_by_reason():
@@ -608,6 +920,23 @@ def test_a_state_that_the_correction_inverts_is_called_so():
     corrector = prescribed(problem, folded(problem))
     result = HybridStepper(pc.ProjectiveDynamics(problem), corrector)(problem.rest_state())
     assert result.status is pc.Status.INVERTED
+
+
+@pytest.mark.parametrize("found", [s for s in pc.Status if s.ok])
+@pytest.mark.parametrize("folds", [True, False])
+def test_how_a_step_was_found_stays_and_inverted_cells_are_the_corrected_state_s(found, folds):
+    problem = pc.discretise(soft_beam())
+
+    class Told(pc.ProjectiveDynamics):
+        def __call__(self, *args, **options):
+            return replace(super().__call__(*args, **options), status=found)
+
+    corrector = prescribed(problem, folded(problem) if folds else bumped(problem))
+    status = HybridStepper(Told(problem), corrector)(problem.rest_state()).status
+    if found in (pc.Status.CONVERGED, pc.Status.INVERTED):
+        assert status is (pc.Status.INVERTED if folds else pc.Status.CONVERGED)
+    else:
+        assert status is found
 
 
 # --- turning the scene -----------------------------------------------------------------------
@@ -712,30 +1041,44 @@ def test_a_gate_without_meaning_is_refused(changes):
         Gate(**changes)
 
 
+def gradients_beside(scenes, corrector, through_solver, spoil=None):
+    """Gradients of a loss on scene 0 after two steps; ``spoil`` changes the start of scene 1."""
+    stepper = pc.BatchStepper(scenes, 1e-12)
+    layer = HybridLayer(stepper, corrector, through_solver=through_solver, on_failure="zero")
+    start = stepper.rest_state()
+    p, v, given = start.positions.clone(), start.velocities.clone(), None
+    if spoil is not None:
+        spoil(p, v)
+        given = torch.zeros_like(layer.bodies.rest)
+    loss, nodes = 0.0, len(scenes[0].positions)
+    for k in range(2):
+        p, v, given = layer(p, v, [k * stepper.time_step] * len(scenes), given)
+        if spoil is not None and k == 0:
+            assert not layer.steps.statuses[-1][1].ok
+            assert not given[nodes:].any()
+        assert layer.steps.statuses[-1][0].ok
+        loss = loss + (p - start.positions)[0, :nodes].square().sum()
+        loss = loss + given[:nodes].square().sum()
+    return torch.autograd.grad(loss, list(corrector.parameters()))
+
+
+def lost(p, v):
+    v[1] = torch.nan
+
+
+def far_away(p, v):
+    v[1] = 1e200  # whose square is infinite
+
+
+@pytest.mark.parametrize("spoil", [lost, far_away])
 @pytest.mark.parametrize("through_solver", [True, False])
-def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(through_solver):
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(placement, through_solver, spoil):
     scenes = problems((3, 1, 1), (2, 1, 1))
-    corrector = fitted(scenes, size=0.05)
-    weights = list(corrector.parameters())
-
-    def gradients(chosen, spoil):
-        stepper = pc.BatchStepper(chosen, 1e-12)
-        options = {"through_solver": through_solver, "on_failure": "zero"}
-        layer = HybridLayer(stepper, corrector, **options)
-        start = stepper.rest_state()
-        p, v = start.positions, start.velocities.clone()
-        if spoil:
-            v[1] = torch.nan
-        loss, nodes = 0.0, len(scenes[0].positions)
-        for k in range(2):
-            p, v, correction = layer(p, v, [k * stepper.time_step] * len(chosen))
-            if k == 0:
-                assert not (spoil and correction[nodes:].any())
-            loss = loss + (p - start.positions)[0, :nodes].square().sum()
-            loss = loss + correction[:nodes].square().sum()
-        return torch.autograd.grad(loss, weights)
-
-    found, expected = gradients(scenes, spoil=True), gradients(scenes[:1], spoil=False)
+    features = (*preset("compact").node_features, "previous-correction")
+    corrector = fitted(scenes, placement=placement, node_features=features)
+    found = gradients_beside(scenes, corrector, through_solver, spoil)
+    expected = gradients_beside(scenes[:1], corrector, through_solver)
     for one, other in zip(found, expected, strict=True):
         assert one == pytest.approx(other, abs=1e-3 * float(other.abs().max()))
     assert any(g.any() for g in found)

@@ -254,6 +254,29 @@ def test_a_first_guess_is_to_become_the_base_models_answer(folder):
     torch.testing.assert_close(guess.snapshot.proposed, state.snapshot.positions + moved)
 
 
+@pytest.mark.parametrize("placement", ["force", "guess"])
+def test_what_is_proposed_before_the_step_holds_the_clamps_where_the_coarse_step_has_them(
+    folder, placement
+):
+    changes = {**samples.SMALL["changes"], "placement": placement}
+    architecture = {"preset": "compact", "changes": changes}
+    stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
+    windows, _ = samples.windows(folder, samples.config(stage, corrector=architecture))
+    found = windows.dataset.batch([7, 26])
+    batch = windows.step_batch(found)
+    held, state = ~batch.bodies.free, batch.snapshot
+    assert held.any()
+    ahead = state.positions + 0.01 * state.velocities  # as clamps that do not move always were
+    assert torch.equal(state.proposed[held], ahead[held])
+    found.predictions[:, -1][held] += 0.003
+    moved = windows.step_batch(found)
+    predicted = found.predictions[:, -1].to(torch.float64)
+    assert torch.equal(moved.snapshot.proposed[held], predicted[held])
+    assert torch.equal(moved.snapshot.proposed[~held], state.proposed[~held])
+    if placement == "guess":
+        assert not moved.target[held].any()
+
+
 @pytest.mark.parametrize("relative", [False, True])
 def test_noise_is_seen_and_to_be_corrected(folder, relative):
     settings = samples.config(samples.one_step())

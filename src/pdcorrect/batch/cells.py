@@ -181,13 +181,17 @@ class CellBatch:
 
         Of the nodes' displacements alone, see `ElasticBody.volume_ratios`.
         """
+        return self.volume_ratios(positions).amin(dim=1)
+
+    def volume_ratios(self, positions: Tensor) -> Tensor:
+        """The same of each cell, (B, C); infinite in padding."""
         n = self.sizes
         u = torch.zeros_like(self.rest)
         u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
         a, b, c, d, e, f, g, h, i = self.gradients(u, 1.0).unbind()
         ratios = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
         by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
-        return torch.where(self.present_cells, by_cell, math.inf).amin(dim=1)
+        return torch.where(self.present_cells, by_cell, math.inf)
 
     def rotations(self, F: Tensor) -> Tensor:
         """Nearest rotations (9, M) of matrices (9, M)."""

@@ -143,7 +143,7 @@ class BatchStaging:
         known: dict[str, Any] = {
             "positions": state.positions,
             "velocities": state.velocities,
-            "prescribed": self._prescribed([t + self._h for t in state.times]),
+            "prescribed": self.prescribed([t + self._h for t in state.times]),
             "time": torch.zeros_like(state.positions)
             + by_scene(state.positions.new_tensor(state.times)),
             **state.memory,
@@ -158,7 +158,8 @@ class BatchStaging:
             )
         return known
 
-    def _prescribed(self, times: Sequence[float]) -> Tensor:
+    def prescribed(self, times: Sequence[float]) -> Tensor:
+        """Clamped positions of the scenes at their times (s), (B, N, 3), m."""
         return self._held(times) if self._moving else self._clamped
 
     def _held(self, times: Sequence[float]) -> Tensor:

@@ -74,6 +74,27 @@ class BatchResult(Solved):
     smallest_volume_ratios: Array
 
 
+def chosen(which: Tensor, one: BatchResult, other: BatchResult) -> BatchResult:
+    """The outcome of some scenes, ``which`` (B,) bool, and for the rest another one's."""
+    rows, at = which.cpu().numpy(), which[:, None, None]
+    a, b = one.state, other.state
+    pairs = zip(rows, one.statuses, other.statuses, strict=True)
+    return BatchResult(
+        torch.where(at, one.y, other.y),
+        [first if row else second for row, first, second in pairs],
+        BatchState(
+            torch.where(at, a.positions, b.positions),
+            torch.where(at, a.velocities, b.velocities),
+            a.times,
+            {name: torch.where(at, x, b.memory[name]) for name, x in a.memory.items()},
+        ),
+        np.where(rows, one.iterations, other.iterations),
+        np.where(rows, one.evaluations, other.evaluations),
+        np.where(rows, one.error_estimates, other.error_estimates),
+        np.where(rows, one.smallest_volume_ratios, other.smallest_volume_ratios),
+    )
+
+
 def in_one(statuses: Sequence[Status]) -> list[bool]:
     """Whether each scene's step has a result, and not in smaller parts: so it has derivatives."""
     return [s.ok and s is not Status.SUBSTEPPED for s in statuses]

@@ -144,7 +144,7 @@ class BatchStepper:
         self._minimiser: BatchMinimiser | None = None
         self._inverse: FirstHessian | None = None
         self._one_by_one = OneByOne(
-            self.cells, self._problem_now, self.tolerances, self.time_step, self.integrator
+            self.cells, self.problem_now, self.tolerances, self.time_step, self.integrator
         )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -265,6 +265,11 @@ class BatchStepper:
         """The present material, for `using`."""
         return self._material
 
+    @property
+    def own(self) -> BatchMaterial:
+        """The problems' material."""
+        return self._own
+
     def _with(self, base: BatchMaterial, given: Sequence[Tensor | None]) -> BatchMaterial:
         if all(m is None for m in given):
             return base
@@ -279,8 +284,8 @@ class BatchStepper:
         self.cells.set_weights(material.mu, material.volume_weight)
         self.objective.mass.set_density(material.density)
 
-    def _problem_now(self, i: int) -> Problem:
-        """A scene with the material that it has now."""
+    def problem_now(self, i: int) -> Problem:
+        """The problem of a scene with the material that it has now."""
         problem = self.problems[i]
         if self._material is self._own:
             return problem

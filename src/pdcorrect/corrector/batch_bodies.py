@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -43,28 +44,38 @@ def check_corrector(corrector: object, device: torch.device) -> Corrector:
 
 
 class BatchBodies:
-    """The scenes of a stepper as the bodies of a graph: n nodes without padding.
-
-    Attributes
-    ----------
-    graph : BodyGraph
-        float64, on the stepper's device.  Of the stepper's problems: a material that the
-        stepper was given later is not seen.
-    """
+    """The scenes of a stepper as the bodies of a graph: n nodes without padding."""
 
     def __init__(self, stepper: BatchStepper) -> None:
         if not isinstance(stepper, BatchStepper):
             raise InputError(f"stepper is a {type(stepper).__name__}: expected a BatchStepper.")
-        self._stepper = stepper
-        self.graph = BodyGraph.of(
+        self._stepper, self._material = stepper, stepper.own
+        self._own = self._graph = BodyGraph.of(
             stepper.problems, stepper.time_step, device=stepper.device, dtype=torch.float64
         )
         self._shape = tuple(stepper.node_mask.shape)
         self._rows = stepper.node_mask.reshape(-1).nonzero()[:, 0]
 
+    @property
+    def graph(self) -> BodyGraph:
+        """With the material that the stepper has now; float64, on its device."""
+        stepper, material = self._stepper, self._stepper.present
+        if material is not self._material:
+            cells, nodes = stepper.cells, self._shape[1]
+            self._graph = (
+                self._own
+                if material is stepper.own
+                else self._own.with_material(
+                    self.flat(stepper.objective.mass.nodal[:, :nodes]),
+                    *(values[cells.present_cells] for values in material.values),
+                )
+            )
+            self._material = material
+        return self._graph
+
     def flat(self, x: Tensor) -> Tensor:
         """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return x.reshape(-1, *x.shape[2:])[self._rows].to(self.graph.rest.dtype)
+        return x.reshape(-1, *x.shape[2:])[self._rows].to(self._own.rest.dtype)
 
     def padded(self, x: Tensor) -> Tensor:
         """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
@@ -76,27 +87,19 @@ class BatchBodies:
         self, state: BatchState, coarse: Tensor | None, previous: Tensor | None
     ) -> Snapshot:
         """A step from ``state``, with the coarse answer (B, N, 3) if there is one."""
-        forces = external_forces(self._stepper, state)
-        flat = Snapshot(
-            self.flat(state.positions), self.flat(state.velocities),
-            self.flat(state.positions), self.flat(forces), previous,
-        )  # fmt: skip
-        h, graph = self._stepper.time_step, self.graph
-        proposed = (
-            ballistic(flat, h, flat.forces, graph.mass, graph.free)
-            if coarse is None
-            else self.flat(coarse)
+        positions, velocities, forces = map(
+            self.flat, (state.positions, state.velocities, external_forces(self._stepper, state))
         )
-        return Snapshot(flat.positions, flat.velocities, proposed, flat.forces, previous)
+        if coarse is not None:
+            return Snapshot(positions, velocities, self.flat(coarse), forces, previous)
+        h, graph = self._stepper.time_step, self.graph
+        start = Snapshot(positions, velocities, positions, forces, previous)
+        held = self.flat(self._stepper.staging.prescribed([t + h for t in state.times]))
+        return replace(start, proposed=ballistic(start, h, forces, graph.mass, graph.free, held))
 
     def forces(self, correction: Tensor) -> Tensor:
         """Nodal forces (B, N, 3), N, for a correction (n, 3)."""
         return self.padded(as_forces(correction, self._stepper.time_step, self.graph.mass))
-
-    def sound(self, x: Tensor) -> Tensor:
-        """Whether all values (n, ...) of each body are finite, (B,)."""
-        faults = (~torch.isfinite(x)).flatten(1).any(dim=1).to(self.graph.rest.dtype)
-        return self.graph.node_sums(faults) == 0.0
 
 
 def external_forces(stepper: BatchStepper, state: BatchState) -> Tensor:

@@ -13,17 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.batch.checks import check_nodal, start_times
+from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.batch.threads import one_thread
-from pdcorrect.corrector.batch_bodies import BatchBodies, check_corrector
-from pdcorrect.corrector.batch_gate import BatchAnswer
-from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts, WithNodes
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import View
-from pdcorrect.corrector.gate import Gate, Reason, check_gate
-from pdcorrect.corrector.placements import Velocity, check_velocity, moved
-from pdcorrect.errors import InputError
+from pdcorrect.corrector.decision import corrected_step
+from pdcorrect.corrector.gate import Gate, check_gate
+from pdcorrect.corrector.placements import Velocity
 from pdcorrect.torch_layer import OnFailure, PDLayer
 
 
@@ -38,7 +36,8 @@ class BatchHybridResult:
         As applied, m: to positions, or, by the placement, as forces or to the first iterate.
         Zero where it was refused.
     coarse : BatchResult
-        Of the coarse solver; with placement "force" under the corrected loads.
+        Of the coarse solver, its statuses too; with placement "force" under the corrected
+        loads where they count.  Steps that converged to inverted cells are corrected like others.
     reasons : (B,) int64 tensor
         Numbers of `Reason`: why the plain coarse answer was kept; 0 where it was not.
     factors : (B,) tensor
@@ -57,54 +56,7 @@ class BatchHybridResult:
         return self.reasons > 0
 
 
-class _Hybrid:
-    """What both forms of a hybrid have: its parts, checked."""
-
-    def __init__(self, stepper: BatchStepper, corrector: Corrector, velocity: Velocity) -> None:
-        self.nodes = BatchBodies(stepper)
-        self.corrector = check_corrector(corrector, stepper.device)
-        check_velocity(velocity, stepper.integrator)
-        self.stepper, self.velocity = stepper, velocity
-        self.placement = corrector.config.placement
-
-    def view(self, before: BatchState, coarse: Tensor | None, previous: Tensor | None) -> View:
-        """What the network sees of a step."""
-        graph = self.nodes.graph
-        if previous is not None and previous.shape != graph.rest.shape:
-            raise InputError(
-                f"previous: {tuple(previous.shape)}; expected the correction of the step before, "
-                f"{tuple(graph.rest.shape)}, or None."
-            )
-        return View(graph, self.nodes.snapshot(before, coarse, previous))
-
-    def moved(self, before: BatchState, after: BatchState, correction: Tensor) -> BatchState:
-        """The state after a step with a correction (n, 3) added."""
-        scheme = self.stepper.staging(before).scheme
-        shift = self.nodes.padded(correction)
-        positions, velocities, memory = moved(scheme, after, shift, self.velocity)
-        return replace(after, positions=positions, velocities=velocities, memory=memory)
-
-
-class _WithNodes:
-    """Nodal values of all scenes with and without padding."""
-
-    _hybrid: _Hybrid
-
-    @property
-    def bodies(self) -> BodyGraph:
-        """The scenes as the network knows them, float64, on the stepper's device."""
-        return self._hybrid.nodes.graph
-
-    def flat(self, x: Tensor) -> Tensor:
-        """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return self._hybrid.nodes.flat(x)
-
-    def padded(self, x: Tensor) -> Tensor:
-        """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""
-        return self._hybrid.nodes.padded(x)
-
-
-class BatchHybrid(_WithNodes):
+class BatchHybrid(WithNodes):
     """Steps many scenes and corrects each; no gradients.
 
     A scene whose correction is exactly zero, or refused, keeps its coarse step bit for bit.
@@ -135,7 +87,7 @@ class BatchHybrid(_WithNodes):
         velocity: Velocity = "recomputed",
         gate: Gate | None = None,
     ) -> None:
-        self._hybrid = _Hybrid(stepper, corrector, velocity)
+        self._hybrid = BatchParts(stepper, corrector, velocity)
         self.stepper, self.corrector, self.gate = stepper, corrector, gate
         check_gate(gate, corrector)
 
@@ -154,93 +106,15 @@ class BatchHybrid(_WithNodes):
         InputError
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
-        correct = {"state": self._state, "force": self._force, "guess": self._guess}
         with one_thread(self.stepper.device):
-            return correct[self._hybrid.placement](state, previous)
-
-    def _state(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
-        hybrid, coarse = self._hybrid, self.stepper(before)
-        view = hybrid.view(before, coarse.state.positions, previous)
-        asked, reasons = self._asked(view)
-        reasons = torch.where(self._failed(coarse), int(Reason.SOLVER), reasons)
-        factors = torch.ones_like(self.bodies.cell_size)
-        if self.gate is not None and self.gate.judges:
-            answer = self._answer(before, coarse, view)
-            factors, found = answer.judged(
-                self.gate, lambda x: hybrid.moved(before, coarse.state, self._scaled(asked, x))
-            )
-            factors = factors.to(asked)
-            reasons = self._first(reasons, found, asked)
-        correction = self._scaled(asked, torch.where(reasons == 0, factors, 0.0))
-        after = hybrid.moved(before, coarse.state, correction)
-        changed = self._changed(correction)[:, None, None]
-        final = replace(
-            after,
-            positions=torch.where(changed, after.positions, coarse.state.positions),
-            velocities=torch.where(changed, after.velocities, coarse.state.velocities),
-            memory={
-                name: torch.where(changed, x, coarse.state.memory[name])
-                for name, x in after.memory.items()
-            },
+            step = BatchCoarseStep(self._hybrid, state, previous)
+            answer, coarse, decision = corrected_step(step, self.corrector, self.gate)
+        return BatchHybridResult(
+            answer.state, decision.correction, coarse, decision.reasons, decision.factors
         )
-        return BatchHybridResult(final, correction, coarse, reasons, factors)
-
-    def _force(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
-        view = self._hybrid.view(before, None, previous)
-        asked, reasons = self._asked(view)
-        added = self._hybrid.nodes.forces(asked)
-        coarse = self.stepper(before, added)
-        found = torch.where(self._failed(coarse), int(Reason.SOLVER), 0)
-        if self.gate is not None and self.gate.judges:
-            judged = self._answer(before, coarse, view).judged_as_forced(self.gate, added)
-            found = torch.where(found == 0, judged, found)
-        found = self._first(torch.zeros_like(reasons), found, asked)
-        correction = self._scaled(asked, (found == 0).to(asked))
-        if found.any():
-            coarse = self.stepper(before, self._hybrid.nodes.forces(correction))
-        reasons = torch.where(reasons == 0, found, reasons)
-        factors = torch.ones_like(self.bodies.cell_size)
-        return BatchHybridResult(coarse.state, correction, coarse, reasons, factors)
-
-    def _guess(self, before: BatchState, previous: Tensor | None) -> BatchHybridResult:
-        view = self._hybrid.view(before, None, previous)
-        correction, reasons = self._asked(view)
-        changed = self.bodies.by_node(self._changed(correction))[:, None]
-        guess = torch.where(changed, view.snapshot.proposed + correction, torch.nan)
-        coarse = self.stepper(before, guess=self.padded(guess))
-        factors = torch.ones_like(self.bodies.cell_size)
-        return BatchHybridResult(coarse.state, correction, coarse, reasons, factors)
-
-    def _asked(self, view: View) -> tuple[Tensor, Tensor]:
-        """The network's correction (n, 3), and why scenes' were refused and made zero, (B,)."""
-        correction = self.corrector.of_view(view)
-        sound = self._hybrid.nodes.sound(correction)
-        reasons = torch.where(sound, int(Reason.NONE), int(Reason.NOT_FINITE))
-        if self.gate is not None:
-            unknown = sound & self.gate.unknown(self.corrector, view)
-            reasons = torch.where(unknown, int(Reason.FEATURES), reasons)
-        fine = view.bodies.by_node(reasons == 0)[:, None]
-        return torch.where(fine, correction, 0.0), reasons
-
-    def _answer(self, before: BatchState, coarse: BatchResult, view: View) -> BatchAnswer:
-        return BatchAnswer(self.stepper, before, coarse, self.padded(view.snapshot.forces))
-
-    def _failed(self, coarse: BatchResult) -> Tensor:
-        return torch.tensor([not s.ok for s in coarse.statuses], device=self.stepper.device)
-
-    def _first(self, reasons: Tensor, found: Tensor, correction: Tensor) -> Tensor:
-        """Reasons, and those found later of scenes that have none and are corrected at all."""
-        return torch.where((reasons == 0) & self._changed(correction), found, reasons)
-
-    def _scaled(self, correction: Tensor, factors: Tensor) -> Tensor:
-        return correction * self.bodies.by_node(factors.to(correction))[:, None]
-
-    def _changed(self, correction: Tensor) -> Tensor:
-        """Whether a scene has a correction that is not zero, (B,)."""
-        return self.bodies.node_sums((correction != 0.0).any(dim=1).to(correction)) > 0.0
 
 
-class HybridLayer(_WithNodes, nn.Module):
+class HybridLayer(WithNodes, nn.Module):
     """One corrected step of many scenes, differentiable by the network's weights.
 
     Call it again with what it returned for more steps.  The corrector is a submodule.
@@ -287,7 +161,7 @@ class HybridLayer(_WithNodes, nn.Module):
         on_failure: OnFailure = "raise",
     ) -> None:
         super().__init__()
-        self._hybrid = _Hybrid(stepper, corrector, velocity)
+        self._hybrid = BatchParts(stepper, corrector, velocity)
         self.corrector, self.through_solver = corrector, through_solver
         self.steps = PDLayer(stepper, on_failure=on_failure)
 
@@ -326,38 +200,82 @@ class HybridLayer(_WithNodes, nn.Module):
         if hybrid.placement == "state":
             after, correction = self._corrected(before, self._step(before, None), previous)
         else:
-            correction = self.corrector.of_view(hybrid.view(before, None, previous))
-            force = hybrid.placement == "force"
-            after = self._step(before, hybrid.nodes.forces(correction) if force else None)
+            after, correction = self._stepped(before, previous)
         return after.positions, after.velocities, correction
 
     def _corrected(
         self, before: BatchState, after: BatchState, previous: Tensor | None
     ) -> tuple[BatchState, Tensor]:
         """The state after a step, corrected; scenes whose step failed have no part in it."""
-        hybrid = self._hybrid
-        stepped = torch.tensor(
-            [s.ok for s in self.steps.statuses[-1]], device=self.bodies.rest.device
-        )
-        ok, at_nodes = stepped[:, None, None], self.bodies.by_node(stepped)[:, None]
-        rest = hybrid.stepper.cells.rest[:, : before.positions.shape[1]]
-        seen = replace(
-            before, positions=torch.where(ok, before.positions, rest),
-            velocities=torch.where(ok, before.velocities, 0.0),
-        )  # fmt: skip
-        proposed = torch.where(ok, after.positions, rest)
-        known = None if previous is None else torch.where(at_nodes, previous, 0.0)
+        hybrid, ok = self._hybrid, self._converged()
+        at_nodes = self.bodies.by_node(ok)[:, None]
+        seen, known = self._at_rest_unless(ok, before, previous)
+        proposed = torch.where(by_scene(ok), after.positions, seen.positions)
         correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
         correction = torch.where(at_nodes, correction, 0.0)
-        moved = hybrid.moved(before, after, correction)
+        moved, ok = hybrid.moved(before, after, correction), by_scene(ok)
         final = replace(
             moved, positions=torch.where(ok, moved.positions, after.positions.detach()),
             velocities=torch.where(ok, moved.velocities, after.velocities.detach()),
         )  # fmt: skip
         return final, correction
 
+    def _stepped(self, before: BatchState, previous: Tensor | None) -> tuple[BatchState, Tensor]:
+        """The state after a step with corrected loads or guess; failed scenes as above.
+
+        The network is asked before it is known which steps fail: again, where its inputs or
+        answer are not finite, and what it is shown of scenes that fail later has no derivatives.
+        """
+        hybrid, nodes = self._hybrid, self._hybrid.nodes
+        with torch.no_grad():
+            flat = torch.cat([nodes.flat(before.positions), nodes.flat(before.velocities)], dim=1)
+            flat = flat if previous is None else torch.cat([flat, previous], dim=1)
+            sound = self.bodies.sound(flat)
+        while True:
+            seen, known = self._at_rest_unless(sound, before, previous)
+            correction = self.corrector.of_view(hybrid.view(seen, None, known))
+            still = sound & self.bodies.sound(correction)
+            if torch.equal(still, sound):
+                break
+            sound = still
+        correction = torch.where(self.bodies.by_node(sound)[:, None], correction, 0.0)
+        force = hybrid.placement == "force"
+        after = self._step(before, nodes.forces(correction) if force else None)
+        ok = sound & self._converged()
+        at_nodes = self.bodies.by_node(ok)[:, None]
+        for x, mask in (
+            (seen.positions, by_scene(ok)), (seen.velocities, by_scene(ok)),
+            (known, at_nodes), (correction, at_nodes),
+        ):  # fmt: skip
+            _without_derivatives(x, ~mask)
+        return after, torch.where(at_nodes, correction, 0.0)
+
+    def _converged(self) -> Tensor:
+        """Whether each scene's last step did, (B,) bool."""
+        statuses = self.steps.statuses[-1]
+        return torch.tensor([s.ok for s in statuses], device=self.bodies.rest.device)
+
+    def _at_rest_unless(
+        self, ok: Tensor, before: BatchState, previous: Tensor | None
+    ) -> tuple[BatchState, Tensor | None]:
+        """What the network is shown of a state: other scenes than those (B,) as at rest."""
+        rest = self._hybrid.stepper.cells.rest[:, : before.positions.shape[1]]
+        seen = replace(
+            before, positions=torch.where(by_scene(ok), before.positions, rest),
+            velocities=torch.where(by_scene(ok), before.velocities, 0.0),
+        )  # fmt: skip
+        if previous is not None:
+            previous = torch.where(self.bodies.by_node(ok)[:, None], previous, 0.0)
+        return seen, previous
+
     def _step(self, before: BatchState, forces: Tensor | None) -> BatchState:
         positions, velocities = self.steps(
             before.positions, before.velocities, forces, times=before.times
         )
         return BatchState(positions, velocities, before.times)
+
+
+def _without_derivatives(x: Tensor | None, where: Tensor) -> None:
+    """Make a tensor of a graph that exists already pass no derivatives back in some places."""
+    if x is not None and x.requires_grad:
+        x.register_hook(lambda grad: torch.where(where, 0.0, grad))  # type: ignore[no-untyped-call]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -153,6 +153,33 @@ class BodyGraph:
         """Means (B, ...) over the nodes of each body of values (n, ...)."""
         counts = torch.bincount(self.graph, minlength=self.bodies).to(values.dtype)
         return self.node_sums(values) / counts.reshape(-1, *[1] * (values.ndim - 1))
+
+    def sound(self, values: Tensor) -> Tensor:
+        """Whether all values (n, ...) of each body are finite, (B,)."""
+        faults = (~torch.isfinite(values)).flatten(1).any(dim=1).to(self.rest.dtype)
+        return self.node_sums(faults) == 0.0
+
+    def with_material(
+        self, mass: Tensor, young: Tensor, poisson: Tensor, density: Tensor
+    ) -> BodyGraph:
+        """The same bodies of another material: nodal masses (n,), kg, and values (c,) of cells.
+
+        What is known of their rest is kept.
+        """
+        corners = self.cells.reshape(-1)
+        counts = torch.bincount(corners, minlength=len(self.rest)).to(self.rest)
+
+        def mean(values: Tensor) -> Tensor:
+            each = values.to(self.rest).repeat_interleave(self.cells.shape[1])
+            return torch.zeros_like(self.mass).index_add(0, corners, each) / counts
+
+        found = replace(
+            self, mass=mass.to(self.rest), young=mean(young), poisson=mean(poisson),
+            density=mean(density),
+        )  # fmt: skip
+        kept = ("rest_inverses", "rest_frames", "rest_edges", "rest_turns")
+        vars(found).update({name: vars(self)[name] for name in kept if name in vars(self)})
+        return found
 
     def to(
         self, device: str | torch.device | None = None, dtype: torch.dtype | None = None

@@ -29,11 +29,14 @@ class CorrectorConfig(Strict):
     clip
         Normalised inputs bend towards this bound; None leaves them as they are.
     momentum_neutral
-        Whether the linear and angular momentum that the correction gives to the wholly free
-        nodes of a body are taken out.
+        Whether the rigid motion that has the same sums of m delta and r x m delta over the
+        wholly free nodes of a body, at the proposed positions, is taken out of theirs: then
+        linear momentum stays exactly, angular momentum to first order in delta.  Nodes with a
+        held component keep what they have.
     placement
         What is corrected: "state", the coarse solver's answer; "force", its loads;
-        "guess", only where its iteration begins.
+        "guess", only where its iteration begins, which may lead to another one of several
+        minima.
     """
 
     node_features: tuple[str, ...]

@@ -6,7 +6,8 @@ not finite, and those of steps that the coarse solver failed, are refused withou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated
 
@@ -18,9 +19,6 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import NonNegative, Number, Strict
-
-_HALVINGS = 6
-"""How often a limited correction is halved before it is refused."""
 
 
 class Reason(IntEnum):
@@ -34,16 +32,37 @@ class Reason(IntEnum):
     SOLVER = 5
 
 
-Measure = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""From factors on the corrections of B scenes to smallest det F and energy, J, each (B,)."""
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What a gate looks at in the states of B scenes after a step, or before it.
+
+    Attributes
+    ----------
+    ratios : (B, C)
+        Smallest det F of each cell, of the nodes' displacements; infinite in padding.
+    stored : (B,)
+        Kinetic and elastic energy, J.
+    work : (B,)
+        Of the scene's loads since the step began, J, without the forces of corrections.
+    """
+
+    ratios: Tensor
+    stored: Tensor
+    work: Tensor
 
 
 class Gate(Strict):
     """When a correction is refused; None switches a test off.
 
     The network's inputs are tested before any placement.  Volumes and energy are tested on
-    corrected answers (placement "state") and on those under corrected loads ("force"); where
-    only the first iterate is corrected ("guess"), the answer is the coarse solver's anyway.
+    corrected answers (placement "state") and on those under corrected loads ("force"), against
+    the plain coarse answer of the same step; where only the first iterate is corrected
+    ("guess"), the answer is the coarse solver's anyway.
+
+    To save the plain step, an answer under corrected loads is first held against the state
+    before the step: if no cell fails by ``volume`` and ``crushing`` beside what it was, and
+    the loads have done at least the work by which the energy rose, it stands.  In batches
+    of elements with internal modes the plain step is always solved.
 
     Attributes
     ----------
@@ -51,14 +70,18 @@ class Gate(Strict):
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data.
     volume
-        Refused if the smallest det F at the quadrature points, of the nodes' displacements, is
-        not above this bound, unless it is no smaller than the coarse answer's.
+        Refused if in any cell the smallest det F at the quadrature points, of the nodes'
+        displacements, is not above this bound, unless it is no smaller than in the same cell
+        of the coarse answer.
+    crushing
+        Refused if in any cell it is below this multiple of the coarse answer's, where that is
+        positive.
     energy
-        Refused if kinetic and elastic energy less the work of the loads is higher than after
-        the coarse step by more than this multiple of the step's energy: kinetic and elastic
-        energy after the coarse step and the magnitude of the loads' work in it.  For placement
-        "force", where there is no other answer to compare with, the work of the added forces
-        takes the place of the rise.
+        Refused if kinetic and elastic energy less the work of the scene's loads in the step is
+        higher than after the coarse step by more than this multiple of the step's energy:
+        kinetic and elastic energy after the coarse step and the magnitude of the loads' work
+        in it.  Nothing in the bound depends on the correction, and the forces of corrections
+        are no loads.
     limit
         Whether a correction that fails by volume or energy is halved, up to six times, until it
         passes, and refused only then; for placement "state".
@@ -67,6 +90,7 @@ class Gate(Strict):
     margin: NonNegative | None = 3.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     volume: Number | None = 0.0
+    crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
     energy: NonNegative | None = 1.0
     limit: bool = False
 
@@ -90,40 +114,27 @@ class Gate(Strict):
         nodes |= counts > 0.0
         return bodies.body_means(nodes.to(bodies.mass)) > self.share
 
-    def judged(self, measure: Measure, volume: Tensor, cap: Tensor) -> tuple[Tensor, Tensor]:
-        """Factors on corrections, and reasons to refuse them, both (B,).
+    def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Tensor:
+        """Reasons (B,) to refuse an answer beside another one, which is the coarse one.
 
-        Parameters
-        ----------
-        measure : callable
-        volume : (B,)
-            Smallest det F of the coarse answers.
-        cap : (B,)
-            Largest energy that is accepted, J.
+        ``rise`` takes the place of ``energy``.  What is not a number does not pass.
         """
-        factors = torch.ones_like(cap)
-        reasons = self._reasons(*measure(factors), volume, cap)
-        for _ in range(_HALVINGS if self.limit else 0):
-            failed = reasons > 0
-            if not failed.any():
-                break
-            factors = torch.where(failed, 0.5 * factors, factors)
-            reasons = self._reasons(*measure(factors), volume, cap)
-        return factors, reasons
-
-    def _reasons(self, ratios: Tensor, energies: Tensor, volume: Tensor, cap: Tensor) -> Tensor:
-        reasons = torch.zeros(len(cap), dtype=torch.int64, device=cap.device)
-        if self.energy is not None:
-            reasons = torch.where(energies <= cap, reasons, int(Reason.ENERGY))
+        reasons = torch.zeros(len(answer.stored), dtype=torch.int64, device=answer.stored.device)
+        if rise is not None:
+            cap = coarse.stored - coarse.work + rise * (coarse.stored + coarse.work.abs())
+            reasons = torch.where(answer.stored - answer.work <= cap, reasons, int(Reason.ENERGY))
+        below = torch.zeros_like(answer.ratios, dtype=torch.bool)
         if self.volume is not None:
-            whole = (ratios > self.volume) | (ratios >= volume)
-            reasons = torch.where(whole, reasons, int(Reason.INVERSION))
-        return reasons
+            below |= ~(answer.ratios > self.volume)
+        if self.crushing is not None:
+            below |= ~(answer.ratios >= self.crushing * coarse.ratios.clamp_min(0.0))
+        worse = below & ~(answer.ratios >= coarse.ratios)
+        return torch.where(worse.any(dim=1), int(Reason.INVERSION), reasons)
 
     @property
     def judges(self) -> bool:
         """Whether it looks at the answers."""
-        return self.volume is not None or self.energy is not None
+        return any(bound is not None for bound in (self.volume, self.crushing, self.energy))
 
 
 def check_gate(gate: object, corrector: Corrector) -> None:

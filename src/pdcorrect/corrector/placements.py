@@ -8,6 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
+import numpy as np
+import torch
+
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.schemes import Scheme
 
@@ -16,11 +19,11 @@ Velocity = Literal["recomputed", "kept"]
 solver's own."""
 
 
-def ballistic(state: Any, h: float, forces: Any, mass: Any, free: Any) -> Any:
+def ballistic(state: Any, h: float, forces: Any, mass: Any, free: Any, held: Any) -> Any:
     """Positions after a step under inertia and loads alone, p + h v + h2 f/m, m.
 
     What the network is shown as the proposed positions before the coarse solver was asked.
-    Clamped components go on with their velocity: loads do not move them.
+    Clamped components are where the clamps will be.
 
     Parameters
     ----------
@@ -33,9 +36,12 @@ def ballistic(state: Any, h: float, forces: Any, mass: Any, free: Any) -> Any:
     mass : (...)
         Row sums of the mass matrix, kg.
     free : (..., 3)
-        1 or True where a component may move.
+        True where a component may move.
+    held : (..., 3)
+        Prescribed positions at the end of the step, m; not used where a component may move.
     """
-    return state.positions + h * state.velocities + h**2 * forces * free / mass[..., None]
+    ahead = state.positions + h * state.velocities + h**2 * forces / mass[..., None]
+    return (np if isinstance(ahead, np.ndarray) else torch).where(free, ahead, held)
 
 
 def as_forces(correction: Any, h: float, mass: Any) -> Any:

@@ -144,7 +144,8 @@ class StepWindows:
         target = targets[:, -1] - coarse
         if self.config.placement != "state":
             h: Any = bodies.by_node(bodies.time_step)[:, None]
-            start = ballistic(state, h, state.forces, bodies.mass, bodies.free)
+            # the clamps of the stored coarse step are where they are prescribed
+            start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
         return StepBatch(bodies, state, target, self._errors[found.mesh, found.simulation])

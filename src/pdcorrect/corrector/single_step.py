@@ -1,0 +1,147 @@
+"""`SingleCoarseStep`: a step of `ProjectiveDynamics` or `Newton` that a network corrects."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.features import Snapshot, View
+from pdcorrect.corrector.gate import Measured
+from pdcorrect.corrector.placements import Velocity, as_forces, ballistic, moved
+from pdcorrect.solvers.implicit import ImplicitStepper
+from pdcorrect.state import State, Status, StepResult
+
+Array = NDArray[np.float64]
+
+
+class SingleCoarseStep:
+    """A `CoarseStep` of one scene, on the CPU.
+
+    Parameters
+    ----------
+    coarse : ImplicitStepper
+    bodies : BodyGraph
+        Its scene, float64.
+    velocity : {"recomputed", "kept"}
+        Of corrected answers.
+    state : State
+        Before the step.
+    forces : (N, 3) or None
+        Besides the scene's loads, N.
+    previous : (N, 3) or None
+        Correction of the step before, m.
+
+    Attributes
+    ----------
+    seconds : float
+        Wall clock in the coarse solver.
+    """
+
+    def __init__(
+        self,
+        coarse: ImplicitStepper,
+        bodies: BodyGraph,
+        velocity: Velocity,
+        state: State,
+        forces: Array | None = None,
+        previous: Array | None = None,
+    ) -> None:
+        self._coarse, self._bodies, self._velocity = coarse, bodies, velocity
+        self._problem, self._state, self._forces = coarse.problem, state, forces
+        self._previous, self.seconds = previous, 0.0
+        stage = coarse.integrate(self._problem, state, coarse.time_step, forces)
+        loads = self._problem.external_forces(*stage.loads_over, stage.loads_at)
+        self._loads: Array = loads if forces is None else loads + forces
+
+    def view(self, answer: StepResult | None) -> View:
+        """See `CoarseStep`."""
+        state, problem = self._state, self._problem
+        h, mass, free = self._coarse.time_step, problem.mass, problem.free
+        proposed: Array = (
+            ballistic(state, h, self._loads, mass, free, problem.clamped_positions(state.time + h))
+            if answer is None
+            else answer.state.positions
+        )
+        arrays = state.positions, state.velocities, proposed, self._loads
+        positions, velocities, after, loads = map(torch.tensor, arrays)
+        old = None if self._previous is None else torch.tensor(self._previous)
+        return View(self._bodies, Snapshot(positions, velocities, after, loads, old))
+
+    def solved(self, added: Tensor | None = None, guess: Tensor | None = None) -> StepResult:
+        """See `CoarseStep`; the work of a correction's forces is no ``external_work``."""
+        started, forces = time.perf_counter(), self._forces
+        push: Array | None = None
+        if added is not None:
+            push = as_forces(added.numpy(), self._coarse.time_step, self._problem.mass)
+            forces = push if forces is None else forces + push
+        start = None if guess is None else guess.numpy()
+        answer = self._coarse(self._state, forces, guess=start)
+        self.seconds += time.perf_counter() - started
+        if push is None:
+            return answer
+        work = answer.stats["external_work"] - float(np.vdot(push, self._way(answer)))
+        return replace(answer, stats={**answer.stats, "external_work": work})
+
+    def ok(self, answer: StepResult) -> Tensor:
+        """See `CoarseStep`."""
+        return torch.tensor([answer.status.ok])
+
+    def moved(self, answer: StepResult, correction: Tensor) -> StepResult:
+        """See `CoarseStep`; statistics are those of the corrected state."""
+        shift = correction.numpy()
+        scheme = self._coarse.integrate.scheme(self._state, self._coarse.time_step)
+        positions, velocities, memory = moved(scheme, answer.state, shift, self._velocity)
+        state = State(positions, velocities, answer.state.time, memory)
+        ratio = float(self._problem.volume_ratios(positions).min())
+        work = answer.stats["external_work"] + float(np.vdot(self._loads, shift))
+        stats = {
+            **answer.stats,
+            "elastic_energy": self._problem.energy(positions),
+            "kinetic_energy": self._kinetic(state),
+            "external_work": work,
+            "smallest_volume_ratio": ratio,
+        }
+        return replace(answer, state=state, status=_status(answer.status, ratio), stats=stats)
+
+    def measured(self, answer: StepResult) -> Measured:
+        """See `CoarseStep`."""
+        stored = answer.stats["elastic_energy"] + answer.stats["kinetic_energy"]
+        return self._measured(answer.state, stored, np.vdot(self._loads, self._way(answer)))
+
+    def before(self) -> Measured:
+        """See `CoarseStep`."""
+        energy = self._problem.energy(self._state.positions)
+        return self._measured(self._state, energy + self._kinetic(self._state), 0.0)
+
+    def chosen(self, which: Tensor, one: StepResult, other: StepResult) -> StepResult:
+        """See `CoarseStep`."""
+        return one if bool(which) else other
+
+    def _measured(self, state: State, stored: float, work: float | np.floating[Any]) -> Measured:
+        ratios = torch.from_numpy(self._problem.volume_ratios(state.positions))[None]
+        numbers = torch.tensor([[stored], [float(work)]], dtype=torch.float64)
+        return Measured(ratios, numbers[0], numbers[1])
+
+    def _way(self, answer: StepResult) -> Array:
+        way: Array = answer.state.positions - self._state.positions
+        return way
+
+    def _kinetic(self, state: State) -> float:
+        return 0.5 * float(np.vdot(state.velocities, self._problem.mass_times(state.velocities)))
+
+
+def _status(coarse: Status, ratio: float) -> Status:
+    """Of a corrected state with a smallest det F.
+
+    How the coarse step was found stays; whether cells are inverted is the corrected state's.
+    """
+    if coarse not in (Status.CONVERGED, Status.INVERTED):
+        return coarse
+    return Status.INVERTED if ratio <= 0.0 else Status.CONVERGED
