@@ -1018,12 +1018,16 @@ def test_parts_that_do_not_fit_are_refused():
             hybrid(part, corrector, velocity="kept")
 
 
-def test_a_correction_before_of_other_bodies_is_refused():
-    problem = pc.discretise(soft_beam())
-    stepper = pc.BatchStepper([problem])
-    hybrid = BatchHybrid(stepper, fitted([problem]))
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_correction_before_of_other_bodies_is_refused(placement):
+    stepper = pc.BatchStepper([pc.discretise(soft_beam())])
+    corrector = fitted(stepper.problems, placement=placement)
+    state, other = stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="previous"):
-        hybrid(stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64))
+        BatchHybrid(stepper, corrector)(state, other)
+    layer = HybridLayer(stepper, corrector, through_solver=True)
+    with pytest.raises(InputError, match="previous"):
+        layer(state.positions, state.velocities, previous=other)
 
 
 def test_a_state_that_is_none_is_refused():

@@ -196,6 +196,7 @@ class HybridLayer(WithNodes, nn.Module):
         hybrid, cells = self._hybrid, self._hybrid.stepper.cells
         check_nodal(cells, "positions", positions)
         check_nodal(cells, "velocities", velocities)
+        hybrid.check_previous(previous)
         if not self.through_solver:
             positions, velocities = positions.detach(), velocities.detach()
             previous = None if previous is None else previous.detach()
