@@ -1018,12 +1018,16 @@ def test_parts_that_do_not_fit_are_refused():
             hybrid(part, corrector, velocity="kept")
 
 
-def test_a_correction_before_of_other_bodies_is_refused():
-    problem = pc.discretise(soft_beam())
-    stepper = pc.BatchStepper([problem])
-    hybrid = BatchHybrid(stepper, fitted([problem]))
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_correction_before_of_other_bodies_is_refused(placement):
+    stepper = pc.BatchStepper([pc.discretise(soft_beam())])
+    corrector = fitted(stepper.problems, placement=placement)
+    state, other = stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="previous"):
-        hybrid(stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64))
+        BatchHybrid(stepper, corrector)(state, other)
+    layer = HybridLayer(stepper, corrector, through_solver=True)
+    with pytest.raises(InputError, match="previous"):
+        layer(state.positions, state.velocities, previous=other)
 
 
 def test_a_state_that_is_none_is_refused():
@@ -1068,6 +1072,34 @@ def lost(p, v):
 
 def far_away(p, v):
     v[1] = 1e200  # whose square is infinite
+
+
+class Overflowing(Corrector):
+    """Gives what is not finite, with such derivatives, where a body is fast."""
+
+    def of_view(self, view):
+        speed = view.snapshot.velocities.norm(dim=1, keepdim=True)
+        return super().of_view(view) * torch.exp(1e6 * (speed - 100.0).clamp_min(0.0))
+
+
+def fast(p, v):
+    v[1] = 1e3
+
+
+@pytest.mark.parametrize("through_solver", [True, False])
+def test_loads_that_are_not_finite_fail_their_scene_alone(through_solver):
+    scenes = problems((3, 1, 1), (2, 1, 1))
+    corrector = fitted(scenes, kind=Overflowing, placement="force")
+    found = gradients_beside(scenes, corrector, through_solver, fast)
+    expected = gradients_beside(scenes[:1], corrector, through_solver)
+    for one, other in zip(found, expected, strict=True):
+        assert one == pytest.approx(other, abs=1e-3 * float(other.abs().max()))
+    stepper = pc.BatchStepper(scenes)
+    layer = HybridLayer(stepper, corrector, through_solver=through_solver)
+    start = stepper.rest_state()
+    fast(start.positions, start.velocities)
+    with pytest.raises(InputError, match="forces"):
+        layer(start.positions, start.velocities)
 
 
 @pytest.mark.parametrize("spoil", [lost, far_away])

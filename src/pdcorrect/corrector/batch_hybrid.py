@@ -146,6 +146,9 @@ class HybridLayer(WithNodes, nn.Module):
 
     Notes
     -----
+    Scenes whose step fails, where that does not raise, have a correction of zero and no part in
+    the derivatives by the weights.  Nothing is refused here.
+
     With placement "guess" positions and velocities do not depend on the network: only the
     correction does.  Derivatives by forces of the same step, for placement "force", go through
     the solver in any case.
@@ -193,14 +196,15 @@ class HybridLayer(WithNodes, nn.Module):
         hybrid, cells = self._hybrid, self._hybrid.stepper.cells
         check_nodal(cells, "positions", positions)
         check_nodal(cells, "velocities", velocities)
+        hybrid.check_previous(previous)
         if not self.through_solver:
             positions, velocities = positions.detach(), velocities.detach()
             previous = None if previous is None else previous.detach()
         before = BatchState(positions, velocities, start_times(cells, times))
-        if hybrid.placement == "state":
-            after, correction = self._corrected(before, self._step(before, None), previous)
+        if hybrid.placement == "force":
+            after, correction = self._forced(before, previous)
         else:
-            after, correction = self._stepped(before, previous)
+            after, correction = self._corrected(before, self._step(before, None), previous)
         return after.positions, after.velocities, correction
 
     def _corrected(
@@ -210,44 +214,42 @@ class HybridLayer(WithNodes, nn.Module):
         hybrid, ok = self._hybrid, self._converged()
         at_nodes = self.bodies.by_node(ok)[:, None]
         seen, known = self._at_rest_unless(ok, before, previous)
-        proposed = torch.where(by_scene(ok), after.positions, seen.positions)
+        guess, ok = hybrid.placement == "guess", by_scene(ok)
+        proposed = None if guess else torch.where(ok, after.positions, seen.positions)
         correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
         correction = torch.where(at_nodes, correction, 0.0)
-        moved, ok = hybrid.moved(before, after, correction), by_scene(ok)
+        if guess:
+            return after, correction
+        moved = hybrid.moved(before, after, correction)
         final = replace(
             moved, positions=torch.where(ok, moved.positions, after.positions.detach()),
             velocities=torch.where(ok, moved.velocities, after.velocities.detach()),
         )  # fmt: skip
         return final, correction
 
-    def _stepped(self, before: BatchState, previous: Tensor | None) -> tuple[BatchState, Tensor]:
-        """The state after a step with corrected loads or guess; failed scenes as above.
+    def _forced(self, before: BatchState, previous: Tensor | None) -> tuple[BatchState, Tensor]:
+        """The state after a step under corrected loads; failed scenes as above.
 
-        The network is asked before it is known which steps fail: again, where its inputs or
-        answer are not finite, and what it is shown of scenes that fail later has no derivatives.
+        The network is asked before it is known which steps fail.  Those from states that are
+        not finite will, and those under loads that are not: it is asked again without them.
         """
         hybrid, nodes = self._hybrid, self._hybrid.nodes
-        with torch.no_grad():
-            flat = torch.cat([nodes.flat(before.positions), nodes.flat(before.velocities)], dim=1)
-            flat = flat if previous is None else torch.cat([flat, previous], dim=1)
-            sound = self.bodies.sound(flat)
-        while True:
-            seen, known = self._at_rest_unless(sound, before, previous)
-            correction = self.corrector.of_view(hybrid.view(seen, None, known))
-            still = sound & self.bodies.sound(correction)
-            if torch.equal(still, sound):
-                break
-            sound = still
-        correction = torch.where(self.bodies.by_node(sound)[:, None], correction, 0.0)
-        force = hybrid.placement == "force"
-        after = self._step(before, nodes.forces(correction) if force else None)
-        ok = sound & self._converged()
+        known = [nodes.flat(before.positions), nodes.flat(before.velocities)]
+        known = known if previous is None else [*known, previous]
+        sound = self.bodies.sound(torch.cat(known, dim=1))
+        seen, given = self._at_rest_unless(sound, before, previous)
+        correction = self.corrector.of_view(hybrid.view(seen, None, given))
+        answered = sound & self.bodies.sound(correction)
+        if not torch.equal(answered, sound):
+            seen, given = self._at_rest_unless(answered, before, previous)
+            correction = self.corrector.of_view(hybrid.view(seen, None, given))
+        at_nodes = self.bodies.by_node(answered)[:, None]
+        after = self._step(before, nodes.forces(torch.where(at_nodes, correction, torch.nan)))
+        ok = self._converged()
         at_nodes = self.bodies.by_node(ok)[:, None]
-        for x, mask in (
-            (seen.positions, by_scene(ok)), (seen.velocities, by_scene(ok)),
-            (known, at_nodes), (correction, at_nodes),
-        ):  # fmt: skip
-            _without_derivatives(x, ~mask)
+        _without_derivatives(seen.positions, ~by_scene(ok))
+        _without_derivatives(seen.velocities, ~by_scene(ok))
+        _without_derivatives(given, ~at_nodes)
         return after, torch.where(at_nodes, correction, 0.0)
 
     def _converged(self) -> Tensor:

@@ -31,13 +31,17 @@ class BatchParts:
 
     def view(self, before: BatchState, coarse: Tensor | None, previous: Tensor | None) -> View:
         """What the network sees of a step."""
-        graph = self.nodes.graph
-        if previous is not None and previous.shape != graph.rest.shape:
+        self.check_previous(previous)
+        return View(self.nodes.graph, self.nodes.snapshot(before, coarse, previous))
+
+    def check_previous(self, previous: Tensor | None) -> None:
+        """Refuse a correction of other bodies."""
+        expected = self.nodes.graph.rest.shape
+        if previous is not None and previous.shape != expected:
             raise InputError(
                 f"previous: {tuple(previous.shape)}; expected the correction of the step before, "
-                f"{tuple(graph.rest.shape)}, or None."
+                f"{tuple(expected)}, or None."
             )
-        return View(graph, self.nodes.snapshot(before, coarse, previous))
 
     def moved(self, before: BatchState, after: BatchState, correction: Tensor) -> BatchState:
         """The state after a step with a correction (n, 3) added."""
