@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 import pdcorrect as pc
 from pdcorrect.fem.mesh import voxel_mesh
@@ -192,85 +191,115 @@ SCENARIOS = (
     Scenario("random 5", "by up to 5 cells", CALM_BEAM, "rest", scattered(5.0), quick=True),
     Scenario("random 50", "by up to 50 cells", CALM_BEAM, "rest", scattered(50.0)),
     Scenario("inside-out", "mirrored in its middle", CALM_BEAM, "rest", inside_out, quick=True),
-    Scenario(
-        "twist 720", "one end turned twice and back", moving(TURN, (24, 2, 2), 90), "rest"
-    ),
+    Scenario("twist 720", "one end turned twice and back", moving(TURN, (24, 2, 2), 90), "rest"),
     Scenario(
         "stretch 10", "drawn to ten times its length and back", moving(PULL, (6, 2, 2), 80), "rest"
     ),
     *(
         Scenario(
-            f"E {young:.0e}", "force at the end in proportion to Young's modulus (Pa)",
+            f"E {young:.0e}",
+            "force at the end in proportion to Young's modulus (Pa)",
             beam(frames=15, material={"young": young}, loads=[end_force(2e-3, young)]),
-            "motion", quick=young == 1e11,
-        )  # fmt: skip
+            "motion",
+            quick=young == 1e11,
+        )
         for young in (1e2, 1e5, 1e8, 1e11)
     ),
     Scenario(
-        "contrast 1e4", "half of the body ten thousand times stiffer",
+        "contrast 1e4",
+        "half of the body ten thousand times stiffer",
         beam(frames=15, material={"young": 1e7}, materials=[SOFT_END], loads=[gravity(1.0)]),
-        "motion", quick=True,
+        "motion",
+        quick=True,
     ),
     *(
         Scenario(
-            f"nu {nu}", "nearly incompressible, bending under its weight",
+            f"nu {nu}",
+            "nearly incompressible, bending under its weight",
             beam(frames=15, material={"young": 2e5, "poisson": nu}, loads=[gravity(9.81)]),
-            "motion", quick=nu == 0.4999,
-        )  # fmt: skip
+            "motion",
+            quick=nu == 0.4999,
+        )
         for nu in (0.49, 0.499, 0.4999)
     ),
     *(
         Scenario(
-            f"density {density:g}", "force at the end, mass from nearly none to much (kg/m3)",
+            f"density {density:g}",
+            "force at the end, mass from nearly none to much (kg/m3)",
             beam(frames=15, material={"density": density}, loads=[end_force(2e-3, 1e6)]),
             "motion",
-        )  # fmt: skip
+        )
         for density in (1e-1, 1e1, 1e3, 1e5)
     ),
     *(
         Scenario(
-            f"h {step:g}", "a bending motion at 2 m/s, by steps of this length (s)",
-            beam(frames=10, step=step, loads=[gravity(9.81)]), "motion", velocity=bending(2.0),
+            f"h {step:g}",
+            "a bending motion at 2 m/s, by steps of this length (s)",
+            beam(frames=10, step=step, loads=[gravity(9.81)]),
+            "motion",
+            velocity=bending(2.0),
             quick=step in (1e-5, 1.0),
-        )  # fmt: skip
+        )
         for step in (1e-5, 1e-3, 1e-1, 1.0)
     ),
     Scenario(
-        "slivers", "a strip of cells a hundred times wider than thick, under a small load",
+        "slivers",
+        "a strip of cells a hundred times wider than thick, under a small load",
         beam(
-            body=block_file((6, 2, 2), lambda p: p * [CELL, CELL, CELL / 100]), frames=15,
+            body=block_file((6, 2, 2), lambda p: p * [CELL, CELL, CELL / 100]),
+            frames=15,
             loads=[gravity(0.1)],
         ),
-        "motion", quick=True,
+        "motion",
+        quick=True,
     ),
     Scenario(
-        "warped", "cells with random corners and turned faces",
-        beam(body=block_file((6, 2, 2), warped), frames=15, loads=[gravity(9.81)]), "motion",
+        "warped",
+        "cells with random corners and turned faces",
+        beam(body=block_file((6, 2, 2), warped), frames=15, loads=[gravity(9.81)]),
+        "motion",
     ),
     Scenario(
-        "1 cell", "a body of one cell",
-        beam((1, 1, 1), 15, material={"young": 1e4}, loads=[gravity(9.81)]), "motion", quick=True,
+        "1 cell",
+        "a body of one cell",
+        beam((1, 1, 1), 15, material={"young": 1e4}, loads=[gravity(9.81)]),
+        "motion",
+        quick=True,
     ),
     Scenario(
-        "2 cells", "a body of two cells",
-        beam((2, 1, 1), 15, material={"young": 1e4}, loads=[gravity(9.81)]), "motion",
+        "2 cells",
+        "a body of two cells",
+        beam((2, 1, 1), 15, material={"young": 1e4}, loads=[gravity(9.81)]),
+        "motion",
     ),
     Scenario(
-        "200 000 cells", "a large compact body, one step under its weight",
-        beam((50, 64, 64), 1, step=0.05, loads=[gravity(9.81)]), "motion",
+        "200 000 cells",
+        "a large compact body, one step under its weight",
+        beam((50, 64, 64), 1, step=0.05, loads=[gravity(9.81)]),
+        "motion",
         solvers=("PD", "Newton"),
     ),
     Scenario(
-        "reversal", "a load of ten times gravity that turns round at every step",
-        beam(frames=15, material={"young": 2e5}), "motion", forces=reversing, quick=True,
+        "reversal",
+        "a load of ten times gravity that turns round at every step",
+        beam(frames=15, material={"young": 2e5}),
+        "motion",
+        forces=reversing,
+        quick=True,
     ),
     Scenario(
-        "no clamp", "a free body, squashed to half its height",
-        beam(clamps=[], damping=CALM), "shape", squashed((1, 1, 0.5)), quick=True,
+        "no clamp",
+        "a free body, squashed to half its height",
+        beam(clamps=[], damping=CALM),
+        "shape",
+        squashed((1, 1, 0.5)),
+        quick=True,
     ),
     Scenario(
-        "two bodies", "two bodies in one mesh, one held and one free, nodes displaced by 1 cell",
+        "two bodies",
+        "two bodies in one mesh, one held and one free, nodes displaced by 1 cell",
         beam(body={"shape": "voxels", "occupancy": TWO_BODIES, "cell_size": CELL}, damping=CALM),
-        "shape", scattered(0.5),
+        "shape",
+        scattered(0.5),
     ),
-)  # fmt: skip
+)

@@ -18,7 +18,7 @@ SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid")
 the plain one, and the model `tiny` with its gate on the best."""
 
 TIGHT = 1e-8
-"""Of the coarse cell size: PD as the reference of Newton.  Newton as that of PD: its own default."""
+"""Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""
 
 
 @dataclass(frozen=True)
