@@ -167,6 +167,20 @@ def test_figures_that_are_missing_or_no_number_are_outside(program, home):
     assert "d: missing, expected FINE" in out
 
 
+def test_a_known_failure_is_reported_until_it_is_mended(program, home, tmp_path):
+    known = {"value": 9.0, "tolerance": 0.1, "source": "theory", "known_failure": "ill <luck>"}
+    expect(home, a={**known, "quick": True})
+    status, out, _ = program("validate", "--quick")
+    assert status == 0
+    assert "sums: pass, but for 1 figures that are known to fail" in out
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "fails, known: ill &lt;luck&gt;" in page
+    expect(home, a={**known, "value": 1.0, "quick": True})
+    status, out, _ = program("validate", "--quick")
+    assert status == 1
+    assert "a: 1, expected 1 ± 0.1" in out
+
+
 def test_a_case_without_quick_figures_is_left_out_of_quick_runs(program, home):
     slow = {name: {**aim, "quick": False} for name, aim in EXPECTED.items()}
     (home / "expected.json").write_text(json.dumps(slow))

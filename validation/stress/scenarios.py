@@ -173,7 +173,7 @@ TURN = {"times": [0.0, 0.24, 0.48], "rotation": [0.0, 720.0, 0.0], "axis": "x"}
 PULL = {"times": [0.0, 0.2, 0.4], "displacement": [[0, 0, 0], [9 * 6 * CELL, 0, 0], [0, 0, 0]]}
 END = {"plane": "x", "at": "max"}
 SOFT_END = {"region": {"box": [[0.15, -1, -1], [1, 1, 1]]}, "young": 1e3}
-CALM_BEAM = beam(damping=CALM)
+CALM_BEAM = beam(frames=80, damping=CALM)
 
 
 def moving(motion: dict[str, Any], cells: tuple[int, int, int], frames: int) -> pc.Scene:
@@ -191,7 +191,7 @@ SCENARIOS = (
     Scenario("random 5", "by up to 5 cells", CALM_BEAM, "rest", scattered(5.0), quick=True),
     Scenario("random 50", "by up to 50 cells", CALM_BEAM, "rest", scattered(50.0)),
     Scenario("inside-out", "mirrored in its middle", CALM_BEAM, "rest", inside_out, quick=True),
-    Scenario("twist 720", "one end turned twice and back", moving(TURN, (24, 2, 2), 90), "rest"),
+    Scenario("twist 720", "one end turned twice and back", moving(TURN, (24, 2, 2), 128), "rest"),
     Scenario(
         "stretch 10", "drawn to ten times its length and back", moving(PULL, (6, 2, 2), 80), "rest"
     ),
@@ -199,7 +199,7 @@ SCENARIOS = (
         Scenario(
             f"E {young:.0e}",
             "force at the end in proportion to Young's modulus (Pa)",
-            beam(frames=15, material={"young": young}, loads=[end_force(2e-3, young)]),
+            beam(frames=15, material={"young": young}, loads=[end_force(2e-2, young)]),
             "motion",
             quick=young == 1e11,
         )
@@ -208,7 +208,7 @@ SCENARIOS = (
     Scenario(
         "contrast 1e4",
         "half of the body ten thousand times stiffer",
-        beam(frames=15, material={"young": 1e7}, materials=[SOFT_END], loads=[gravity(1.0)]),
+        beam(frames=15, material={"young": 1e7}, materials=[SOFT_END], loads=[gravity(9.81)]),
         "motion",
         quick=True,
     ),
@@ -226,7 +226,7 @@ SCENARIOS = (
         Scenario(
             f"density {density:g}",
             "force at the end, mass from nearly none to much (kg/m3)",
-            beam(frames=15, material={"density": density}, loads=[end_force(2e-3, 1e6)]),
+            beam(frames=15, material={"density": density}, loads=[end_force(2e-2, 1e6)]),
             "motion",
         )
         for density in (1e-1, 1e1, 1e3, 1e5)
@@ -244,11 +244,11 @@ SCENARIOS = (
     ),
     Scenario(
         "slivers",
-        "a strip of cells a hundred times wider than thick, under a small load",
+        "a strip of cells a hundred times wider than thick, falling under its weight",
         beam(
             body=block_file((6, 2, 2), lambda p: p * [CELL, CELL, CELL / 100]),
             frames=15,
-            loads=[gravity(0.1)],
+            loads=[gravity(9.81)],
         ),
         "motion",
         quick=True,
@@ -290,15 +290,19 @@ SCENARIOS = (
     Scenario(
         "no clamp",
         "a free body, squashed to half its height",
-        beam(clamps=[], damping=CALM),
+        beam(frames=80, clamps=[], damping=CALM),
         "shape",
         squashed((1, 1, 0.5)),
         quick=True,
     ),
     Scenario(
         "two bodies",
-        "two bodies in one mesh, one held and one free, nodes displaced by 1 cell",
-        beam(body={"shape": "voxels", "occupancy": TWO_BODIES, "cell_size": CELL}, damping=CALM),
+        "two bodies in one mesh, one held and one free, nodes displaced by half a cell",
+        beam(
+            body={"shape": "voxels", "occupancy": TWO_BODIES, "cell_size": CELL},
+            frames=80,
+            damping=CALM,
+        ),
         "shape",
         scattered(0.5),
     ),
