@@ -191,7 +191,7 @@ def draw(scenario: Scenario, found: Run, path: Path) -> None:
         points=found.problem.positions,
         cells=found.problem.cells,
     )
-    shown = list(dict.fromkeys([0, min(1, frames), frames // 2, frames]))
+    shown = scenario.shown or list(dict.fromkeys([0, min(1, frames), frames // 2, frames]))
     pc.render(trajectory, path, frame=shown, window=1200)
 
 

@@ -48,6 +48,8 @@ class Scenario:
         Whether quick runs have it.
     solvers : sequence of str, optional
         Which of them; all by default.
+    shown : sequence of int, optional
+        Frames of the picture.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Scenario:
     forces: Callable[[pc.Problem, int], Array] | None = None
     quick: bool = False
     solvers: Sequence[str] = ()
+    shown: Sequence[int] = ()
 
     def state(self, problem: pc.Problem) -> pc.State:
         """Where a run begins; what is clamped stays there."""
@@ -189,11 +192,23 @@ SCENARIOS = (
     Scenario("point", "squashed to a point", CALM_BEAM, "rest", squashed((0, 0, 0)), quick=True),
     Scenario("random 1", "nodes displaced by up to 1 cell", CALM_BEAM, "rest", scattered(1.0)),
     Scenario("random 5", "by up to 5 cells", CALM_BEAM, "rest", scattered(5.0), quick=True),
-    Scenario("random 50", "by up to 50 cells", CALM_BEAM, "rest", scattered(50.0)),
-    Scenario("inside-out", "mirrored in its middle", CALM_BEAM, "rest", inside_out, quick=True),
-    Scenario("twist 720", "one end turned twice and back", moving(TURN, (24, 2, 2), 128), "rest"),
     Scenario(
-        "stretch 10", "drawn to ten times its length and back", moving(PULL, (6, 2, 2), 80), "rest"
+        "random 50", "by up to 50 cells", CALM_BEAM, "rest", scattered(50.0), shown=(1, 20, 80)
+    ),
+    Scenario("inside-out", "mirrored in its middle", CALM_BEAM, "rest", inside_out, quick=True),
+    Scenario(
+        "twist 720",
+        "one end turned twice and back",
+        moving(TURN, (24, 2, 2), 128),
+        "rest",
+        shown=(0, 12, 24, 128),
+    ),
+    Scenario(
+        "stretch 10",
+        "drawn to ten times its length and back",
+        moving(PULL, (6, 2, 2), 80),
+        "rest",
+        shown=(0, 10, 20, 80),
     ),
     *(
         Scenario(
