@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,34 @@ def on(problem: pc.Problem, axis: str, at: float) -> NDArray[np.int64]:
 def nearest(problem: pc.Problem, point: tuple[float, float, float]) -> int:
     """The node nearest to a rest point (m)."""
     return int(np.linalg.norm(problem.positions - np.array(point), axis=1).argmin())
+
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+
+
+def plot(
+    path: Path,
+    curves: Mapping[str, tuple[Sequence[float] | Array, Sequence[float] | Array]],
+    labels: tuple[str, str],
+    scales: tuple[str, str] = ("linear", "linear"),
+    marks: bool = False,
+) -> None:
+    """Curves (x, y) by name in one plot with a legend above; ``scales`` linear or log."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for k, (name, (x, y)) in enumerate(curves.items()):
+        style = {"color": COLOURS[k % len(COLOURS)], "linestyle": ("-", "--", "-.", ":")[k % 4]}
+        axis.plot(x, y, label=name, marker="o" if marks else "", linewidth=1.8, **style)
+    axis.set(xlabel=labels[0], ylabel=labels[1], xscale=scales[0], yscale=scales[1])
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+    columns = {"ncols": min(3, len(curves)), "frameon": False, "fontsize": 9}
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", **columns)
+    figure.savefig(path, dpi=150)
 
 
 def main(file: str) -> int:
