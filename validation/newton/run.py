@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+import itertools
+
 import common
 
 import pdcorrect as pc
@@ -86,9 +88,9 @@ def model_error(motion: str) -> tuple[common.Figures, list[float]]:
 
 def converging(name: str, runs: list[Array]) -> tuple[common.Figures, list[float]]:
     """Distances between neighbours in a sequence of finer runs, and their order."""
-    steps = [far(a, b) for a, b in zip(runs, runs[1:], strict=False)]
+    steps = [far(a, b) for a, b in itertools.pairwise(runs)]
     figures = {f"{name}, change {k + 1}, mm": 1e3 * d for k, d in enumerate(steps)}
-    for k, (a, b) in enumerate(zip(steps, steps[1:], strict=False)):
+    for k, (a, b) in enumerate(itertools.pairwise(steps)):
         figures[f"{name}, order {k + 1}"] = float(np.log2(a / b))
     return figures, [1e3 * d for d in steps]
 
