@@ -227,6 +227,12 @@ def test_expectations_that_are_no_json_are_refused(home):
         read_expectations(home / "expected.json")
 
 
+def test_parts_whose_records_would_be_one_file_are_refused(home, tmp_path):
+    (home / "run.py").write_text("def parts(quick):\n    return {'h 1e-3': None, 'h 1e+3': None}")
+    with pytest.raises(InputError, match=r"'h 1e-3' and 'h 1e\+3'"):
+        run_case(find_cases()[0], tmp_path / "out")
+
+
 def test_a_module_without_a_case_is_refused(home, tmp_path):
     (home / "run.py").write_text("")
     with pytest.raises(InputError, match=r"run\.py: expected a function case"):

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pdcorrect.environment import environment
-from pdcorrect.errors import PdcorrectError
+from pdcorrect.errors import InputError, PdcorrectError
 from pdcorrect.replacement import clear_parts, make_folder, write_text
-from pdcorrect.validation.cases import ValidationCase
+from pdcorrect.validation.cases import Parts, ValidationCase
 from pdcorrect.validation.outcome import Outcome, missing, outside
 from pdcorrect.validation.records import PartRecord, Record, load, save, table_csv
 
@@ -81,6 +81,7 @@ def run_case(
     clear_parts(folder)
     try:
         parts = case.parts(quick)
+        _check_names(parts)
         for number, (name, compute) in enumerate(parts.items()):
             if on_part:
                 on_part(name, number, len(parts))
@@ -114,6 +115,23 @@ def _run_part(compute: Callable[[], Outcome], folder: Path, part: PartRecord) ->
             picture.draw(folder / f"{picture.name}.png")
             part.pictures[f"{folder.name}/{picture.name}.png"] = picture.caption
     return part
+
+
+def _check_names(parts: Parts) -> None:
+    """Refuse parts whose records would be one file.
+
+    Raises
+    ------
+    InputError
+    """
+    known: dict[str, str] = {}
+    for name in parts:
+        if slug(name) in known:
+            raise InputError(
+                f"parts {known[slug(name)]!r} and {name!r}: expected names that differ in more "
+                "than case and signs, by which their records are told apart."
+            )
+        known[slug(name)] = name
 
 
 def slug(name: str) -> str:
