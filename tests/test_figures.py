@@ -374,3 +374,12 @@ def test_drawing_is_probed_in_another_process(monkeypatch):
     assert "libegl1" in figures.check_offscreen()
     monkeypatch.setattr(figures, "_PROBE", "import time; time.sleep(30)")
     assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)
+
+
+def test_short_times_are_told_in_a_unit_that_shows_them():
+    from pdcorrect.figures.sheet import time_text
+
+    assert time_text(0.01, 1.0) == "0.010 s"
+    assert time_text(1e-5, 1e-4) == "0.010 ms"
+    assert time_text(0.0, 1e-4) == "0.000 ms"
+    assert time_text(2e-6, 1e-5) == "2.000 µs"

@@ -12,6 +12,7 @@ SOURCE = Path(__file__).parent.parent / "src" / "pdcorrect"
 ORDER = [
     "pdcorrect",
     "errors",
+    "home",
     "interruption",
     "replacement",
     "shapes",
@@ -194,11 +195,18 @@ ORDER = [
     "training.checkpoints",
     "training.progress",
     "training.training",
+    "validation",
+    "validation.outcome",
+    "validation.cases",
+    "validation.records",
+    "validation.running",
+    "validation.page",
     "report",
     "progress",
     "dataset_cli",
     "evaluation_cli",
     "train_cli",
+    "validate_cli",
     "cli",
 ]
 """From bottom to top: a module imports only modules above it in this list."""

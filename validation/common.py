@@ -1,11 +1,9 @@
-"""What the cases share: meshes, equilibria, and figures compared with expected ones."""
+"""What the cases share: meshes, equilibria, and the parts of an outcome."""
 
 from __future__ import annotations
 
-import json
 import tempfile
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import pdcorrect as pc
-from pdcorrect.environment import environment
 from pdcorrect.fem.mesh import voxel_mesh
 from pdcorrect.fem.mesh_files import write_vtu
+from pdcorrect.validation.cases import ValidationCase
+from pdcorrect.validation.outcome import Outcome as Outcome
+from pdcorrect.validation.outcome import Picture as Picture
+from pdcorrect.validation.outcome import Table as Table
+from pdcorrect.validation.page import shown_figure
+from pdcorrect.validation.running import run_case
 
 Array = NDArray[np.float64]
 Figures = dict[str, float]
@@ -78,40 +81,45 @@ def nearest(problem: pc.Problem, point: tuple[float, float, float]) -> int:
     return int(np.linalg.norm(problem.positions - np.array(point), axis=1).argmin())
 
 
-def expected(folder: Path) -> dict[str, dict[str, Any]]:
-    """Figures and tolerances of a case, by name."""
-    return json.loads((folder / "expected.json").read_text(encoding="utf-8"))
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
 
-def outside(figures: Mapping[str, float], wanted: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Names of the figures that differ from the expected ones by more than the tolerance."""
-    return [
-        name
-        for name, value in figures.items()
-        if name in wanted and not abs(value - wanted[name]["value"]) <= wanted[name]["tolerance"]
-    ]
+def plot(
+    path: Path,
+    curves: Mapping[str, tuple[Sequence[float] | Array, Sequence[float] | Array]],
+    labels: tuple[str, str],
+    scales: tuple[str, str] = ("linear", "linear"),
+    marks: bool = False,
+) -> None:
+    """Curves (x, y) by name in one plot with a legend above; ``scales`` linear or log."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    for k, (name, (x, y)) in enumerate(curves.items()):
+        style = {"color": COLOURS[k % len(COLOURS)], "linestyle": ("-", "--", "-.", ":")[k % 4]}
+        axis.plot(x, y, label=name, marker="o" if marks else "", linewidth=1.8, **style)
+    axis.set(xlabel=labels[0], ylabel=labels[1], xscale=scales[0], yscale=scales[1])
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+    columns = {"ncols": min(3, len(curves)), "frameon": False, "fontsize": 9}
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", **columns)
+    figure.savefig(path, dpi=150)
 
 
-def finish(folder: Path, figures: Figures, arguments: str = "") -> int:
-    """Print the figures, write ``results/<case>.json``; 1 if one is outside or missing."""
-    wanted = expected(folder)
-    wrong = outside(figures, wanted) + sorted(set(wanted) - set(figures))
-    width = max(map(len, figures))
-    for name, value in figures.items():
-        aim = wanted.get(name)
-        goal = f"{aim['value']:>9g} ± {aim['tolerance']:g}  {aim['source']}" if aim else ""
-        mark = "  OUTSIDE" if name in wrong else ""
-        print(f"{name:<{width}}  {value:>9.5g}  {goal}{mark}")
-    record = {
-        "command": f"python validation/{folder.name}/run.py {arguments}".strip(),
-        "date": time.strftime("%Y-%m-%d"),
-        "seed": None,  # nothing is random
-        "outside": wrong,
-        "figures": {name: value if value == value else None for name, value in figures.items()},
-        "environment": environment(),
-    }
-    text = json.dumps(record, indent=2, allow_nan=False) + "\n"
-    (RESULTS / f"{folder.name}.json").write_text(text, encoding="utf-8")
-    for name in wrong:
+def main(file: str) -> int:
+    """Run the case of a file in full, write its result to `RESULTS`; 1 if a figure is outside."""
+    case = ValidationCase(Path(file).resolve().parent)
+    command = f"python validation/{case.name}/run.py"
+    record = run_case(case, RESULTS, again=True, command=command)
+    for name, value in record.figures.items():
+        aim = case.expected.get(name)
+        goal = f"{aim.describe()}  {aim.source}" if aim else ""
+        mark = "  OUTSIDE" if name in record.outside else ""
+        print(f"{name}  {shown_figure(value)}  {goal}{mark}")
+    for name in record.outside:
         print(f"outside the tolerance or missing: {name}")
-    return 1 if wrong else 0
+    print(record.error, end="")
+    return 0 if record.passed else 1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect import dataset_cli, evaluation_cli, train_cli
+from pdcorrect import dataset_cli, evaluation_cli, train_cli, validate_cli
 from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
 from pdcorrect.interruption import Terminated, terminable
 
@@ -28,6 +28,7 @@ app = typer.Typer(
 app.add_typer(dataset_cli.app, name="dataset")
 app.command()(evaluation_cli.evaluate)
 app.command()(train_cli.train)
+app.command()(validate_cli.validate)
 
 FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
 

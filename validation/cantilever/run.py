@@ -174,5 +174,18 @@ def compute(elements: tuple[str, ...] = common.ELEMENTS, meshes: tuple[int, ...]
     return figures
 
 
+def quick_figures() -> common.Figures:
+    """Those that take seconds."""
+    figures = compute(("hex27",), (2,))
+    for element in ("hex8", "hex8-bubble", "hex8-bubble-mean"):
+        figures[f"end shear, {element} 1x1"] = end_shear(element, 1, [HELD])
+    return figures | {"torsion, free to warp, hex27 4x4": torsion("hex27", 4, True, SIDE)}
+
+
+def case(quick: bool) -> common.Outcome:
+    """The case's outcome."""
+    return common.Outcome(quick_figures() if quick else compute())
+
+
 if __name__ == "__main__":
-    sys.exit(common.finish(Path(__file__).parent, compute()))
+    sys.exit(common.main(__file__))

@@ -148,12 +148,18 @@ _COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73")
 _SHAPES = ("bricks", "trapezoids", "parallelograms")
 
 
-def main() -> int:
-    """Compute, draw and compare."""
+CAPTION = "Deflection over reference against Poisson's ratio, slenderness and shape of the cells."
+
+
+def case(quick: bool) -> common.Outcome:
+    """The case's outcome; the picture needs all figures."""
+    if quick:
+        figures = shear(("hex8", "hex8-bubble", "hex8-bubble-mean"), (50,))
+        return common.Outcome(figures | distortion(("hex8-bubble", "hex27")))
     figures = compute()
-    draw(figures, common.RESULTS / "locking.png")
-    return common.finish(Path(__file__).parent, figures)
+    picture = common.Picture("locking", CAPTION, lambda path: draw(figures, path))
+    return common.Outcome(figures, pictures=(picture,))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(common.main(__file__))

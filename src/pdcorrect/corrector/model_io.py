@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 from pydantic import Field, JsonValue, ValidationError
 
-import pdcorrect
 from pdcorrect import __version__
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.cost import parameters
@@ -31,6 +30,7 @@ from pdcorrect.errors import (
     OutputError,
     require_extra,
 )
+from pdcorrect.home import home_folder
 from pdcorrect.replacement import make_folder, part_of_process, replacing
 from pdcorrect.scene.regions import Strict
 
@@ -46,8 +46,6 @@ from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 FORMAT = "pdcorrect-model"
 VERSION = 1
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
-HOME = "PDCORRECT_HOME"
-"""Environment variable: the folder with ``models``; by default the checkout of the code."""
 
 _NORMALISER = "normaliser."
 _CHECKSUM = "checksum"
@@ -228,16 +226,7 @@ def models_folder() -> Path:
     InputError
         If the environment does not say, and the code is not in its checkout.
     """
-    home = os.environ.get(HOME)
-    if home:
-        return Path(home) / "models"
-    checkout = Path(pdcorrect.__file__).resolve().parents[2]
-    if not (checkout / "pyproject.toml").is_file():
-        raise InputError(
-            f"models by name: expected the environment variable {HOME} to name the folder that "
-            "has 'models' in it, or the path of a model."
-        )
-    return checkout / "models"
+    return home_folder("models", ", or the path of a model")
 
 
 def _read(path: Path) -> bytes:

@@ -146,7 +146,9 @@ class _Picture:
         rest = _moves(bodies)
         view = View.fitted(shown_points(bodies, rest), max(16, width // columns))
         captions = labels + [""] * (columns - len(labels))
-        self._sheet = Sheet(view, captions, rows, bar, _font(width, columns))
+        longest = max(map(max, self._times))
+        font = _font(width, columns)
+        self._sheet = Sheet(view, captions, rows, bar, font, longest=longest)
         palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
         self._painter = Painter(bodies, view, palette, limit, rest)
         self._panels = [(body, time) for time in range(count) for body in range(len(bodies))]

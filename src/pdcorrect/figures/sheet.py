@@ -47,6 +47,8 @@ class Sheet:
         Height of the text, pixels.
     columns : int, optional
         As many as labels by default.
+    longest : float
+        The last time on any page, s: chooses the unit of times.
     """
 
     def __init__(
@@ -57,7 +59,9 @@ class Sheet:
         bar: ColourBar | None,
         font: float,
         columns: int | None = None,
+        longest: float = 1.0,
     ) -> None:
+        self._longest = longest
         figure = require_extra("matplotlib.figure", "view")
         agg = require_extra("matplotlib.backends.backend_agg", "view")
         self._view, self._labels, self._font = view, list(labels), font
@@ -88,7 +92,7 @@ class Sheet:
         """The whole picture (height, width, 3); images and times (s) row by row."""
         self._canvas.restore_region(self._background)
         for text, time in zip(self._times, times, strict=True):
-            text.set_text(f"t = {time:.3f} s")
+            text.set_text(f"t = {time_text(time, self._longest)}")
             self._figure.draw_artist(text)
         page = np.array(self._canvas.buffer_rgba())[:, :, :3]
         for number, image in enumerate(images):
@@ -187,6 +191,14 @@ def round_length(length: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not above ``length`` (m)."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-12)))
+
+
+def time_text(time: float, longest: float) -> str:
+    """A time (s) with three decimals, in the unit in which the longest time reads best."""
+    factor, unit = (
+        (1.0, "s") if longest >= 0.02 else (1e3, "ms") if longest >= 2e-5 else (1e6, "µs")
+    )
+    return f"{factor * time:.3f} {unit}"
 
 
 def length_text(length: float) -> str:

@@ -1,0 +1,1 @@
+"""Validation cases: found, run, judged by figures written down before, and reported."""

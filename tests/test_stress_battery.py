@@ -1,0 +1,153 @@
+"""How the stress battery judges a run: distances from what has to be reached, and verdicts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from conftest import rotation
+from pdcorrect.validation.cases import find_cases
+
+(CASE,) = find_cases(["stress"])
+BATTERY = CASE._module()
+SCENES = {scenario.name: scenario for scenario in BATTERY.SCENARIOS}
+SOLVERS = BATTERY.SOLVERS
+
+
+def run_of(scenario, *frames, statuses=("CONVERGED",), iterations=(3,)):
+    """A made-up run through positions (N, 3)."""
+    problem = pc.discretise(scenario.scene)
+    shown = [f(problem) for f in frames]
+    found = [pc.Status[name] for name in statuses]
+    return BATTERY.Run(problem, np.stack(shown), found, list(iterations), [0] * len(found))
+
+
+def at_rest(problem):
+    return problem.positions
+
+
+def pushed(by, nodes=slice(None)):
+    def place(problem):
+        out = problem.positions.copy()
+        out[nodes] += by
+        return out
+
+    return place
+
+
+def test_every_scene_and_solver_has_an_expectation_and_there_are_no_others():
+    names = {
+        f"{scenario.name}, {solver}, {what}"
+        for scenario in SCENES.values()
+        for solver in (scenario.solvers or SOLVERS)
+        for what in ("distance", "status")
+    }
+    assert set(CASE.expected) == names
+    quick = {name for name, aim in CASE.expected.items() if aim.quick}
+    assert quick == {name for name in names if SCENES[name.split(",")[0]].quick}
+
+
+def test_the_distance_from_rest_is_in_cells():
+    found = run_of(SCENES["plane"], at_rest, pushed([0.0, 0.03, 0.04], nodes=7))
+    assert BATTERY.distance(SCENES["plane"], found, None) == pytest.approx(1.0)
+
+
+def test_a_free_body_may_move_rigidly_but_not_change_its_shape():
+    scenario, turn = SCENES["no clamp"], rotation()
+    rigid = run_of(scenario, at_rest, lambda p: p.positions @ turn.T + [3.0, -2.0, 1.0])
+    assert BATTERY.distance(scenario, rigid, None) < 1e-12
+    mirrored = run_of(scenario, at_rest, lambda p: p.positions * [1.0, 1.0, -1.0])
+    assert BATTERY.distance(scenario, mirrored, None) > 1.0
+    longer = run_of(scenario, at_rest, lambda p: p.positions * [1.1, 1.0, 1.0])
+    assert BATTERY.distance(scenario, longer, None) == pytest.approx(0.05 * 0.3 / 0.05)
+
+
+def test_of_two_bodies_the_held_one_may_not_move():
+    scenario = SCENES["two bodies"]
+    problem = pc.discretise(scenario.scene)
+    free = problem.positions[:, 0] > 0.25
+    assert 0 < free.sum() < len(free)
+    moved = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.5], nodes=free))
+    assert BATTERY.distance(scenario, moved, None) < 1e-12
+    moved = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.05], nodes=~free))
+    assert BATTERY.distance(scenario, moved, None) == pytest.approx(1.0)
+
+
+def test_a_motion_is_compared_in_all_frames_with_the_largest_displacement_as_unit():
+    scenario = SCENES["1 cell"]
+    truth = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.5]), pushed([0.0, 0.0, 0.1]))
+    found = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.55]), pushed([0.0, 0.0, 0.1]))
+    assert BATTERY.distance(scenario, found, truth) == pytest.approx(0.1)
+
+
+def test_a_run_that_is_no_number_is_far_from_everything():
+    found = run_of(SCENES["plane"], at_rest, pushed([np.nan, 0.0, 0.0], nodes=3))
+    assert BATTERY.distance(SCENES["plane"], found, None) == BATTERY.UNDEFINED
+
+
+@pytest.mark.parametrize(
+    ("statuses", "iterations", "far", "word"),
+    [
+        (["CONVERGED", "CONVERGED"], [3, 200], 1e-4, "pass"),
+        (["CONVERGED", "CONVERGED"], [201, 3], 1e-4, "slow"),
+        (["SUBSTEPPED", "CONVERGED"], [3, 3], 1e-4, "slow"),
+        (["INVERTED", "CONVERGED"], [3, 3], 1e-4, "pass"),
+        (["CONVERGED", "INVERTED"], [3, 3], 1e-4, "fail"),
+        (["LINE_SEARCH", "CONVERGED"], [3, 3], 1e-4, "fail"),
+        (["CONVERGED", "CONVERGED"], [3, 3], 1e-2, "fail"),
+    ],
+)
+def test_verdicts(statuses, iterations, far, word):
+    """A failed step counts wherever it is, inverted cells at the end."""
+    scenario, cell = SCENES["plane"], 0.05
+    end = pushed([far * cell, 0.0, 0.0], nodes=9)
+    found = run_of(scenario, at_rest, end, statuses=statuses, iterations=iterations)
+    figures = BATTERY.figures_of(scenario, "PD", found, None)
+    assert BATTERY.verdict("PD", found, figures) == word
+
+
+def test_newton_is_slow_sooner():
+    found = run_of(SCENES["plane"], at_rest, at_rest, iterations=[31])
+    figures = BATTERY.figures_of(SCENES["plane"], "Newton", found, None)
+    assert BATTERY.verdict("Newton", found, figures) == "slow"
+
+
+def test_rest_is_a_minimum_and_a_strained_body_is_not_in_balance():
+    problem_at_rest = run_of(SCENES["plane"], at_rest, at_rest)
+    force, softest, ratio, corner = BATTERY.minimum(problem_at_rest)
+    assert force < 1e-12
+    assert (softest, ratio, corner) == pytest.approx((1.0, 1.0, 1.0))
+    strained = run_of(SCENES["plane"], at_rest, lambda p: p.positions * [1.5, 1.0, 1.0])
+    assert BATTERY.minimum(strained)[0] > 0.01
+
+
+def test_starts_keep_what_is_clamped():
+    for name in ("point", "random 50", "inside-out"):
+        scenario = SCENES[name]
+        problem = pc.discretise(scenario.scene)
+        state = scenario.state(problem)
+        np.testing.assert_array_equal(
+            state.positions[~problem.free], problem.positions[~problem.free]
+        )
+        assert np.abs(state.positions - problem.positions).max() > problem.cell_size
+
+
+def test_the_reversing_load_turns_round_at_every_step():
+    problem = pc.discretise(SCENES["reversal"].scene)
+    first, second = (SCENES["reversal"].forces(problem, k) for k in (0, 1))
+    np.testing.assert_array_equal(first, -second)
+    assert first.sum(axis=0)[2] == pytest.approx(-100.0 * problem.mass.sum())
+
+
+def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
+    """The battery as a whole, with a stepper that stops after one iteration."""
+    scenario = replace(SCENES["1 cell"], solvers=("PD", "Newton"))
+    make = {**BATTERY.run.__globals__["MAKE"]}
+    make["PD"] = lambda problem: pc.ProjectiveDynamics(problem, max_iterations=0, recover=False)
+    monkeypatch.setitem(BATTERY.run.__globals__, "MAKE", make)
+    outcome = BATTERY.part(scenario)
+    row = dict(zip(outcome.tables[0].headings, outcome.tables[0].rows[0], strict=True))
+    assert row["PD"].startswith("fail")
+    assert row["Newton"].startswith("pass")
+    assert outcome.figures["1 cell, PD, status"] == "ITERATION_LIMIT"

@@ -1,0 +1,154 @@
+"""PD against full Newton FEM, other energies, and whether the references have converged."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import itertools
+
+import common
+
+import pdcorrect as pc
+
+Array = np.ndarray
+CELL, STEP, FRAMES = 0.05, 0.01, 20
+END = {"plane": "x", "at": "max"}
+MOTIONS: dict[str, dict[str, Any]] = {
+    "bend": {"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]},
+    "twist": {"kind": "torsion", "strength": 4e4},
+    "stretch": {"kind": "traction", "traction": [3e4, 0.0, 0.0], "region": END},
+}
+STRENGTH = {"bend": "acceleration", "twist": "strength", "stretch": "traction"}
+SHARES = (0.01, 0.1, 1.0)
+"""Of the load, in the comparison of energies."""
+TIGHT = 1e-8
+
+
+def scene(motion: str, share: float = 1.0, split: int = 1, **sections: Any) -> pc.Scene:
+    """A beam of 6 x 2 x 2 cells under a share of the motion's load; ``split`` steps a frame."""
+    key = STRENGTH[motion]
+    load = {**MOTIONS[motion], key: (share * np.array(MOTIONS[motion][key])).tolist()}
+    settings = {
+        "body": {"shape": "beam", "cells": [6, 2, 2], "cell_size": CELL},
+        "material": {"young": 3e5, "poisson": 0.4, "density": 1e3},
+        "clamps": [{"region": {"plane": "x", "at": "min"}}], "loads": [load],
+        "time": {"step": STEP / split, "frames": FRAMES * split},
+    }  # fmt: skip
+    for name, change in sections.items():
+        settings[name] = {**settings.get(name, {}), **change}
+    return pc.Scene(**settings)
+
+
+def positions(told: pc.Scene, refine: int = 1, split: int = 1, newton: bool = False) -> Array:
+    """Positions at the frames, (T+1, N, 3), on the coarse nodes."""
+    problem = pc.discretise(told, refine=refine)
+    stepper = pc.Newton(problem) if newton else pc.ProjectiveDynamics(problem, TIGHT)
+    run = pc.restrict(pc.rollout(stepper), to=pc.discretise(told))
+    return run.positions[::split]
+
+
+def far(a: Array, b: Array) -> float:
+    """RMS distance of a node, m."""
+    return pc.metrics.rms_error(a, b)
+
+
+def solver_error(motion: str, element: str) -> common.Figures:
+    """Largest distance of PD from Newton on the same energy, in cells."""
+    told = scene(motion, solver={"element": element})
+    by_pd, by_newton = positions(told), positions(told, newton=True)
+    name = f"solver, {motion}, {element}"
+    return {
+        f"{name}, cells": pc.metrics.largest_error(by_pd, by_newton) / CELL,
+        f"{name}, displacement, cells": pc.metrics.largest_displacement(by_newton) / CELL,
+    }
+
+
+def model_error(motion: str) -> tuple[common.Figures, list[float]]:
+    """Newton FEM with stable neo-Hookean energy against the corotated one, by load."""
+    errors = []
+    for share in SHARES:
+        truth = positions(scene(motion, share), newton=True)
+        other = scene(motion, share, material={"energy": "neo-hookean"})
+        size = far(truth, np.broadcast_to(truth[0], truth.shape))
+        errors.append(100.0 * far(positions(other, newton=True), truth) / size)
+    figures = {
+        f"model, {motion}, {share:g} of the load, per cent": error
+        for share, error in zip(SHARES, errors, strict=True)
+    }
+    order = float(np.log10(errors[1] / errors[0]))
+    return figures | {f"model, {motion}, order in the load": order}, errors
+
+
+def converging(name: str, runs: list[Array]) -> tuple[common.Figures, list[float]]:
+    """Distances between neighbours in a sequence of finer runs, and their order."""
+    steps = [far(a, b) for a, b in itertools.pairwise(runs)]
+    figures = {f"{name}, change {k + 1}, mm": 1e3 * d for k, d in enumerate(steps)}
+    for k, (a, b) in enumerate(itertools.pairwise(steps)):
+        figures[f"{name}, order {k + 1}"] = float(np.log2(a / b))
+    return figures, [1e3 * d for d in steps]
+
+
+def mesh(motion: str, refines: tuple[int, ...]) -> tuple[common.Figures, list[float]]:
+    """Best element on ever finer meshes; what is left on the 4x4x4 mesh, of the coarse error."""
+    told = scene(motion, solver={"element": "hex8-bubble", "mass": "averaged"})
+    runs = [positions(told, refine) for refine in refines]
+    figures, steps = converging(f"mesh, {motion}", runs)
+    if 8 in refines:
+        truth = runs[-1]
+        left = far(runs[-2], truth) / far(runs[0], truth)
+        figures[f"mesh, {motion}, 4x error over coarse error"] = left
+    return figures, steps
+
+
+def time(motion: str, splits: tuple[int, ...]) -> tuple[common.Figures, list[float]]:
+    """Backward Euler at ever smaller steps."""
+    runs = [positions(scene(motion, split=s), split=s) for s in splits]
+    return converging(f"time, {motion}", runs)
+
+
+def outcome(motion: str, quick: bool) -> common.Outcome:
+    """All figures of a motion."""
+    figures: common.Figures = {}
+    rows = []
+    for element in ("hex8", "hex8-bubble-mean") if quick else common.ELEMENTS:
+        figures |= solver_error(motion, element)
+        rows.append((motion, element, figures[f"solver, {motion}, {element}, cells"]))
+    model, errors = model_error(motion)
+    refines = (1, 2, 4) if quick else (1, 2, 4, 8)
+    meshes, by_mesh = mesh(motion, refines)
+    times, by_time = time(motion, (1, 2, 4, 8) if quick else (1, 2, 4, 8, 16, 32))
+    figures |= model | meshes | times
+    tables = (
+        common.Table(
+            "PD (10⁻⁸) and Newton on one energy: largest distance",
+            ("motion", "element", "cells"), tuple(rows),
+        ),
+        common.Table(
+            "Newton FEM: neo-Hookean against corotated, per cent of the displacement",
+            ("motion", *(f"{s:g} of the load" for s in SHARES)), ((motion, *errors),),
+        ),
+    )  # fmt: skip
+    curves = {
+        "mesh: 1x1x1 to 2x2x2 cells, and so on": ([1 / r for r in refines[:-1]], by_mesh),
+        "time step: 0.01 s to 0.005 s, and so on": ([0.5**k for k in range(len(by_time))], by_time),
+    }
+    labels = ("size of cell or step, of the coarse one", "RMS change on halving it, mm")
+    caption = f"{motion}: change of the motion when cells or steps are halved."
+    draw = partial(common.plot, curves=curves, labels=labels, scales=("log", "log"), marks=True)
+    return common.Outcome(figures, tables, (common.Picture(f"newton-{motion}", caption, draw),))
+
+
+def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
+    """One part a motion; quick runs have one."""
+    return {m: partial(outcome, m, quick) for m in (("bend",) if quick else MOTIONS)}
+
+
+if __name__ == "__main__":
+    sys.exit(common.main(__file__))

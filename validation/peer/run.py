@@ -1,0 +1,105 @@
+"""The beam of another code, step by step: DiffPD's trajectory, and what its conventions change."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+import pdcorrect as pc
+
+Array = np.ndarray
+DATA = Path(__file__).parents[2] / "tests" / "data" / "diffpd_beam_24x2x2.npz"
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6)
+
+
+@cache
+def peer() -> dict[str, Array]:
+    """The other code's arrays."""
+    with np.load(DATA, allow_pickle=False) as data:
+        return {name: data[name] for name in data}
+
+
+def scene(mass: str = "per-node", weight: str = "published", tolerance: float = 1e-7) -> pc.Scene:
+    """Its beam: 24 x 2 x 2 cells of 2 cm, E = 1 MPa, Poisson's ratio 0.45, under gravity."""
+    data = peer()
+    return pc.Scene(
+        name="beam of another code",
+        body={"shape": "beam", "cells": [24, 2, 2], "cell_size": float(data["cell_size"])},
+        material={
+            "young": float(data["young"]),
+            "poisson": float(data["poisson"]),
+            "density": float(data["density"]),
+            "volume_weight": weight,
+        },
+        clamps=[{"region": {"plane": "x", "at": 0.0}}],
+        loads=[{"kind": "gravity", "acceleration": data["gravity"]}],
+        time={"step": float(data["time_step"]), "frames": len(data["positions"]) - 1},
+        solver={"mass": mass, "tolerance": tolerance},
+    )
+
+
+def tip(positions: Array) -> Array:
+    """Displacement across, (T+1,), mm, of the node that the other code's authors watch."""
+    node = int(peer()["tip_node"])
+    return 1e3 * (positions[:, node, 2] - positions[0, node, 2])
+
+
+def case(quick: bool) -> common.Outcome:
+    """All figures; it takes seconds."""
+    truth = peer()["positions"]
+    same = pc.discretise(scene())
+    by_pd = pc.rollout(pc.ProjectiveDynamics(same))
+    by_newton = pc.rollout(pc.Newton(same))
+    figures: common.Figures = {
+        "displacement, mm": 1e3 * pc.metrics.largest_displacement(truth),
+        "PD, distance, um": 1e6 * pc.metrics.largest_error(by_pd.positions, truth),
+        "Newton, distance, um": 1e6 * pc.metrics.largest_error(by_newton.positions, truth),
+        "PD, velocities, um/s": 1e6 * float(np.abs(by_pd.velocities - peer()["velocities"]).max()),
+    }
+    rows = []
+    for tolerance in TOLERANCES:
+        problem = pc.discretise(scene(tolerance=tolerance))
+        run = pc.rollout(pc.ProjectiveDynamics(problem))
+        error = 1e3 * float(np.abs(tip(run.positions) - tip(truth)).max())
+        iterations = float(run.stats["iterations"].mean())
+        figures[f"tip, tolerance {tolerance:g}, um"] = error
+        figures[f"iterations, tolerance {tolerance:g}"] = iterations
+        rows.append((tolerance, error, iterations))
+    lumped = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene("lumped"))))
+    honest = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene("lumped", "lame"))))
+    figures["mass, of the true one"] = float(
+        same.mass.sum() / pc.discretise(honest_scene()).mass.sum()
+    )
+    figures["tip, true mass, mm"] = float(np.abs(tip(lumped.positions) - tip(truth)).max())
+    figures["tip, true mass and weight, mm"] = float(
+        np.abs(tip(honest.positions) - tip(truth)).max()
+    )
+    curves = {
+        "DiffPD": (lumped.times, tip(truth)),
+        "this code, the same rules": (lumped.times, tip(by_pd.positions)),
+        "true mass": (lumped.times, tip(lumped.positions)),
+        "true mass, E and ν as asked for": (lumped.times, tip(honest.positions)),
+    }
+    labels = ("time, s", "tip displacement, mm")
+    picture = common.Picture(
+        "tip", "The tip of the beam by DiffPD and here; its mass rule and volume weight.",
+        lambda path: common.plot(path, curves, labels),
+    )  # fmt: skip
+    headings = ("tolerance, cells", "worst error of the tip, µm", "iterations a step")
+    tables = (common.Table("PD against DiffPD's trajectory", headings, tuple(rows)),)
+    return common.Outcome(figures, tables, (picture,))
+
+
+def honest_scene() -> pc.Scene:
+    """With the body's own mass."""
+    return scene("lumped", "lame")
+
+
+if __name__ == "__main__":
+    sys.exit(common.main(__file__))

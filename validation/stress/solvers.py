@@ -1,0 +1,118 @@
+"""The solvers of the battery, run alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from scenarios import Scenario
+
+import pdcorrect as pc
+
+Array = np.ndarray
+SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid")
+"""Projective dynamics on the plain and on the best coarse mesh, Newton and the batch stepper on
+the plain one, and the model `tiny` with its gate on the best."""
+
+TIGHT = 1e-8
+"""Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Positions (T+1, N, 3) and what the steps said.
+
+    Attributes
+    ----------
+    problem : Problem
+    positions : (T+1, N, 3)
+    statuses : list of Status
+    iterations : list of int
+    refused : list of int
+        1 where a gate refused a correction.
+    """
+
+    problem: pc.Problem
+    positions: Array
+    statuses: list[pc.Status]
+    iterations: list[int]
+    refused: list[int]
+
+
+def problem_of(scenario: Scenario, solver: str) -> pc.Problem:
+    """The mesh that a solver works on."""
+    best = solver in ("PD best", "hybrid")
+    return pc.discretise(pc.best_coarse(scenario.scene) if best else scenario.scene)
+
+
+def run(scenario: Scenario, solver: str) -> Run:
+    """All steps; one that fails does not end the run."""
+    problem = problem_of(scenario, solver)
+    if solver == "batch":
+        return _batch(scenario, problem)
+    return _steps(scenario, MAKE[solver](problem))
+
+
+def tight(scenario: Scenario, solver: str) -> Run:
+    """The same steps by the other method, solved tightly."""
+    problem = problem_of(scenario, solver)
+    other = pc.ProjectiveDynamics(problem, TIGHT) if solver == "Newton" else pc.Newton(problem)
+    return _steps(scenario, other)
+
+
+@cache
+def _model() -> Any:
+    return pc.load_model("tiny").corrector
+
+
+def _hybrid(problem: pc.Problem) -> pc.HybridStepper:
+    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _model(), gate=pc.Gate())
+
+
+MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
+    "PD": pc.ProjectiveDynamics,
+    "PD best": pc.ProjectiveDynamics,
+    "Newton": pc.Newton,
+    "hybrid": _hybrid,
+}
+
+
+def _steps(scenario: Scenario, stepper: pc.Stepper) -> Run:
+    problem, state = stepper.problem, scenario.state(stepper.problem)
+    results = []
+    for number in range(scenario.scene.time.frames):
+        forces = scenario.forces(problem, number) if scenario.forces else None
+        results.append(stepper(state, forces))
+        state = results[-1].state
+    return Run(
+        problem,
+        np.stack([scenario.state(problem).positions, *(r.state.positions for r in results)]),
+        [r.status for r in results],
+        [r.iterations for r in results],
+        [int(r.stats.get("refused", 0)) for r in results],
+    )
+
+
+def _batch(scenario: Scenario, problem: pc.Problem) -> Run:
+    import torch
+
+    stepper = pc.BatchStepper([problem])
+    states, results = [scenario.state(problem)], []
+    batch = stepper.state(states)
+    for number in range(scenario.scene.time.frames):
+        forces = None
+        if scenario.forces:
+            forces = torch.as_tensor(scenario.forces(problem, number))[None]
+        results.append(stepper(batch, forces))
+        batch = results[-1].state
+        states += stepper.states(batch)
+    return Run(
+        problem,
+        np.stack([state.positions for state in states]),
+        [r.statuses[0] for r in results],
+        [int(r.iterations[0]) for r in results],
+        [0] * len(results),
+    )
