@@ -44,7 +44,7 @@ from pdcorrect.training.sources import OneStepBatches, one_step_loss, share_done
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
 from pdcorrect.training.validation import Scores, Validation  # noqa: E402
-from pdcorrect.training.world import World  # noqa: E402
+from pdcorrect.training.world import World, joined  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 BASIC = '[[stages]]\nkind = "one-step"\niterations = 1\n'
@@ -585,6 +585,12 @@ def test_where_the_plain_model_has_no_error_there_is_only_error_to_add(folder):
 def _unloaded(recording):
     scene = Scene.from_toml(recording.scene_toml)
     return scene.model_copy(update={"loads": ()}).to_toml()
+
+
+def test_processes_that_are_to_share_a_gpu_are_refused(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="for 2 processes: expected 'cuda'"), joined("cuda:1"):
+        pass
 
 
 def test_errors_below_the_rounding_of_storage_are_not_learned():

@@ -26,7 +26,8 @@ def train(
         bool, typer.Option(help="Go on from the folder's checkpoint, if there is one.")
     ] = False,
     seconds: Annotated[
-        Optional[float], typer.Option(help="Stop after so many seconds; --resume goes on.")
+        Optional[float],
+        typer.Option(help="Stop after about so many seconds, start included; --resume goes on."),
     ] = None,
     evaluate: Annotated[
         Optional[str],
@@ -40,6 +41,9 @@ def train(
     Several processes: torchrun --nproc-per-node N -m pdcorrect.cli train ...
     Exit status 1 if time was up before the end.
     """
+    import time
+
+    started = time.monotonic()
     from pdcorrect.training.config import TrainingConfig
     from pdcorrect.training.training import MODEL, Training
     from pdcorrect.training.world import joined
@@ -49,7 +53,8 @@ def train(
         training = Training(
             loaded, data, output, device=own, resume=resume, world=world, on_report=_tell
         )
-        finished = training.run(seconds)
+        left = None if seconds is None else max(0.0, seconds - (time.monotonic() - started))
+        finished = training.run(left)
         if not world.first:
             return
         metrics = training.progress.metrics

@@ -87,7 +87,7 @@ class Gate(Strict):
         passes, and refused only then; for placement "state".
     """
 
-    margin: NonNegative | None = 3.0
+    margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     volume: Number | None = 0.0
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1

@@ -70,12 +70,17 @@ def joined(device: str) -> Iterator[tuple[World, str]]:
     Raises
     ------
     InputError
-        If there are more processes than GPUs of this machine.
+        If there are more processes than GPUs of this machine, or all are to share one.
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         yield World(), device
         return
+    if device.startswith("cuda:"):
+        raise InputError(
+            f"device {device!r} for {size} processes: expected 'cuda', of which each process takes "
+            "its own."
+        )
     if device == "cuda":
         local = int(os.environ.get("LOCAL_RANK", "0"))
         if local >= torch.cuda.device_count():
