@@ -182,6 +182,7 @@ ORDER = [
     "training.losses",
     "training.precision",
     "training.recordings",
+    "training.resident",
     "training.windows",
     "training.fitting",
     "training.scenes",

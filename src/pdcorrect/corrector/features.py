@@ -74,7 +74,9 @@ class View:
     def gradients(self) -> Tensor:
         """Deformation gradients F (n, 3, 3), after the step."""
         bodies = self.bodies
-        return node_gradients(self.snapshot.proposed, bodies.rest_inverses, bodies.cells)
+        return node_gradients(
+            self.snapshot.proposed, bodies.rest_inverses, bodies.cells, bodies.cell_counts
+        )
 
     @cached_property
     def turns(self) -> Tensor:

@@ -10,6 +10,8 @@ R does not depend on how a mesh orders the corners of its cells; the frame at re
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
@@ -22,28 +24,37 @@ _FLATTEST = 1e-3
 
 def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
     """Axes of cells as columns, (c, 3, 3), m, for positions (n, 3) and cells (c, 8)."""
-    signs = torch.as_tensor(2.0 * VTK_CORNERS - 1.0, dtype=positions.dtype, device=positions.device)
-    return torch.einsum("cki,kj->cij", positions[cells], signs / 4.0)
+    corners = positions.index_select(0, cells.reshape(-1)).reshape(*cells.shape, 3)
+    return torch.einsum("cki,kj->cij", corners, _edge_means(positions.dtype, positions.device))
 
 
-def node_axes(positions: Tensor, cells: Tensor) -> Tensor:
-    """Means of the axes of the cells that touch a node, (n, 3, 3), m."""
-    return _node_means(cell_axes(positions, cells), cells, len(positions))
+@cache
+def _edge_means(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What a cell's corners count in its axes, (8, 3)."""
+    with torch.inference_mode(False):
+        return torch.as_tensor((2.0 * VTK_CORNERS - 1.0) / 4.0, dtype=dtype, device=device)
 
 
-def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor) -> Tensor:
+def node_axes(positions: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
+    """Means of the axes of the cells that touch a node, (n, 3, 3), m.
+
+    ``counts`` (n,) are the numbers of these cells.
+    """
+    return _node_means(cell_axes(positions, cells), cells, counts)
+
+
+def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
     """Means of the deformation gradients of the cells that touch a node, (n, 3, 3).
 
-    ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m.
+    ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m; ``counts`` as above.
     """
-    return _node_means(cell_axes(positions, cells) @ inverses, cells, len(positions))
+    return _node_means(cell_axes(positions, cells) @ inverses, cells, counts)
 
 
-def _node_means(values: Tensor, cells: Tensor, nodes: int) -> Tensor:
+def _node_means(values: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
     corners = cells.reshape(-1)
-    sums = values.new_zeros(nodes, 3, 3)
-    sums = sums.index_add(0, corners, values.repeat_interleave(cells.shape[1], dim=0))
-    counts = values.new_zeros(nodes).index_add(0, corners, values.new_ones(len(corners)))
+    each = values[:, None].expand(-1, cells.shape[1], -1, -1).reshape(-1, 3, 3)
+    sums = values.new_zeros(len(counts), 3, 3).index_add(0, corners, each)
     return sums / counts[:, None, None]
 
 
