@@ -102,5 +102,13 @@ def turned_back(R: Tensor, x: Tensor) -> Tensor:
 
 def rotation_vectors(R: Tensor) -> Tensor:
     """Axial parts of R (n, 3, 3), (n, 3): sine of the angle times the axis."""
-    upper = (R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1])
-    return 0.5 * torch.stack(upper, dim=1)
+    here, there = _axial(R.device)
+    R = R.flatten(1)
+    return 0.5 * (R.index_select(1, here) - R.index_select(1, there))
+
+
+@cache
+def _axial(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Where zy, xz and yx are in the nine of a matrix, and yz, zx and xy."""
+    with torch.inference_mode(False):
+        return torch.tensor([7, 2, 3], device=device), torch.tensor([5, 6, 1], device=device)
