@@ -150,6 +150,7 @@ ORDER = [
     "environment",
     "data.generate",
     "corrector",
+    "corrector.rotations",
     "corrector.frames",
     "corrector.bodies",
     "corrector.features",

@@ -11,13 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.frames import (
-    cell_axes,
-    node_axes,
-    polar_rotations,
-    rotation_vectors,
-    turned_back,
-)
+from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
+from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.data.graph import mesh_edges, node_means
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
@@ -152,7 +147,7 @@ class BodyGraph:
         here, there = self.edge_index
         with torch.inference_mode(False):
             frames = self.rest_frames
-            return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
+            return turns_between(frames[here], frames[there])
 
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""

@@ -17,12 +17,8 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.frames import (
-    node_gradients,
-    polar_rotations,
-    rotation_vectors,
-    turned_back,
-)
+from pdcorrect.corrector.frames import node_gradients, turned_back
+from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.errors import InputError
 
 STILL = 1e-9
@@ -199,7 +195,7 @@ def _motion(view: View) -> Tensor:
 def _turn(view: View) -> Tensor:
     """Rotation between the frames of an edge's ends, beyond that at rest."""
     senders = view.frames.index_select(0, view.sender)
-    now = rotation_vectors(view.receiver_frames.transpose(1, 2) @ senders)
+    now = turns_between(view.receiver_frames, senders)
     return (now - view.bodies.rest_turns) / view.scale.index_select(0, view.receiver)
 
 

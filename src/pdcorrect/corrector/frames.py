@@ -17,10 +17,6 @@ from torch import Tensor
 
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
-_NEWTON_STEPS = 8
-_FLATTEST = 1e-3
-"""Least determinant, of what a cube's axes of the same norm have, that a rotation is made of."""
-
 
 def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
     """Axes of cells as columns, (c, 3, 3), m, for positions (n, 3) and cells (c, 8)."""
@@ -58,38 +54,6 @@ def _node_means(values: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
     return sums / counts[:, None, None]
 
 
-def polar_rotations(matrices: Tensor) -> Tensor:
-    """Rotations R of M = R U for matrices (n, 3, 3) with positive determinants.
-
-    Newton's iteration with scaling (Higham 1986), which can be differentiated.  Where the
-    determinant is not positive, or tiny beside the matrix, R is the identity.
-    """
-    X = matrices.permute(1, 2, 0).contiguous()  # long rows: fewer and quicker operations
-    squares = X.square().sum(dim=(0, 1))
-    X = X / torch.where(squares > 0.0, squares, 1.0).sqrt()
-    usable = _determinants(X, _cofactors(X)) > _FLATTEST * 3.0**-1.5
-    identity = torch.eye(3, dtype=X.dtype, device=X.device)[..., None]
-    X = torch.where(usable, X, identity)
-    for _ in range(_NEWTON_STEPS):
-        C = _cofactors(X)
-        inverse = C / _determinants(X, C)
-        scale = (inverse.square().sum(dim=(0, 1)) / X.square().sum(dim=(0, 1))).sqrt().sqrt()
-        X = (0.5 * scale) * X + inverse / (2.0 * scale)
-    return torch.where(usable, X, identity).permute(2, 0, 1).contiguous()
-
-
-def _cofactors(A: Tensor) -> Tensor:
-    """Det A A^-T of (3, 3, n)."""
-    rows = torch.cat([A, A[:2]])
-    B = torch.cat([rows, rows[:, :2]], dim=1)
-    return B[1:4, 1:4] * B[2:, 2:] - B[1:4, 2:] * B[2:, 1:4]
-
-
-def _determinants(A: Tensor, cofactors: Tensor) -> Tensor:
-    """Of (3, 3, n), (n,)."""
-    return (A[0] * cofactors[0]).sum(dim=0)
-
-
 def turned(R: Tensor, x: Tensor) -> Tensor:
     """R x for matrices (n, 3, 3) and vectors (n, 3)."""
     return (R @ x[..., None])[..., 0]
@@ -98,17 +62,3 @@ def turned(R: Tensor, x: Tensor) -> Tensor:
 def turned_back(R: Tensor, x: Tensor) -> Tensor:
     """R^T x."""
     return (R.transpose(1, 2) @ x[..., None])[..., 0]
-
-
-def rotation_vectors(R: Tensor) -> Tensor:
-    """Axial parts of R (n, 3, 3), (n, 3): sine of the angle times the axis."""
-    here, there = _axial(R.device)
-    R = R.flatten(1)
-    return 0.5 * (R.index_select(1, here) - R.index_select(1, there))
-
-
-@cache
-def _axial(device: torch.device) -> tuple[Tensor, Tensor]:
-    """Where zy, xz and yx are in the nine of a matrix, and yz, zx and xy."""
-    with torch.inference_mode(False):
-        return torch.tensor([7, 2, 3], device=device), torch.tensor([5, 6, 1], device=device)
