@@ -16,7 +16,7 @@ from block_meshes import o_grid, spokes, warped  # noqa: E402
 from conftest import beam, problem_on, rotation  # noqa: E402
 from network_samples import SIZE, STEP, tensor  # noqa: E402
 from pdcorrect import discretise  # noqa: E402
-from pdcorrect.corrector import cost, features, frames  # noqa: E402
+from pdcorrect.corrector import cost, features, frames, rotations  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.config import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector, without_momentum  # noqa: E402
@@ -77,7 +77,7 @@ def test_rotations_are_those_of_the_singular_value_decomposition(kind):
     kept = np.linalg.det(M) > 2e-3 * (s**2).sum(axis=1) ** 1.5 / 3**1.5
     assert kept.mean() > 0.5
     M = M[kept]
-    R = frames.polar_rotations(tensor(M)).numpy()
+    R = rotations.polar_rotations(tensor(M)).numpy()
     U, _, V = np.linalg.svd(M)
     np.testing.assert_allclose(
         R @ R.swapaxes(1, 2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12
@@ -86,9 +86,15 @@ def test_rotations_are_those_of_the_singular_value_decomposition(kind):
     np.testing.assert_allclose(R, U @ V, atol=1e-12 * (s[kept, 0] / s[kept, 2]).max())
 
 
+@pytest.mark.parametrize("kind", ["random", "near a rotation", "stretched", "nearly flat", "tiny"])
+def test_rotations_one_by_one_are_those_of_all_together(kind):
+    M = tensor(np.concatenate([matrices(kind), list(UNUSABLE.values()), [np.full((3, 3), np.nan)]]))
+    assert largest(rotations.polar_rotations(M) - rotations.together(M)) < 1e-13
+
+
 def test_rotations_in_single_precision_are_rotations():
     M = torch.as_tensor(matrices("stretched"), dtype=torch.float32)
-    R = frames.polar_rotations(M)
+    R = rotations.polar_rotations(M)
     assert R.dtype == torch.float32
     assert largest(R @ R.transpose(1, 2) - torch.eye(3)) < 1e-5
 
@@ -107,7 +113,7 @@ UNUSABLE = {
 def test_there_is_no_rotation_of_what_is_flat_or_mirrored(kind, dtype):
     good = rotation()
     M = torch.as_tensor(np.stack([UNUSABLE[kind], 2.0 * good]), dtype=dtype).requires_grad_()
-    R = frames.polar_rotations(M)
+    R = rotations.polar_rotations(M)
     assert torch.equal(R[0], torch.eye(3, dtype=dtype))
     assert largest(R[1] - torch.as_tensor(good, dtype=dtype)) < 1e-6
     (gradient,) = torch.autograd.grad((R * torch.arange(9.0).reshape(3, 3)).sum(), M)
@@ -118,7 +124,12 @@ def test_there_is_no_rotation_of_what_is_flat_or_mirrored(kind, dtype):
 
 def test_derivatives_of_rotations_are_right():
     M = tensor(matrices("stretched")[:4] / 10 + np.eye(3)).requires_grad_()
-    assert torch.autograd.gradcheck(frames.polar_rotations, (M,), eps=1e-6, atol=1e-7)
+    assert torch.autograd.gradcheck(rotations.polar_rotations, (M,), eps=1e-6, atol=1e-7)
+    tiny = (1e-6 * M).detach().requires_grad_()
+    weights = tensor(np.random.default_rng(3).normal(size=M.shape))
+    (one,) = torch.autograd.grad((rotations.polar_rotations(M) * weights).sum(), M)
+    (other,) = torch.autograd.grad((rotations.polar_rotations(tiny) * weights).sum(), tiny)
+    torch.testing.assert_close(1e-6 * other, one)
 
 
 def test_axes_of_a_cell_are_the_means_of_its_edges():
@@ -137,10 +148,10 @@ def test_a_node_takes_the_mean_of_its_cells():
     bodies = samples.body((2, 1, 1), distortion=0.0)
     x = bodies.rest.clone()
     x[x[:, 0] > 1.5 * SIZE, 0] += 0.5 * SIZE  # the second cell is half as long again
-    F = frames.node_gradients(x, bodies.rest_inverses, bodies.cells)
+    F = frames.node_gradients(x, bodies.rest_inverses, bodies.cells, bodies.cell_counts)
     expected = 1.0 + 0.25 * (bodies.rest[:, 0] / SIZE).round()
     assert torch.allclose(F[:, 0, 0], expected)
-    assert torch.allclose(frames.node_axes(x, bodies.cells), SIZE * F)
+    assert torch.allclose(frames.node_axes(x, bodies.cells, bodies.cell_counts), SIZE * F)
 
 
 def blocks():

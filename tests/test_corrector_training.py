@@ -8,7 +8,7 @@ import random
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
+from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
@@ -297,13 +298,53 @@ def test_noise_is_seen_and_to_be_corrected(folder, relative):
     assert noisy.snapshot.positions is batch.snapshot.positions
 
 
+@pytest.mark.parametrize("features", [("node-type", "strain"), ("load", "previous-correction")])
+@pytest.mark.parametrize("placement", ["state", "force"])
+def test_windows_kept_in_memory_are_those_that_are_read(folder, features, placement):
+    changes = {**samples.SMALL["changes"], "node_features": features, "placement": placement}
+    stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
+    settings = samples.config(stage, corrector={"preset": "compact", "changes": changes})
+    kept, read = (
+        samples.windows(folder, settings, resident=resident)[0] for resident in (True, False)
+    )
+    chosen = [45, 3, 18, 45, 20, 56, 0]  # both meshes, all simulations, first and last windows
+    pairs = [(kept.batch(chosen), read.batch(chosen))]
+    several = kept.batches(8, seed=3), read.batches(8, seed=3)
+    pairs += [(next(several[0]), next(several[1])) for _ in range(2 * len(several[0]))]
+    assert several[0].state_dict() == several[1].state_dict()
+    for one, other in pairs:
+        assert torch.equal(one.target, other.target)
+        assert torch.equal(one.scale, other.scale)
+        for x, y in ((one.bodies, other.bodies), (one.snapshot, other.snapshot)):
+            for field in fields(x):
+                a, b = getattr(x, field.name), getattr(y, field.name)
+                assert (a is None and b is None) or (a.dtype == b.dtype and torch.equal(a, b))
+        for name in KNOWN:
+            assert torch.equal(vars(one.bodies)[name], vars(other.bodies)[name])
+
+
+def test_windows_that_memory_does_not_hold_are_read(folder, monkeypatch):
+    settings = samples.config(samples.one_step())
+    assert samples.windows(folder, settings)[0].resident
+    monkeypatch.setattr("pdcorrect.training.windows.CACHE_BYTES", 10**5)
+    assert not samples.windows(folder, settings)[0].resident
+
+
+@pytest.mark.parametrize("index", [60, 10**6])
+def test_there_is_no_window_beyond_the_last(folder, index):
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    assert len(windows.dataset) == 60
+    with pytest.raises(IndexError, match=str(index)):
+        windows.batch([0, index])
+
+
 def test_what_is_known_of_the_rest_is_that_of_the_bodies(folder):
     windows, _ = samples.windows(folder, samples.config(samples.one_step()))
     bodies = windows.batch([3, 45, 4]).bodies
     anew = bodies.to()
-    for name in ("rest_inverses", "rest_frames", "rest_edges", "rest_turns"):
-        torch.testing.assert_close(getattr(bodies, name), getattr(anew, name))
-        assert len(getattr(bodies, name)) > 50
+    for name in KNOWN:
+        torch.testing.assert_close(vars(bodies)[name], getattr(anew, name))
+        assert len(getattr(bodies, name)) > 50 or name == "node_counts"
 
 
 # --- normalisation -----------------------------------------------------------------------

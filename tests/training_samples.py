@@ -69,10 +69,11 @@ def unrolled(**changes):
     return Stage(**{"kind": "unrolled", "iterations": 2, "batch": 3, **changes})
 
 
-def windows(folder, settings):
+def windows(folder, settings, **options):
     """The windows of a configuration's training split, and its recordings."""
     recordings = load_recordings(folder, "training", settings.base)
-    return StepWindows(folder, recordings, settings.architecture(), settings.base), recordings
+    architecture = settings.architecture()
+    return StepWindows(folder, recordings, architecture, settings.base, **options), recordings
 
 
 def fitted(folder, settings, silent=False):

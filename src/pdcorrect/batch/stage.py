@@ -145,7 +145,7 @@ class BatchStaging:
             "velocities": state.velocities,
             "prescribed": self.prescribed([t + self._h for t in state.times]),
             "time": torch.zeros_like(state.positions)
-            + by_scene(state.positions.new_tensor(state.times)),
+            + by_scene(_on_device(state.times, state.positions)),
             **state.memory,
             "clamp_velocity": 0.0,
             "clamp_velocity_at_y": 0.0,
@@ -171,3 +171,8 @@ class BatchStaging:
         """A sum (B, N, 3) in memory of its own."""
         values: Tensor = by_component(torch, self.free, known, on_free, on_clamped)
         return values.clone() if any(values is other for other in known.values()) else values
+
+
+def _on_device(numbers: Sequence[float], like: Tensor) -> Tensor:
+    """Numbers (B,) in another tensor's type, on its device, which is not waited for."""
+    return torch.tensor(numbers, dtype=like.dtype).to(like.device, non_blocking=True)

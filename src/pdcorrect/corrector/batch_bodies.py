@@ -75,7 +75,7 @@ class BatchBodies:
 
     def flat(self, x: Tensor) -> Tensor:
         """Nodal values (B, N, ...) of scenes, float64, without padding: (n, ...)."""
-        return x.reshape(-1, *x.shape[2:])[self._rows].to(self._own.rest.dtype)
+        return x.reshape(-1, *x.shape[2:]).index_select(0, self._rows).to(self._own.rest.dtype)
 
     def padded(self, x: Tensor) -> Tensor:
         """Values (n, ...) as (B, N, ...) in the stepper's type, zero in padding."""

@@ -255,7 +255,8 @@ class HybridLayer(WithNodes, nn.Module):
     def _converged(self) -> Tensor:
         """Whether each scene's last step did, (B,) bool."""
         statuses = self.steps.statuses[-1]
-        return torch.tensor([s.ok for s in statuses], device=self.bodies.rest.device)
+        fine = torch.tensor([s.ok for s in statuses])
+        return fine.to(self.bodies.rest.device, non_blocking=True)
 
     def _at_rest_unless(
         self, ok: Tensor, before: BatchState, previous: Tensor | None

@@ -108,7 +108,8 @@ class BatchCoarseStep:
 
     def ok(self, answer: BatchResult) -> Tensor:
         """See `CoarseStep`."""
-        return torch.tensor([s.ok for s in answer.statuses], device=self._stepper.device)
+        fine = torch.tensor([s.ok for s in answer.statuses])
+        return fine.to(self._stepper.device, non_blocking=True)
 
     def moved(self, answer: BatchResult, correction: Tensor) -> BatchResult:
         """See `CoarseStep`; only the state is another one."""

@@ -11,13 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.frames import (
-    cell_axes,
-    node_axes,
-    polar_rotations,
-    rotation_vectors,
-    turned_back,
-)
+from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
+from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.data.graph import mesh_edges, node_means
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
@@ -114,16 +109,30 @@ class BodyGraph:
         return len(self.cell_size)
 
     @cached_property
+    def node_counts(self) -> Tensor:
+        """Nodes of each body, (B,), in the type of ``rest``."""
+        with torch.inference_mode(False):  # for later use with derivatives too
+            return self.node_sums(torch.ones_like(self.mass))
+
+    @cached_property
+    def cell_counts(self) -> Tensor:
+        """Cells that touch each node, (n,), in the type of ``rest``."""
+        with torch.inference_mode(False):
+            corners = self.cells.reshape(-1)
+            ones = torch.ones_like(corners, dtype=self.rest.dtype)
+            return torch.zeros_like(self.mass).index_add(0, corners, ones)
+
+    @cached_property
     def rest_inverses(self) -> Tensor:
         """Inverses of the cells' axes at rest, (c, 3, 3), 1/m."""
-        with torch.inference_mode(False):  # for later use with derivatives too
+        with torch.inference_mode(False):
             return torch.linalg.inv(cell_axes(self.rest, self.cells))
 
     @cached_property
     def rest_frames(self) -> Tensor:
         """Frames of the nodes at rest: rotations (n, 3, 3)."""
         with torch.inference_mode(False):
-            return polar_rotations(node_axes(self.rest, self.cells))
+            return polar_rotations(node_axes(self.rest, self.cells, self.cell_counts))
 
     @cached_property
     def rest_edges(self) -> Tensor:
@@ -138,11 +147,11 @@ class BodyGraph:
         here, there = self.edge_index
         with torch.inference_mode(False):
             frames = self.rest_frames
-            return rotation_vectors(frames[here].transpose(1, 2) @ frames[there])
+            return turns_between(frames[here], frames[there])
 
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""
-        return values[self.graph]
+        return values.index_select(0, self.graph)
 
     def node_sums(self, values: Tensor) -> Tensor:
         """Sums (B, ...) over the nodes of each body of values (n, ...)."""
@@ -151,7 +160,7 @@ class BodyGraph:
 
     def body_means(self, values: Tensor) -> Tensor:
         """Means (B, ...) over the nodes of each body of values (n, ...)."""
-        counts = torch.bincount(self.graph, minlength=self.bodies).to(values.dtype)
+        counts = self.node_counts.to(values.dtype)
         return self.node_sums(values) / counts.reshape(-1, *[1] * (values.ndim - 1))
 
     def sound(self, values: Tensor) -> Tensor:
@@ -167,18 +176,16 @@ class BodyGraph:
         What is known of their rest is kept.
         """
         corners = self.cells.reshape(-1)
-        counts = torch.bincount(corners, minlength=len(self.rest)).to(self.rest)
 
         def mean(values: Tensor) -> Tensor:
             each = values.to(self.rest).repeat_interleave(self.cells.shape[1])
-            return torch.zeros_like(self.mass).index_add(0, corners, each) / counts
+            return torch.zeros_like(self.mass).index_add(0, corners, each) / self.cell_counts
 
         found = replace(
             self, mass=mass.to(self.rest), young=mean(young), poisson=mean(poisson),
             density=mean(density),
         )  # fmt: skip
-        kept = ("rest_inverses", "rest_frames", "rest_edges", "rest_turns")
-        vars(found).update({name: vars(self)[name] for name in kept if name in vars(self)})
+        vars(found).update({name: vars(self)[name] for name in KNOWN if name in vars(self)})
         return found
 
     def to(
@@ -191,6 +198,12 @@ class BodyGraph:
             moved[field.name] = value.to(device, dtype if value.is_floating_point() else None)
         return BodyGraph(**moved)
 
+
+REST_OF_NODES = ("rest_frames", "cell_counts")
+REST_OF_EDGES = ("rest_edges", "rest_turns")
+REST_OF_CELLS = ("rest_inverses",)
+KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
+"""What a graph computes of its bodies at rest once, when first asked for."""
 
 _NODAL = ("rest", "free", "mass", "young", "poisson", "density")
 

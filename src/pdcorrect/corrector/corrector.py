@@ -100,7 +100,8 @@ def without_momentum(view: View, correction: Tensor) -> Tensor:
     inertia = bodies.node_sums(moments)
     trace = inertia.diagonal(dim1=1, dim2=2).sum(dim=1)
     least = torch.where(trace > 0.0, _LEAST_INERTIA * trace, 1.0)
-    turn = torch.linalg.solve(inertia + least[:, None, None] * identity, spin)
+    # regular by construction; unlike `solve` this does not wait for the device to say so
+    turn, _ = torch.linalg.solve_ex(inertia + least[:, None, None] * identity, spin)
     motion = bodies.by_node(mean) + torch.linalg.cross(bodies.by_node(turn), r)
     return torch.where(carries, correction - motion, correction)
 

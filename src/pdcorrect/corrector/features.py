@@ -11,18 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.frames import (
-    node_gradients,
-    polar_rotations,
-    rotation_vectors,
-    turned_back,
-)
+from pdcorrect.corrector.frames import node_gradients, turned_back
+from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.errors import InputError
 
 STILL = 1e-9
@@ -74,7 +70,9 @@ class View:
     def gradients(self) -> Tensor:
         """Deformation gradients F (n, 3, 3), after the step."""
         bodies = self.bodies
-        return node_gradients(self.snapshot.proposed, bodies.rest_inverses, bodies.cells)
+        return node_gradients(
+            self.snapshot.proposed, bodies.rest_inverses, bodies.cells, bodies.cell_counts
+        )
 
     @cached_property
     def turns(self) -> Tensor:
@@ -89,7 +87,7 @@ class View:
     @cached_property
     def receiver_frames(self) -> Tensor:
         """Frames of the edges' receivers, (E, 3, 3)."""
-        return self.frames[self.receiver]
+        return self.frames.index_select(0, self.receiver)
 
     @cached_property
     def strain(self) -> Tensor:
@@ -110,18 +108,27 @@ class View:
         """Deformation at nodes, (n, 1), at least `STILL`."""
         return self.bodies.by_node(self.deformation.clamp_min(STILL))[:, None]
 
+    @cached_property
+    def unit(self) -> Tensor:
+        """Cell size times deformation at nodes, (n, 1), m."""
+        return self.size * self.scale
+
+    @cached_property
+    def receiver_unit(self) -> Tensor:
+        """The same at the edges' receivers, (E, 1), m."""
+        return self.unit.index_select(0, self.receiver)
+
     def edge_change(self, field: Tensor) -> Tensor:
         """Difference of a nodal field (n, 3) along edges, sender minus receiver, (E, 3)."""
-        return field[self.sender] - field[self.receiver]
+        return field.index_select(0, self.sender) - field.index_select(0, self.receiver)
 
     def in_frame(self, x: Tensor) -> Tensor:
         """Nodal vectors (n, 3) in the node's frame, over cell size and deformation."""
-        return turned_back(self.frames, x) / (self.size * self.scale)
+        return turned_back(self.frames, x) / self.unit
 
     def in_receiver_frame(self, x: Tensor) -> Tensor:
         """Vectors (E, 3) of edges in the receiver's frame, over cell size and deformation."""
-        unit = (self.size * self.scale)[self.receiver]
-        return turned_back(self.receiver_frames, x) / unit
+        return turned_back(self.receiver_frames, x) / self.receiver_unit
 
 
 Feature = tuple[int, Callable[[View], Tensor]]
@@ -158,18 +165,25 @@ def _stiffness(view: View) -> Tensor:
 
 
 def _strain(view: View) -> Tensor:
-    rows, columns = (0, 1, 2, 1, 2, 2), (0, 1, 2, 0, 0, 1)
-    return view.strain[:, rows, columns] / view.scale
+    six = _lower_triangle(view.strain.device)
+    return view.strain.flatten(1).index_select(1, six) / view.scale
+
+
+@cache
+def _lower_triangle(device: torch.device) -> Tensor:
+    """Where xx, yy, zz, yx, zx and zy are in the nine of a matrix."""
+    with torch.inference_mode(False):
+        return torch.tensor([0, 4, 8, 3, 6, 7], device=device)
 
 
 def _rest_edge(view: View) -> Tensor:
-    return _with_length(view.bodies.rest_edges / view.size[view.receiver])
+    return _with_length(view.bodies.rest_edges / view.size.index_select(0, view.receiver))
 
 
 def _stretch(view: View) -> Tensor:
     """Edge in the receiver's frame, minus that at rest in the frame at rest."""
     now = turned_back(view.receiver_frames, view.edge_change(view.snapshot.proposed))
-    return (now - view.bodies.rest_edges) / (view.size * view.scale)[view.receiver]
+    return (now - view.bodies.rest_edges) / view.receiver_unit
 
 
 def _motion(view: View) -> Tensor:
@@ -180,8 +194,9 @@ def _motion(view: View) -> Tensor:
 
 def _turn(view: View) -> Tensor:
     """Rotation between the frames of an edge's ends, beyond that at rest."""
-    now = rotation_vectors(view.receiver_frames.transpose(1, 2) @ view.frames[view.sender])
-    return (now - view.bodies.rest_turns) / view.scale[view.receiver]
+    senders = view.frames.index_select(0, view.sender)
+    now = turns_between(view.receiver_frames, senders)
+    return (now - view.bodies.rest_turns) / view.scale.index_select(0, view.receiver)
 
 
 def _with_length(x: Tensor) -> Tensor:

@@ -10,73 +10,48 @@ R does not depend on how a mesh orders the corners of its cells; the frame at re
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from torch import Tensor
 
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
-_NEWTON_STEPS = 8
-_FLATTEST = 1e-3
-"""Least determinant, of what a cube's axes of the same norm have, that a rotation is made of."""
-
 
 def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
     """Axes of cells as columns, (c, 3, 3), m, for positions (n, 3) and cells (c, 8)."""
-    signs = torch.as_tensor(2.0 * VTK_CORNERS - 1.0, dtype=positions.dtype, device=positions.device)
-    return torch.einsum("cki,kj->cij", positions[cells], signs / 4.0)
+    corners = positions.index_select(0, cells.reshape(-1)).reshape(*cells.shape, 3)
+    return torch.einsum("cki,kj->cij", corners, _edge_means(positions.dtype, positions.device))
 
 
-def node_axes(positions: Tensor, cells: Tensor) -> Tensor:
-    """Means of the axes of the cells that touch a node, (n, 3, 3), m."""
-    return _node_means(cell_axes(positions, cells), cells, len(positions))
+@cache
+def _edge_means(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """What a cell's corners count in its axes, (8, 3)."""
+    with torch.inference_mode(False):
+        return torch.as_tensor((2.0 * VTK_CORNERS - 1.0) / 4.0, dtype=dtype, device=device)
 
 
-def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor) -> Tensor:
+def node_axes(positions: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
+    """Means of the axes of the cells that touch a node, (n, 3, 3), m.
+
+    ``counts`` (n,) are the numbers of these cells.
+    """
+    return _node_means(cell_axes(positions, cells), cells, counts)
+
+
+def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
     """Means of the deformation gradients of the cells that touch a node, (n, 3, 3).
 
-    ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m.
+    ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m; ``counts`` as above.
     """
-    return _node_means(cell_axes(positions, cells) @ inverses, cells, len(positions))
+    return _node_means(cell_axes(positions, cells) @ inverses, cells, counts)
 
 
-def _node_means(values: Tensor, cells: Tensor, nodes: int) -> Tensor:
+def _node_means(values: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
     corners = cells.reshape(-1)
-    sums = values.new_zeros(nodes, 3, 3)
-    sums = sums.index_add(0, corners, values.repeat_interleave(cells.shape[1], dim=0))
-    counts = values.new_zeros(nodes).index_add(0, corners, values.new_ones(len(corners)))
+    each = values[:, None].expand(-1, cells.shape[1], -1, -1).reshape(-1, 3, 3)
+    sums = values.new_zeros(len(counts), 3, 3).index_add(0, corners, each)
     return sums / counts[:, None, None]
-
-
-def polar_rotations(matrices: Tensor) -> Tensor:
-    """Rotations R of M = R U for matrices (n, 3, 3) with positive determinants.
-
-    Newton's iteration with scaling (Higham 1986), which can be differentiated.  Where the
-    determinant is not positive, or tiny beside the matrix, R is the identity.
-    """
-    X = matrices.permute(1, 2, 0).contiguous()  # long rows: fewer and quicker operations
-    squares = X.square().sum(dim=(0, 1))
-    X = X / torch.where(squares > 0.0, squares, 1.0).sqrt()
-    usable = _determinants(X, _cofactors(X)) > _FLATTEST * 3.0**-1.5
-    identity = torch.eye(3, dtype=X.dtype, device=X.device)[..., None]
-    X = torch.where(usable, X, identity)
-    for _ in range(_NEWTON_STEPS):
-        C = _cofactors(X)
-        inverse = C / _determinants(X, C)
-        scale = (inverse.square().sum(dim=(0, 1)) / X.square().sum(dim=(0, 1))).sqrt().sqrt()
-        X = (0.5 * scale) * X + inverse / (2.0 * scale)
-    return torch.where(usable, X, identity).permute(2, 0, 1).contiguous()
-
-
-def _cofactors(A: Tensor) -> Tensor:
-    """Det A A^-T of (3, 3, n)."""
-    rows = torch.cat([A, A[:2]])
-    B = torch.cat([rows, rows[:, :2]], dim=1)
-    return B[1:4, 1:4] * B[2:, 2:] - B[1:4, 2:] * B[2:, 1:4]
-
-
-def _determinants(A: Tensor, cofactors: Tensor) -> Tensor:
-    """Of (3, 3, n), (n,)."""
-    return (A[0] * cofactors[0]).sum(dim=0)
 
 
 def turned(R: Tensor, x: Tensor) -> Tensor:
@@ -87,9 +62,3 @@ def turned(R: Tensor, x: Tensor) -> Tensor:
 def turned_back(R: Tensor, x: Tensor) -> Tensor:
     """R^T x."""
     return (R.transpose(1, 2) @ x[..., None])[..., 0]
-
-
-def rotation_vectors(R: Tensor) -> Tensor:
-    """Axial parts of R (n, 3, 3), (n, 3): sine of the angle times the axis."""
-    upper = (R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1])
-    return 0.5 * torch.stack(upper, dim=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -191,7 +191,9 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             _check_runs(header, base, self.runs)
         counts = [max(0, steps - window + 1) for h in self.headers for steps in h.steps]
         # Row by row: file, simulation, number of its first window; in the order of windows.
-        self._owners = [(i, s) for i, h in enumerate(self.headers) for s in range(len(h.steps))]
+        self._owners = np.array(
+            [(i, s) for i, h in enumerate(self.headers) for s in range(len(h.steps))]
+        )
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if not self._starts[-1]:
             longest = max((steps for h in self.headers for steps in h.steps), default=0)
@@ -234,10 +236,36 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         sizes = _sizes(places)
         return _parts(places, sizes, self.window, self.dtype), sizes
 
+    def places(
+        self, indices: Sequence[int] | NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,).
+
+        Raises
+        ------
+        IndexError
+            If there is no such window.
+        """
+        numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
+        if not isinstance(chosen, range):
+            numbers = np.asarray(chosen, dtype=np.int64)[numbers]
+        for idx in numbers[(numbers < 0) | (numbers >= self.len())]:
+            raise self._no_window(int(idx))
+        rows = np.searchsorted(self._starts, numbers, side="right") - 1
+        files, simulations = self._owners[rows].T
+        return files, simulations, numbers - self._starts[rows]
+
+    def decoded(self, file: int) -> _Shard:
+        """A file's tensors, which are kept as far as memory allows."""
+        return self._shards[file]
+
+    def forget(self) -> None:
+        """Drop all decoded files from memory."""
+        self._shards = RecentlyUsed(self._load, _bytes, self.cache_bytes)
+
     def shard_numbers(self) -> NDArray[np.int64]:
         """For each window the number of its file in the split, (len(self),)."""
-        owners = np.array([shard for shard, _ in self._owners])
-        every = np.repeat(owners, np.diff(self._starts))
+        every = np.repeat(self._owners[:, 0], np.diff(self._starts))
         return every[np.asarray(self.indices(), dtype=np.int64)]
 
     def shard_bytes(self) -> NDArray[np.int64]:
@@ -251,14 +279,17 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def _place(self, idx: int) -> _Place:
         if not 0 <= idx < self.len():
-            raise IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
+            raise self._no_window(idx)
         row = int(np.searchsorted(self._starts, idx, side="right")) - 1
-        number, simulation = self._owners[row]
+        number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
         return _Place(
             self.headers[number], shard, simulation, shard.motions[simulation],
             idx - int(self._starts[row]),
         )  # fmt: skip
+
+    def _no_window(self, idx: int) -> IndexError:
+        return IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
 
     def _load(self, number: int) -> _Shard:
         path = self.headers[number].path
@@ -277,6 +308,9 @@ class TrajectoryLoader(DataLoader[Any]):
         Windows in order without.
     drop_last : bool
         Leave out a last batch that is smaller.
+    assemble : callable, optional
+        Makes a batch, which knows its ``num_graphs``, of the numbers of its windows;
+        `TrajectoryDataset.batch` by default.  Without worker processes.
     **options
         Of ``torch.utils.data.DataLoader``, such as ``num_workers``, ``persistent_workers``,
         ``multiprocessing_context`` and ``pin_memory``.
@@ -289,13 +323,14 @@ class TrajectoryLoader(DataLoader[Any]):
         sampler: ShardShuffle | None = None,
         *,
         drop_last: bool = False,
+        assemble: Callable[[Sequence[int]], Any] | None = None,
         **options: Any,
     ) -> None:
         self.shuffle, self.windows = sampler, batch_size
         order = SequentialSampler(dataset) if sampler is None else sampler
         self._position = 0 if sampler is None else sampler.position
         super().__init__(
-            _Batches(dataset),
+            _Batches(dataset, assemble or dataset.batch),
             batch_size=None,
             sampler=BatchSampler(order, batch_size, drop_last),
             collate_fn=_unchanged,
@@ -337,12 +372,14 @@ class TrajectoryLoader(DataLoader[Any]):
 class _Batches(torch.utils.data.Dataset[Any]):
     """Lists of indices -> batches, from a worker packed."""
 
-    def __init__(self, dataset: TrajectoryDataset) -> None:
-        self.dataset = dataset
+    def __init__(
+        self, dataset: TrajectoryDataset, assemble: Callable[[Sequence[int]], Any]
+    ) -> None:
+        self.dataset, self.assemble = dataset, assemble
 
-    def __getitem__(self, indices: list[int]) -> Batch | _Packed:
+    def __getitem__(self, indices: list[int]) -> Any:
         in_worker = torch.utils.data.get_worker_info() is not None
-        return self.dataset.packed(indices) if in_worker else self.dataset.batch(indices)
+        return self.dataset.packed(indices) if in_worker else self.assemble(indices)
 
 
 def _unchanged(batch: Any) -> Any:

@@ -60,7 +60,8 @@ class Optimiser:
         self._adam = torch.optim.Adam(self._weights, lr=stage.rate.peak, fused=True)
         device = self._weights[0].device
         self._bad = torch.zeros((), device=device)
-        self._counts = {name: torch.zeros((), dtype=torch.float64, device=device) for name in _TOLD}
+        self._told = torch.zeros(len(_TOLD), dtype=torch.float64, device=device)
+        self._counts = dict(zip(_TOLD, self._told.unbind(), strict=True))
         vars(self._adam).update(grad_scale=None, found_inf=self._bad)  # its kernel asks for them
 
     def step(self, loss: Tensor, progress: float) -> None:
@@ -97,7 +98,7 @@ class Optimiser:
 
     def take_report(self) -> dict[str, float]:
         """Mean loss, batches left out, and the longest row of them; counting starts anew."""
-        values = {name: float(x) for name, x in self._counts.items()}
+        values: dict[str, float] = dict(zip(_TOLD, self._told.tolist(), strict=True))
         for name, x in self._counts.items():
             x.fill_(values["row"] if name in ("row", "longest") else 0.0)
         count = values["count"]
@@ -117,7 +118,7 @@ class Optimiser:
             for part in _MOMENTS
             if weight in state
         }
-        return moments | {f"count.{name}": x for name, x in self._counts.items()}
+        return moments | {f"count.{name}": x.clone() for name, x in self._counts.items()}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Go on where a state was taken."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,7 +41,9 @@ class SceneGroup:
         T of each simulation.
     errors : BaseErrors
     counts : (B,) tensor
-        Nodes.
+        Nodes of each.
+    nodes : int
+        Of all.
     """
 
     def __init__(
@@ -54,6 +58,8 @@ class SceneGroup:
         self.errors = base_errors(recordings, self.device)
         self.mask = self.stepper.node_mask
         self.counts = self.mask.sum(dim=1).to(torch.float64)
+        self.nodes = sum(self.stepper.node_counts)
+        self._rows = torch.arange(len(self), device=self.device)
         self._reference = self._padded([r.reference for r in recordings])
         self._layers: dict[tuple[int, bool, Velocity], HybridLayer] = {}
 
@@ -79,9 +85,21 @@ class SceneGroup:
 
     def truth(self, frames: Frames) -> Tensor:
         """The reference's positions (B, N, 3), float64, in one frame of each simulation."""
-        rows = torch.arange(len(self), device=self.device)
-        at = torch.from_numpy(np.asarray(frames)).to(self.device, non_blocking=True)
-        return self._reference[rows, at].to(torch.float64)
+        return self._reference[self._rows, self.on_device(frames)].to(torch.float64)
+
+    def on_device(self, values: NDArray[Any]) -> Tensor:
+        """Numbers of the scenes (B,) on the device, which is not waited for."""
+        return torch.from_numpy(np.asarray(values)).to(self.device, non_blocking=True)
+
+    def by_node(self, values: Tensor) -> Tensor:
+        """Values (B,) of the scenes at their nodes without padding, (n,)."""
+        return values.index_select(0, self._owners)
+
+    @cached_property
+    def _owners(self) -> Tensor:
+        """Scene of each node, (n,)."""
+        counts = self.mask.sum(dim=1)
+        return torch.repeat_interleave(self._rows, counts, output_size=self.nodes)
 
     def states(self, frames: Frames) -> tuple[Tensor, Tensor]:
         """Positions and velocities of the reference, (B, N, 3).

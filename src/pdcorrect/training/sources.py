@@ -83,9 +83,8 @@ def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tenso
     """Mean loss of the bodies of a batch."""
     with network_precision(corrector, stage.amp):
         correction = corrector(batch.bodies, batch.snapshot)
-    counts = torch.bincount(batch.bodies.graph, minlength=batch.bodies.bodies)
-    errors = correction - batch.target
-    each = body_losses(stage.loss, errors, batch.bodies.node_sums, counts, batch.scale)
+    bodies, errors = batch.bodies, correction - batch.target
+    each = body_losses(stage.loss, errors, bodies.node_sums, bodies.node_counts, batch.scale)
     return each.mean()
 
 

@@ -113,7 +113,7 @@ class UnrolledBatches:
         if self._stage.start == "pool":
             found.end.ages[~found.alive | group.lost(found.end.positions, found.end.frames)] = -1
             self._pool[number] = found.end
-        return mean_of(found.losses, torch.from_numpy(found.alive).to(group.device))
+        return mean_of(found.losses, group.on_device(found.alive))
 
     def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """The pool: numbers, and tensors by name."""
@@ -151,7 +151,7 @@ class UnrolledBatches:
         frames = rng.integers(0, group.steps - steps + 1)
         anew = rng.random(len(group)) < self._stage.restart
         positions, velocities = group.states(frames)
-        none = torch.zeros(int(group.counts.sum()), 3, dtype=torch.float64, device=group.device)
+        none = torch.zeros(group.nodes, 3, dtype=torch.float64, device=group.device)
         drawn = Rollouts(positions, velocities, none, frames, np.zeros_like(frames))
         before = self._pool.get(number)
         if self._stage.start == "reference" or before is None:
@@ -179,14 +179,14 @@ def unroll(
             positions, velocities, correction = layer(
                 positions, velocities, group.times(frames), correction
             )
-        fine = torch.tensor(in_one(layer.steps.statuses[-1]), device=group.device)
+        fine = group.on_device(np.array(in_one(layer.steps.statuses[-1])))
         living = living & fine & torch.isfinite(positions).flatten(1).all(dim=1)
         frames, ages = frames + 1, ages + 1
         truth, at = group.truth(frames), living[:, None, None]
         # Not a number times zero is not zero: it must not reach what all scenes share.
         positions = torch.where(at, positions, truth)
         velocities = torch.where(at, velocities, 0.0)
-        scale = group.errors.after(torch.from_numpy(ages).to(group.device))
+        scale = group.errors.after(group.on_device(ages))
         total = total + body_losses(stage.loss, positions - truth, group.sums, group.counts, scale)
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
@@ -194,9 +194,8 @@ def unroll(
 
 def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:
     """What a pool held, some scenes begun anew."""
-    which = torch.from_numpy(anew).to(group.device)
-    at = which[:, None, None]
-    of_nodes = which.repeat_interleave(group.mask.sum(dim=1))[:, None]
+    which = group.on_device(anew)
+    at, of_nodes = which[:, None, None], group.by_node(which)[:, None]
     return Rollouts(
         torch.where(at, drawn.positions, before.positions),
         torch.where(at, drawn.velocities, before.velocities),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.bodies import KNOWN, BodyGraph
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import TRAINING
-from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
+from pdcorrect.data.reader import CACHE_BYTES, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.sampling import ShardShuffle
 from pdcorrect.training.recordings import Base, Recording
+from pdcorrect.training.resident import ResidentWindows, StoredWindows
 
 _SHARE_OF_DEVICE = 0.3
 """Of a GPU's free memory, which the windows may fill."""
@@ -74,7 +76,10 @@ class StepWindows:
     base : {"plain", "best"}
     device : str or torch.device
     workers : int
-        Processes that read ahead; none if the split fits into the device's memory.
+        Processes that read ahead; none are needed where the split is kept in memory.
+    resident : bool, optional
+        Whether all windows are kept in the device's memory, see `ResidentWindows`.  By
+        default if they take less than 0.3 of what is free on a GPU, or 4 GiB on the CPU.
     """
 
     def __init__(
@@ -86,83 +91,102 @@ class StepWindows:
         *,
         device: str | torch.device = "cpu",
         workers: int = 0,
+        resident: bool | None = None,
     ) -> None:
         self.config, self.device = config, torch.device(device)
         self._history = "previous-correction" in config.node_features
         window = 2 if self._history else 1
-        dataset = _DeviceDataset(folder, TRAINING, window=window, base=base)
-        size = int(dataset.shard_bytes().sum())
-        if _fits(size, self.device):
-            dataset.keep_on(self.device, size)
-            workers = 0
-        self.dataset, self._workers = dataset, workers
+        self.dataset = TrajectoryDataset(folder, TRAINING, window=window, base=base)
+        size = int(self.dataset.shard_bytes().sum())
+        self.resident = _fits(size, self.device) if resident is None else resident
+        self._workers = 0 if self.resident else workers
         rows = max(r.mesh for r in recordings) + 1
         columns = max(r.number for r in recordings) + 1
         errors = torch.full((rows, columns), float("nan"), dtype=torch.float64)
         for r in recordings:
             errors[r.mesh, r.number] = r.one_step
         self._errors = errors.to(self.device)
-        shards, first = np.unique(dataset.shard_numbers(), return_index=True)
+        files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
         self._first = {
-            dataset.headers[k].number: int(i) for k, i in zip(shards, first, strict=True)
+            self.dataset.headers[k].number: int(i) for k, i in zip(files, first, strict=True)
         }
-        self._rest: dict[int, dict[str, Tensor]] = {}
+        self._known: dict[int, BodyGraph] = {}
 
     def batch(self, indices: Sequence[int]) -> StepBatch:
         """Chosen windows."""
-        return self.step_batch(self.dataset.batch(indices))
+        source = self._tables if self.resident else self.dataset
+        return self.step_batch(source.batch(indices))
+
+    @cached_property
+    def _tables(self) -> ResidentWindows:
+        return ResidentWindows(self.dataset, self._alone, self.device)
 
     def batches(
         self, size: int, *, seed: int, rank: int = 0, world_size: int = 1
     ) -> EndlessBatches:
         """Batches of ``size`` windows in random order, epoch after epoch."""
-        shuffle = ShardShuffle(self.dataset, seed=seed, rank=rank, world_size=world_size)
         options: dict[str, Any] = {"pin_memory": self.device.type == "cuda" and self._workers > 0}
         if self._workers:
             options |= {"num_workers": self._workers, "persistent_workers": True}
+        if self.resident:
+            options |= {"assemble": self._tables.batch}
+        block = len(self.dataset.headers) if self.resident else None
+        shuffle = ShardShuffle(
+            self.dataset, seed=seed, block=block, rank=rank, world_size=world_size
+        )
         whole = len(shuffle) >= size
         loader = TrajectoryLoader(self.dataset, size, shuffle, drop_last=whole, **options)
         return EndlessBatches(self, loader)
 
     def step_batch(self, found: Any) -> StepBatch:
-        """What a batch of samples says about its last step."""
-        meshes = found.mesh.tolist()
-        found = found.to(self.device, non_blocking=True)
-        bodies = self._with_rest(BodyGraph.of_batch(found).to(dtype=torch.float64), meshes)
-        positions, targets, predictions, forces = (
-            getattr(found, name).to(torch.float64)
-            for name in ("positions", "targets", "predictions", "forces")
-        )
-        velocities, previous = found.velocities.to(torch.float64), None
+        """What `StoredWindows`, or a batch of samples on the CPU, say about their last step."""
+        stored = found if isinstance(found, StoredWindows) else self._stored(found)
+        bodies, coarse, target = stored.bodies, stored.predictions[-1], stored.targets[-1]
+        positions, velocities, previous = stored.positions, stored.velocities, None
         if self._history:
-            previous = targets[:, 0] - predictions[:, 0]
-            step = bodies.by_node(bodies.time_step)[:, None]
-            velocities = (targets[:, 0] - positions) / step
-            positions = targets[:, 0]
-        coarse = predictions[:, -1]
-        state = Snapshot(positions, velocities, coarse, forces[:, -1], previous)
-        target = targets[:, -1] - coarse
+            before, positions = positions, stored.targets[0]
+            previous = positions - stored.predictions[0]
+            velocities = (positions - before) / bodies.by_node(bodies.time_step)[:, None]
+        state = Snapshot(positions, velocities, coarse, stored.forces[-1], previous)
+        target = target - coarse
         if self.config.placement != "state":
             h: Any = bodies.by_node(bodies.time_step)[:, None]
             # the clamps of the stored coarse step are where they are prescribed
             start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
-        return StepBatch(bodies, state, target, self._errors[found.mesh, found.simulation])
+        return StepBatch(bodies, state, target, self._errors[stored.mesh, stored.simulation])
 
-    def _with_rest(self, bodies: BodyGraph, meshes: list[int]) -> BodyGraph:
-        """The bodies with what is computed of their rest once for each mesh."""
-        for mesh in set(meshes) - self._rest.keys():
-            one = self.dataset.batch([self._first[mesh]]).to(self.device)
-            alone = BodyGraph.of_batch(one).to(dtype=torch.float64)
-            self._rest[mesh] = {name: getattr(alone, name) for name in _REST}
-        for name in _REST:
-            vars(bodies)[name] = torch.cat([self._rest[mesh][name] for mesh in meshes])
+    def _stored(self, found: Any) -> StoredWindows:
+        """A batch of samples on the device."""
+        meshes = found.mesh.tolist()
+        found = found.to(self.device, non_blocking=True)
+        positions, velocities, targets, predictions, forces = (
+            getattr(found, name).to(torch.float64)
+            for name in ("positions", "velocities", "targets", "predictions", "forces")
+        )
+        return StoredWindows(
+            self._bodies(found, meshes), positions, velocities, targets.transpose(0, 1),
+            predictions.transpose(0, 1), forces.transpose(0, 1), found.mesh, found.simulation,
+        )  # fmt: skip
+
+    def _bodies(self, found: Any, meshes: Sequence[int]) -> BodyGraph:
+        """The bodies of a batch, with what is computed of them at rest once for each mesh."""
+        for mesh in set(meshes) - self._known.keys():
+            self._known[mesh] = self._alone(self._first[mesh])
+        known = [self._known[mesh] for mesh in meshes]
+        bodies = replace(
+            BodyGraph.of_batch(found).to(dtype=torch.float64),
+            cell_size=torch.cat([body.cell_size for body in known]),
+        )
+        for name in KNOWN:
+            vars(bodies)[name] = torch.cat([getattr(body, name) for body in known])
         return bodies
 
-
-_REST = ("rest_inverses", "rest_frames", "rest_edges", "rest_turns")
-"""Cached properties of `BodyGraph`."""
+    def _alone(self, window: int) -> BodyGraph:
+        """The body of a window."""
+        found = self.dataset.batch([window]).to(self.device)
+        return BodyGraph.of_batch(found).to(dtype=torch.float64)
 
 
 class EndlessBatches:
@@ -199,46 +223,8 @@ class EndlessBatches:
         self._number, self._epoch = state["epoch"], None
 
 
-class _DeviceDataset(TrajectoryDataset):
-    """A data set whose decoded files are kept in a device's memory."""
-
-    _device: torch.device | None = None
-
-    def keep_on(self, device: torch.device, size: int) -> None:
-        """Keep all files, which take ``size`` bytes, on a device."""
-        self._device = device
-        self.cache_bytes = self._shards.limit = max(2 * size, self.cache_bytes)
-
-    def _load(self, number: int) -> Any:
-        shard = super()._load(number)
-        if self._device is None or self._device.type == "cpu":
-            return shard
-
-        def moved(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {name: x.to(self._device) for name, x in values.items()}
-
-        motions = [
-            replace(
-                motion,
-                positions=motion.positions.to(self._device),
-                velocities=motion.velocities.to(self._device),
-                steps=moved(motion.steps),
-                rollouts=moved(motion.rollouts),
-            )
-            for motion in shard.motions
-        ]
-        return replace(
-            shard,
-            nodal=moved(shard.nodal),
-            cellwise=moved(shard.cellwise),
-            cells=shard.cells.to(self._device),
-            edge_index=shard.edge_index.to(self._device),
-            motions=motions,
-        )
-
-
 def _fits(size: int, device: torch.device) -> bool:
-    if device.type != "cuda":
-        return False
-    free, _ = torch.cuda.mem_get_info(device)
-    return size < _SHARE_OF_DEVICE * free
+    """Whether so many bytes may be kept on a device."""
+    if device.type == "cuda":
+        return size < _SHARE_OF_DEVICE * torch.cuda.mem_get_info(device)[0]
+    return size <= CACHE_BYTES
