@@ -87,13 +87,11 @@ def without_momentum(view: View, correction: Tensor) -> Tensor:
     carries = bodies.free.all(dim=1, keepdim=True)
     mass = bodies.mass[:, None] * carries.to(correction.dtype)
     total = bodies.node_sums(mass)
-    total = torch.where(total > 0.0, total, 1.0)
-    r = view.snapshot.proposed - bodies.by_node(
-        bodies.node_sums(mass * view.snapshot.proposed) / total
-    )
-    impulse = mass * correction
-    mean = bodies.node_sums(impulse) / total
-    spin = bodies.node_sums(torch.linalg.cross(r, impulse))
+    share = mass / bodies.by_node(torch.where(total > 0.0, total, 1.0))  # exactly 1 of one node
+    centre = bodies.node_sums(share * view.snapshot.proposed)
+    r = view.snapshot.proposed - bodies.by_node(centre)
+    mean = bodies.node_sums(share * correction)
+    spin = bodies.node_sums(torch.linalg.cross(r, mass * correction))
     identity = torch.eye(3, dtype=r.dtype, device=r.device)
     outer = r[:, :, None] * r[:, None, :]
     moments = (r.square().sum(dim=1)[:, None, None] * identity - outer) * mass[..., None]
