@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.fused import rows_of, sums_of_rows
+from pdcorrect.batch.bodies import Bodies
+from pdcorrect.batch.fused import rows_of, sums, sums_of_rows
+from pdcorrect.batch.levels import places
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
 from pdcorrect.fem.problem import Problem
-
-_DIGITS = 11
-"""To which gradients of different cells count as equal."""
+from pdcorrect.fem.quadrature import Quadrature
 
 
 class Sizes(NamedTuple):
@@ -62,6 +62,8 @@ class CellBatch:
     Attributes
     ----------
     sizes : Sizes
+    bodies : Bodies
+        Of the scenes.
     node_counts : list of int
     present_nodes, present_cells : (B, N), (B, C) bool
         Which are a body's own, not padding.
@@ -80,26 +82,29 @@ class CellBatch:
             width,
             points,
         )
+        self.bodies = Bodies.of(problems)
+        distinct = self.bodies.distinct
+        self._owners = torch.as_tensor(self.bodies.owners, device=device)
         self.node_counts = [len(p.positions) for p in problems]
         self.mode_counts = [p.space.internal for p in problems]
         self.device, self.dtype = device, dtype
         n = self.sizes
-        self.rest = self.nodal([p.positions for p in problems])
-        local = [self._renumbered(p) for p in problems]
-        cells = padded(local, (n.cells, width))
-        offsets = np.arange(n.scenes)[:, None, None] * n.unknowns
-        self._cells = torch.as_tensor((cells + offsets).reshape(-1), device=device)
-        self._slots = torch.as_tensor(_slots(local, n), device=device)
-        shape = (n.cells, points)
-        present = padded([np.ones(len(p.cells)) for p in problems], (n.cells,))
-        self.present_cells = torch.as_tensor(present > 0.5, device=device)
-        present = padded([np.ones(count) for count in self.node_counts], (n.nodes,))
-        self.present_nodes = torch.as_tensor(present > 0.5, device=device)
-        volumes = [
-            padded([p.quadrature.weights for p in problems], shape),
-            padded([p.quadrature.volume_weights for p in problems], shape),
-        ]
-        self._volumes = self.tensor(np.stack(volumes)).reshape(2, -1)
+        self.rest = self.repeated([p.positions for p in distinct], n.unknowns, 3)
+        local = [self._renumbered(p) for p in distinct]
+        scene = torch.arange(n.scenes, device=device).reshape(-1, 1, 1)
+        cells = self._numbers(local, 0, n.cells, width)
+        self._cells = (cells + n.unknowns * scene).reshape(-1)
+        found = [places(cells, n.unknowns) for cells in local]
+        slots = self._numbers(found, -1, n.unknowns, max(table.shape[1] for table in found))
+        values = n.cells * width
+        slots = torch.where(slots < 0, n.scenes * values, slots + values * scene)
+        self._slots = slots.flatten(0, 1)
+        self.present_cells = self._first([len(p.cells) for p in problems], n.cells)
+        self.present_nodes = self._first(self.node_counts, n.nodes)
+        quadratures = [p.quadrature for p in distinct]
+        volumes = [[q.weights for q in quadratures], [q.volume_weights for q in quadratures]]
+        self._volumes = torch.stack([self.repeated(v, n.cells, points) for v in volumes])
+        self._volumes = self._volumes.reshape(2, -1)
         self._weights = torch.zeros_like(self._volumes)
         self._points = Points(
             first.materials.model,
@@ -108,7 +113,7 @@ class CellBatch:
             compiled=device.type == "cuda",
         )
         self._identity = torch.eye(3, dtype=dtype, device=device).reshape(9, 1)
-        self._gradients = self.tensor(_gradient_sets(problems, n))
+        self._gradients = self._gradient_sets(quadratures)
 
     def narrowed(self, rows: Tensor) -> CellBatch:
         """Of some scenes."""
@@ -120,8 +125,9 @@ class CellBatch:
         slots = torch.where(slots < last, shifted, len(rows) * n.cells * n.width)
         cells = self._cells.reshape(n.scenes, -1)[rows] + moved * n.unknowns
         return with_rows(
-            self, rows, "rest", "present_nodes", "present_cells", "_gradients",
+            self, rows, "rest", "present_nodes", "present_cells", "_gradients", "_owners",
             sizes=n._replace(scenes=len(rows)),
+            bodies=Bodies(self.bodies.distinct, self.bodies.owners[numbers]),
             node_counts=[self.node_counts[i] for i in numbers],
             mode_counts=[self.mode_counts[i] for i in numbers],
             _cells=cells.reshape(-1),
@@ -141,18 +147,52 @@ class CellBatch:
         return self.tensor(padded(arrays, (self.sizes.unknowns, *arrays[0].shape[1:])))
 
     def configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        """Configurations (N + B, 3) of the bodies, padded to (B, U, 3)."""
-        out = np.zeros((self.sizes.scenes, self.sizes.unknowns, 3))
-        for i, (array, nodes) in enumerate(zip(arrays, self.node_counts, strict=True)):
+        """Configurations (N + B, 3) of the scenes, padded to (B, U, 3)."""
+        return self._spread(arrays, self.node_counts)
+
+    def repeated(self, arrays: Sequence[NDArray[Any]], *shape: int) -> Tensor:
+        """An array of each of the ``bodies``, padded, for all scenes: (B, *shape)."""
+        return self._of_scenes(self.tensor(padded(arrays, shape)))
+
+    def repeated_configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
+        """Configurations (N + B, 3) of the ``bodies``, padded, for all scenes: (B, U, 3)."""
+        counts = [len(p.positions) for p in self.bodies.distinct]
+        return self._of_scenes(self._spread(arrays, counts))
+
+    def _spread(self, arrays: Sequence[NDArray[Any]], node_counts: Sequence[int]) -> Tensor:
+        out = np.zeros((len(arrays), self.sizes.unknowns, 3))
+        for i, (array, nodes) in enumerate(zip(arrays, node_counts, strict=True)):
             modes = array[nodes:]
             out[i, : len(array[:nodes])] = array[:nodes]
             out[i, self.sizes.nodes : self.sizes.nodes + len(modes)] = modes
         return self.tensor(out)
 
+    def _of_scenes(self, x: Tensor) -> Tensor:
+        """Rows of the bodies for all scenes."""
+        return x if len(x) == self.sizes.scenes else x[self._owners]
+
+    def _numbers(self, arrays: Sequence[NDArray[np.int64]], fill: int, *shape: int) -> Tensor:
+        """As `repeated`, of whole numbers."""
+        return self._of_scenes(torch.as_tensor(padded(arrays, shape, fill), device=self.device))
+
+    def _first(self, counts: Sequence[int], most: int) -> Tensor:
+        """Which of ``most`` come before a scene's count, (B, most) bool."""
+        numbers = torch.arange(most, device=self.device)
+        return numbers < torch.tensor(counts, device=self.device)[:, None]
+
     def _renumbered(self, problem: Problem) -> NDArray[np.int64]:
         nodes = len(problem.positions)
         local = problem.space.local
         return np.where(local < nodes, local, local + self.sizes.nodes - nodes)
+
+    def _gradient_sets(self, quadratures: Sequence[Quadrature]) -> Tensor:
+        """Gradients (B, L, 3 Q) where a scene's cells are all alike, else (B, C, L, 3 Q)."""
+        n = self.sizes
+        shape = (n.width, 3 * n.points)
+        if all(q.alike_gradients for q in quadratures):
+            return self.repeated([q.lanes[0].reshape(shape) for q in quadratures], *shape)
+        every = [q.lanes.reshape(len(q.lanes), *shape) for q in quadratures]
+        return self.repeated(every, n.cells, *shape)
 
     # --- energy ---------------------------------------------------------------------------
 
@@ -237,39 +277,13 @@ class CellBatch:
         flat = local.reshape(n.scenes * n.cells * n.width, 3)
         return sums_of_rows(flat, self._slots).reshape(n.scenes, n.unknowns, 3)
 
+    def summed_numbers(self, local: Tensor) -> Tensor:
+        """The same for one number (B, C, L) each, (B, U); not for work in every step."""
+        n = self.sizes
+        return sums(local.reshape(-1, 1), self._slots).reshape(n.scenes, n.unknowns)
+
     @property
     def _rows(self) -> tuple[int, ...]:
         """Leading shape of the products with gradients: by scene where its cells are alike."""
         n = self.sizes
         return (n.scenes, 3 * n.cells) if self._gradients.ndim == 3 else (n.scenes, n.cells, 3)
-
-
-def _slots(local: Sequence[NDArray[np.int64]], n: Sizes) -> NDArray[np.int64]:
-    """For each padded unknown the places (B U, most) in the raveled cells where it occurs."""
-    last = n.scenes * n.cells * n.width
-    rows, places = [], []
-    for i, cells in enumerate(local):
-        flat = cells.ravel()
-        order = np.argsort(flat, kind="stable")
-        rows.append(i * n.unknowns + flat[order])
-        places.append(i * n.cells * n.width + order)
-    row, place = np.concatenate(rows), np.concatenate(places)
-    counts = np.bincount(row, minlength=n.scenes * n.unknowns)
-    starts = np.cumsum(counts) - counts
-    out = np.full((n.scenes * n.unknowns, counts.max()), last)
-    out[row, np.arange(len(row)) - starts[row]] = place
-    return out
-
-
-def _gradient_sets(problems: Sequence[Problem], n: Sizes) -> NDArray[np.float64]:
-    """Gradients (B, L, 3 Q) where a scene's cells are all alike, else (B, C, L, 3 Q)."""
-    lanes = [p.quadrature.lanes for p in problems]
-    scale = [np.abs(a[0]).max() for a in lanes]
-    alike = all(
-        np.allclose(a, a[:1], rtol=0.0, atol=10.0**-_DIGITS * s)
-        for a, s in zip(lanes, scale, strict=True)
-    )
-    if alike:
-        return np.stack([a[0].reshape(n.width, 3 * n.points) for a in lanes])
-    return padded([a.reshape(len(a), n.width, 3 * n.points) for a in lanes],
-                  (n.cells, n.width, 3 * n.points))  # fmt: skip

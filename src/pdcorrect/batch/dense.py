@@ -66,7 +66,8 @@ class DenseInverse:
         for axis in range(self._axes):
             free = self._free[i].ravel() if self._width == 3 else self._free[i][:, axis]
             keep = torch.as_tensor(free.astype(np.float64), device=matrix.device)
-            held = matrix * keep[:, None] * keep + torch.diag(1.0 - keep)
+            held = matrix * keep[:, None] * keep
+            held.diagonal().add_(1.0 - keep)
             factor, info = torch.linalg.cholesky_ex(held)
             if int(info):
                 self._inverse[i] = 0.0

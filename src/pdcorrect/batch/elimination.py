@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,30 +11,27 @@ from torch import Tensor, cat
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.fused import small_products
 from pdcorrect.batch.narrowing import with_rows
-from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.quadrature import alike
 
 Array = NDArray[np.float64]
-
-_DIGITS = 11
-"""To which numbers of different cells count as equal."""
 
 
 def alike_cells(problem: Problem) -> bool:
     """Whether shape functions and material are the same in all cells of a body."""
     materials, quadrature = problem.materials, problem.quadrature
-    return all(
-        np.allclose(a, a[:1], rtol=0.0, atol=10.0**-_DIGITS * np.abs(a[0]).max())
-        for a in (
-            quadrature.lanes, quadrature.weights, quadrature.volume_weights,
+    return quadrature.alike_gradients and all(
+        alike(values)
+        for values in (
+            quadrature.weights, quadrature.volume_weights,
             materials.mu, materials.volume_weight, materials.density,
         )
     )  # fmt: skip
 
 
-def scalar_blocks(problem: Problem, stiffness: float, volume_scale: float, alike: bool) -> Array:
-    """The elastic part of G of each cell, (C, L, L), N/m; of one cell if they are alike."""
-    few = slice(1) if alike else slice(None)
+def scalar_blocks(problem: Problem, stiffness: float, volume_scale: float, one: bool) -> Array:
+    """The elastic part of G of each cell, (C, L, L), N/m; of ``one`` if they are alike."""
+    few = slice(1) if one else slice(None)
     weights, lanes = problem.point_weights[few], problem.quadrature.lanes[few]
     coefficient = stiffness * (2.0 * weights[:, 0] + volume_scale * weights[:, 1])
     rows = lanes.reshape(*lanes.shape[:2], -1)
@@ -43,20 +39,11 @@ def scalar_blocks(problem: Problem, stiffness: float, volume_scale: float, alike
     return np.asarray(rows @ scaled.swapaxes(1, 2))
 
 
-def rest_blocks(problem: Problem, stiffness: float, alike: bool) -> Array:
-    """The rest Hessian of each cell, (C, 3 L, 3 L), N/m; of one cell if they are alike."""
-    tangent = problem.linearise(problem.extended(problem.positions), project=True)
-    if alike:
-        quadrature = tangent.quadrature
-        tangent = replace(
-            tangent,
-            assembly=Assembly(tangent.assembly.cells[:1], problem.unknowns),
-            quadrature=replace(quadrature, lanes=quadrature.lanes[:1]),
-            left=tangent.left[:1],
-            right=tangent.right[:1],
-            tangent=tangent.tangent[:1],
-        )
-    blocks = stiffness * tangent.blocks()
+def rest_blocks(problem: Problem, stiffness: float, one: bool) -> Array:
+    """The rest Hessian of each cell, (C, 3 L, 3 L), N/m; of ``one`` if they are alike."""
+    few = slice(1) if one else slice(None)
+    rest = problem.extended(problem.positions)
+    blocks = stiffness * problem.linearise(rest, project=True, cells=few).blocks()
     count, width = blocks.shape[:2]
     return np.ascontiguousarray(blocks.swapaxes(2, 3)).reshape(count, 3 * width, 3 * width)
 

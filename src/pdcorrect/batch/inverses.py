@@ -136,10 +136,11 @@ class FirstHessian:
         self._rotations: list[Tensor] = []
         if self._turned:
             n = cells.sizes
-            self._turning = Turning(cells, problems)
+            self._turning = Turning(cells)
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
-        self._free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
+        every = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
+        self._free = cells.repeated_configurations(every)
 
     def _filled(self, solver: DenseInverse, mass_factor: float) -> list[bool]:
         regular = []

@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.fem.problem import Problem
+from pdcorrect.batch.cells import CellBatch
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame
 
@@ -45,20 +44,20 @@ class BatchMaterial:
         return self.young, self.poisson, self.density
 
 
-def own_material(cells: CellBatch, problems: Sequence[Problem]) -> BatchMaterial:
+def own_material(cells: CellBatch) -> BatchMaterial:
     """What the problems have."""
 
     def tensor(arrays: Sequence[NDArray[np.float64]]) -> Tensor:
-        return cells.tensor(padded(arrays, (cells.sizes.cells,)))
+        return cells.repeated(arrays, cells.sizes.cells)
 
-    every = [p.materials for p in problems]
+    every = [p.materials for p in cells.bodies.distinct]
     return BatchMaterial(
         tensor([m.young for m in every]),
         tensor([m.poisson for m in every]),
         tensor([m.density for m in every]),
         tensor([m.mu for m in every]),
         tensor([m.volume_weight for m in every]),
-        torch.ones(len(every), dtype=torch.bool, device=cells.device),
+        torch.ones(cells.sizes.scenes, dtype=torch.bool, device=cells.device),
     )
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.fused import small_products
 from pdcorrect.batch.narrowing import with_rows
-from pdcorrect.fem.problem import Problem
 
 
 class BatchMass:
@@ -25,13 +22,14 @@ class BatchMass:
         kg/m3.
     """
 
-    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
+    def __init__(self, cells: CellBatch) -> None:
         self._cells = cells
         n = cells.sizes
-        nodes = problems[0].cells.shape[1]
-        blocks = [p.space.cell_masses(p.mass_rule) for p in problems]
-        self._blocks = cells.tensor(padded(blocks, (n.cells, nodes, nodes)))
-        self._diagonal = all(p.mass_is_diagonal for p in problems)
+        distinct = cells.bodies.distinct
+        nodes = distinct[0].cells.shape[1]
+        blocks = [p.space.cell_masses(p.mass_rule) for p in distinct]
+        self._blocks = cells.repeated(blocks, n.cells, nodes, nodes)
+        self._diagonal = all(p.mass_is_diagonal for p in distinct)
         self.density = cells.rest.new_zeros(n.scenes, n.cells)
         self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
 
@@ -43,8 +41,8 @@ class BatchMass:
         """Densities (B, C), kg/m3, from now on."""
         self.density.copy_(density)
         rows = self._blocks.sum(dim=-1) * self.density[..., None]
-        local = self._filled(rows[..., None].expand(-1, -1, -1, 3))
-        self.nodal.copy_(self._cells.summed(local)[..., 0])
+        local = self._filled(rows[..., None])[..., 0]
+        self.nodal.copy_(self._cells.summed_numbers(local))
 
     def __call__(self, x: Tensor) -> Tensor:
         if self._diagonal:
@@ -87,11 +85,12 @@ class BatchObjective:
         q, o (m) and the external forces (N).
     """
 
-    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
+    def __init__(self, cells: CellBatch) -> None:
         self.cells = cells
-        self.mass = BatchMass(cells, problems)
+        self.mass = BatchMass(cells)
         self.inertia = self.damping = 0.0
-        self.free = cells.configurations([np.where(p.free_unknowns, 1.0, 0.0) for p in problems])
+        free = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
+        self.free = cells.repeated_configurations(free)
         self.target, self.origin, self.forces = (torch.zeros_like(cells.rest) for _ in range(3))
 
     def narrowed(self, rows: Tensor) -> BatchObjective:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.bodies import Bodies
 from pdcorrect.fem.problem import Problem
 
 
@@ -27,13 +28,15 @@ class Sharing:
     def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
         seen: dict[bytes, int] = {}
         self.distinct: list[Problem] = []
-        self.owners: list[int] = []
-        for problem in problems:
+        bodies = Bodies.of(problems)
+        kinds = []
+        for problem in bodies.distinct:
             key = _key(problem)
             if key not in seen:
                 seen[key] = len(self.distinct)
                 self.distinct.append(problem)
-            self.owners.append(seen[key])
+            kinds.append(seen[key])
+        self.owners: list[int] = [kinds[body] for body in bodies.owners]
         self._arrange(device)
 
     def narrowed(self, rows: Tensor) -> tuple[Sharing, list[int]]:

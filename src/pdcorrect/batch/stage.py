@@ -59,10 +59,10 @@ class BatchStaging:
     ) -> None:
         self._cells, self._problems = cells, problems
         self._integrate, self._h = integrate, time_step
-        self._moving = any(p.clamps.moving for p in problems)
-        self._clamped = self._held([0.0] * len(problems))
-        self.free = cells.nodal([p.free.astype(float) for p in problems])[:, : cells.sizes.nodes]
-        self.free = self.free > 0.5
+        distinct, nodes = cells.bodies.distinct, cells.sizes.nodes
+        self._moving = any(p.clamps.moving for p in distinct)
+        self._clamped = cells.repeated([p.clamped_positions(0.0) for p in distinct], nodes, 3)
+        self.free = cells.repeated([p.free.astype(float) for p in distinct], nodes, 3) > 0.5
 
     def extended(self, nodal: Tensor) -> Tensor:
         """(B, N, 3) as configurations (B, U, 3)."""

@@ -131,8 +131,8 @@ class BatchStepper:
         self._most = whole("max_iterations", max_iterations, 1)
         self.cells = CellBatch(self.problems, usable_device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
-        self.objective = BatchObjective(self.cells, self.problems)
-        self._own = self._material = own_material(self.cells, self.problems)
+        self.objective = BatchObjective(self.cells)
+        self._own = self._material = own_material(self.cells)
         self._write(self._own)
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
         self.staging = BatchStaging(self.cells, self.problems, self.integrate, self.time_step)
@@ -175,7 +175,9 @@ class BatchStepper:
 
     def rest_state(self) -> BatchState:
         """All scenes at rest at time zero."""
-        return self.state([p.rest_state() for p in self.problems])
+        positions = self.cells.rest[:, : self.cells.sizes.nodes].clone()
+        times = start_times(self.cells, None)
+        return BatchState(positions, torch.zeros_like(positions), times)
 
     def states(
         self,

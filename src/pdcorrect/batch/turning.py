@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.narrowing import with_rows
-from pdcorrect.fem.problem import Problem
 
 
 class Turning:
     """How nodes and modes have turned since rest, as `first_hessian.Rotations`."""
 
-    def __init__(self, cells: CellBatch, problems: Sequence[Problem]) -> None:
+    def __init__(self, cells: CellBatch) -> None:
         self._cells = cells
         n = cells.sizes
-        shares = [
-            p.quadrature.weights / p.quadrature.weights.sum(axis=1, keepdims=True) for p in problems
-        ]
-        self._shares = cells.tensor(padded(shares, (n.cells, n.points)))
-        held = [~p.free.all(axis=1) for p in problems]
-        self._held = cells.nodal([np.where(h, 1.0, 0.0) for h in held]) > 0.5
-        self._nodes = problems[0].cells.shape[1]
+        distinct = cells.bodies.distinct
+        weights = [p.quadrature.weights for p in distinct]
+        shares = [w / w.sum(axis=1, keepdims=True) for w in weights]
+        self._shares = cells.repeated(shares, n.cells, n.points)
+        held = [np.where(p.free.all(axis=1), 0.0, 1.0) for p in distinct]
+        self._held = cells.repeated(held, n.unknowns) > 0.5
 
     def narrowed(self, cells: CellBatch, rows: Tensor) -> Turning:
         """Of some scenes, with their cells."""

@@ -143,20 +143,28 @@ class ElasticBody:
         )
         return out
 
-    def linearise(self, configuration: Array, project: bool = False) -> Linearisation:
+    def linearise(
+        self, configuration: Array, project: bool = False, cells: slice = slice(None)
+    ) -> Linearisation:
         """The tangent at a configuration, ready to be applied or assembled.
 
-        ``project`` raises negative eigenvalues at each quadrature point to zero.
+        ``project`` raises negative eigenvalues at each quadrature point to zero; ``cells``
+        are those that it is of.
         """
-        count, lanes = self.quadrature.weights.shape
+        if cells == slice(None):
+            assembly, quadrature = self.assembly, self.quadrature
+        else:
+            assembly = Assembly(self.space.local[cells], self.unknowns)
+            quadrature = self.quadrature.of_cells(cells)
+        count, lanes = quadrature.weights.shape
         left, right = np.empty((count, 9, lanes)), np.empty((count, 9, lanes))
         tangent = np.empty((count, 12, lanes))
         kernels.linearise_cells(
-            self.materials.model, self._displacement(configuration), self.space.local,
-            self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
+            self.materials.model, self._displacement(configuration), assembly.cells,
+            quadrature.lanes, self.point_weights[cells], quadrature.first_volume,
             project, left, right, tangent,
         )  # fmt: skip
-        return Linearisation(self.assembly, self.quadrature, left, right, tangent)
+        return Linearisation(assembly, quadrature, left, right, tangent)
 
     def laplacian(self, volume_scale: float = 1.0) -> sp.csr_matrix:
         """Sum (2 mu + s omega) w D^T D, (N + B, N + B), N/m: the stiffness in G (eq. 3-14).

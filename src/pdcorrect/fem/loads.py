@@ -272,7 +272,9 @@ class _CellTorsion:
     inside: Array
 
     def sample(self, positions: Array) -> Array:
-        return self.space.body_load(self.field(self.space.interpolate(positions)) * self.inside)
+        at_rest = positions is self.space.positions
+        points = self.space.points if at_rest else self.space.interpolate(positions)
+        return self.space.body_load(self.field(points) * self.inside)
 
     def pull(self, positions: Array, x: Array) -> Array:
         space = self.space
@@ -306,5 +308,4 @@ _SAMPLERS: dict[type, Callable[..., Sampler]] = {
 def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:
     inside = np.zeros(len(space.cells))
     inside[cells] = 1.0
-    shape = (*space.interpolate(space.positions).shape[:2], 3)
-    return space.body_load(np.broadcast_to(density, shape) * inside[:, None, None])
+    return space.body_load(np.broadcast_to(density, space.points.shape) * inside[:, None, None])

@@ -7,6 +7,7 @@ above, then the top face 4-5-6-7).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -69,10 +70,12 @@ class HexMesh:
         check_connections(positions, cells)
         return cls(positions, cells, np.arange(len(positions)))
 
-    @property
+    @cached_property
     def centres(self) -> NDArray[np.float64]:
         """Mean of each cell's corners, (C, 3)."""
-        return self.positions[self.cells].mean(axis=1)
+        centres = self.positions[self.cells].mean(axis=1)
+        centres.flags.writeable = False
+        return np.asarray(centres)
 
     @property
     def bounds(self) -> NDArray[np.float64]:

@@ -7,13 +7,15 @@ corners; both are converted here and nowhere else.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
-from skfem import Basis, BilinearForm, ElementHex1, ElementHex2, FacetBasis, LinearForm, MeshHex1
-from skfem.element import Element
+from skfem import Basis, BilinearForm, ElementHex1, ElementHex2, FacetBasis, MeshHex1
+from skfem.element import DiscreteField, Element
+from skfem.mapping import MappingIsoparametric
+from skfem.quadrature import get_quadrature
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
@@ -59,9 +61,41 @@ def _density_product(u, v, w):  # type: ignore[no-untyped-def]
     return w.density * u * v
 
 
-@LinearForm
-def _load_component(v, w):  # type: ignore[no-untyped-def]
-    return w.load * v
+class _Mapping(MappingIsoparametric):  # type: ignore[misc]
+    """Keeps its inverse Jacobians (3, 3, C, Q), which a basis asks for with each function."""
+
+    def __init__(self, mesh: MeshHex1) -> None:
+        super().__init__(mesh, mesh.elem(), mesh.bndelem)
+        self._last: tuple[Array, Array] | None = None
+
+    def invDF(self, X: Array, tind: Any = None) -> Array:
+        """See scikit-fem."""
+        if tind is not None:
+            return np.asarray(super().invDF(X, tind))
+        if self._last is None or self._last[0] is not X:
+            self._last = (X, np.asarray(super().invDF(X)))
+        return self._last[1]
+
+    def forget(self) -> None:
+        """Free that memory."""
+        self._last = None
+
+
+class _Values:
+    """What forms without gradients need of a `skfem.Basis`, by another quadrature."""
+
+    def __init__(self, basis: Basis, order: int) -> None:
+        self.X, weights = get_quadrature(basis.mesh.refdom, order)
+        self.dx = np.abs(basis.mapping.detDF(self.X)) * weights
+        self.shapes = np.stack([basis.elem.lbasis(self.X, k)[0] for k in range(basis.Nbfun)])
+        fields = [DiscreteField(np.broadcast_to(v, self.dx.shape)) for v in self.shapes]
+        self.basis = [(field,) for field in fields]
+        self.element_dofs, self.N = basis.element_dofs, basis.N
+        self.Nbfun, self.nelems = basis.Nbfun, basis.nelems
+
+    def default_parameters(self) -> dict[str, Any]:
+        """See scikit-fem: places and sizes of cells, which no form here reads."""
+        return {}
 
 
 class Space:
@@ -94,7 +128,9 @@ class Space:
             np.ascontiguousarray(mesh.positions.T), np.ascontiguousarray(skfem_cells.T)
         )
         self._corners = mesh.positions[mesh.cells]
-        self._basis = Basis(self._mesh, self._element, intorder=self._kind.order)
+        mapping = _Mapping(self._mesh)
+        self._basis = Basis(self._mesh, self._element, mapping, intorder=self._kind.order)
+        mapping.forget()
         self.positions: Array = np.ascontiguousarray(self._basis.doflocs.T)
         self.cells: NDArray[np.int64] = np.ascontiguousarray(
             self._basis.element_dofs[self._to_vtk].T, dtype=np.int64
@@ -117,9 +153,13 @@ class Space:
 
     def mass(self, density: Array) -> sp.csr_matrix:
         """Consistent mass, integral of density u v, (N, N), kg; ``density`` is (C,)."""
-        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
+        basis = self._mass_basis
         per_point = np.broadcast_to(density[:, None], basis.dx.shape)
         return sp.csr_matrix(_density_product.assemble(basis, density=per_point))
+
+    @cached_property
+    def _mass_basis(self) -> _Values:
+        return _Values(self._basis, self._kind.mass_order)
 
     def cell_masses(self, rule: str) -> Array:
         """Each cell's share of the mass matrix at density 1, (C, K, K), m3, by `mass_matrix`."""
@@ -134,9 +174,8 @@ class Space:
 
     @cached_property
     def _consistent_cell_masses(self) -> Array:
-        basis = Basis(self._mesh, self._element, intorder=self._kind.mass_order)
-        values = np.stack([np.asarray(basis.basis[k][0])[0] for k in self._to_vtk])
-        masses = np.einsum("cq,kq,lq->ckl", basis.dx, values, values, optimize=True)
+        dx, values = self._mass_basis.dx, self._mass_basis.shapes[self._to_vtk]
+        masses = np.einsum("cq,kq,lq->ckl", dx, values, values, optimize=True)
         masses.flags.writeable = False
         return masses
 
@@ -151,10 +190,12 @@ class Space:
 
     def body_load(self, density: Array) -> Array:
         """Nodal forces (N, 3), N, of a force density (C, Q, 3), N/m3, at the quadrature points."""
-        columns = [
-            _load_component.assemble(self._basis, load=np.ascontiguousarray(density[..., i]))
-            for i in range(3)
-        ]
+        load = np.ascontiguousarray(np.moveaxis(density, 2, 1))  # (C, 3, Q)
+        dx = self._basis.dx[:, None]
+        shapes = self._shapes[np.argsort(self._to_vtk)]
+        by_shape = [(load * v * dx).sum(axis=2) for v in shapes]  # K x (C, 3)
+        nodes = self._basis.element_dofs.ravel()
+        columns = [np.bincount(nodes, values) for values in np.concatenate(by_shape).T]
         return np.stack(columns, axis=1)
 
     def body_load_transposed(self, nodal: Array) -> Array:
@@ -163,14 +204,24 @@ class Space:
 
     def interpolate_transposed(self, values: Array) -> Array:
         """Derivatives (N, 3) of values . `interpolate` by the nodal field, for (C, Q, 3)."""
-        shapes = np.stack([np.asarray(self._basis.basis[k][0])[0] for k in self._to_vtk])
-        cells = np.einsum("cqi,kq->cki", values, shapes, optimize=True)
+        cells = np.einsum("cqi,kq->cki", values, self._shapes, optimize=True)
         return scatter(self.cells, cells, len(self.positions))
 
     def interpolate(self, nodal: Array) -> Array:
         """Values (C, Q, 3) at the quadrature points of a nodal field (N, 3)."""
-        values = np.stack([np.asarray(self._basis.basis[k][0])[0] for k in self._to_vtk])
-        return np.einsum("cki,kq->cqi", nodal[self.cells], values, optimize=True)
+        return np.einsum("cki,kq->cqi", nodal[self.cells], self._shapes, optimize=True)
+
+    @cached_property
+    def points(self) -> Array:
+        """The quadrature points at rest, (C, Q, 3), m."""
+        points = self.interpolate(self.positions)
+        points.flags.writeable = False
+        return points
+
+    @cached_property
+    def _shapes(self) -> Array:
+        """Shape functions at the quadrature points, (K, Q)."""
+        return np.stack([np.asarray(self._basis.basis[k][0])[0] for k in self._to_vtk])
 
     def face_quadrature(self, faces: NDArray[np.int64]) -> FaceQuadrature:
         """Quadrature on the boundary faces with corner nodes ``faces`` (n, 4)."""

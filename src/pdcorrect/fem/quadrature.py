@@ -18,6 +18,7 @@ on the frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,6 +27,16 @@ from numpy.typing import NDArray
 from pdcorrect.fem.hexahedron import shape_derivatives
 
 Array = NDArray[np.float64]
+
+
+_DIGITS = 11
+"""To which numbers of different cells count as equal."""
+
+
+def alike(values: Array) -> bool:
+    """Whether the numbers (C, ...) of all cells are the first one's, up to rounding."""
+    error = 10.0**-_DIGITS * np.abs(values[0]).max()
+    return bool(np.abs(values - values[:1]).max() <= error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +66,20 @@ class Quadrature:
     def gradients(self) -> Array:
         """The gradients, (C, Q, L, 3), 1/m: a view of ``lanes``."""
         return np.moveaxis(self.lanes, 3, 1)
+
+    @cached_property
+    def alike_gradients(self) -> bool:
+        """Whether the gradients are the same in all cells, see `alike`."""
+        return alike(self.lanes)
+
+    def of_cells(self, cells: slice) -> Quadrature:
+        """Of some cells."""
+        return replace(
+            self,
+            lanes=self.lanes[cells],
+            weights=self.weights[cells],
+            volume_weights=self.volume_weights[cells],
+        )
 
     def with_mean_volume(self) -> Quadrature:
         """The volume term moved to one more point with the cell's mean gradients."""
