@@ -22,6 +22,7 @@ from pdcorrect.data.generate import Workers, generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.statistics import compute_statistics
+from pdcorrect.progress import FileLines
 from pdcorrect.replacement import make_folder, write_text
 
 HERE = Path(__file__).parent
@@ -51,10 +52,11 @@ def main() -> None:
             continue
         started = time.monotonic()
         config = DatasetConfig.load(HERE / name / CONFIG)
-        complete = generate(config, options.folder / name, workers, seconds=left)
-        print(
-            f"{name}: {time.monotonic() - started:.0f} s, {'complete' if complete else 'cut off'}"
-        )
+        print(name, flush=True)
+        target = options.folder / name
+        complete = generate(config, target, workers, seconds=left, on_file=FileLines())
+        seconds = time.monotonic() - started
+        print(f"{name}: {seconds:.0f} s, {'complete' if complete else 'cut off'}", flush=True)
         if complete:
             summarise(options.folder / name, options.summaries / name)
 

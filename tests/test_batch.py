@@ -13,6 +13,7 @@ import torch
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
 from pdcorrect.batch import decomposition, minimise
+from pdcorrect.batch.bodies import Bodies
 from pdcorrect.batch.cells import Sizes
 from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.points import Points
@@ -214,6 +215,42 @@ def test_company_and_order_do_not_matter(device):
     )
     for i, state in zip(order, some, strict=True):
         assert furthest(whole[i], state) < 1e-9
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_scenes_that_differ_by_loads_alone_step_as_if_they_shared_nothing(element):
+    """To the bit: what is computed once for them is what each would have by itself."""
+    scenes = [unlike(seed, element) for seed in (1, 5, 9)]  # two kinds of clamps, three sizes
+    others = [{"kind": "gravity", "acceleration": a} for a in ([3.0, -7.0, 1.0], [0.0, 2.0, 9.0])]
+    settings = {"mass": "averaged", "tolerance": 1e-4}
+    scenes = [s.with_changes(solver={**settings, "element": element}) for s in scenes]
+    pairs = [(s, loads) for s in scenes for loads in (list(s.loads), others[:1], others[1:])]
+    own = [pc.discretise(s) for s in scenes]
+    shared = [own[i // 3].with_loads(loads) for i, (_, loads) in enumerate(pairs)]
+    apart = [pc.discretise(s.with_changes(loads=loads)) for s, loads in pairs]
+    order = [4, 0, 8, 1, 3, 7, 2, 6, 5]
+    one, other = (pc.BatchStepper([p[i] for i in order]) for p in (shared, apart))
+    assert len(one.cells.bodies.distinct) == 3
+    assert len(other.cells.bodies.distinct) == 9
+    states = moving_states(shared)
+    a, b = (stepper(stepper.state([states[i] for i in order])) for stepper in (one, other))
+    assert torch.equal(a.y, b.y)
+    assert (a.iterations == b.iterations).all()
+    assert torch.equal(one.objective.mass.nodal, other.objective.mass.nodal)
+    rows = torch.tensor([1, 5, 6])
+    y = a.y[rows]
+    found, expected = (s.objective.narrowed(rows)(y) for s in (one, other))
+    assert all(torch.equal(x, z) for x, z in zip(found, expected, strict=True))
+
+
+def test_bodies_with_other_materials_or_mass_rules_are_not_one():
+    problem = pc.discretise(unlike(1))
+    twins = [problem, problem.with_loads([]), problem.with_material(density=900.0)]
+    found = Bodies.of([*twins, pc.discretise(unlike(1)), problem])
+    assert found.owners.tolist() == [0, 0, 1, 2, 0]
+    assert [p is q for p, q in zip(found.distinct, (twins[0], twins[2]), strict=False)] == [
+        True
+    ] * 2
 
 
 def test_scenes_with_the_same_matrix_share_one_inverse():

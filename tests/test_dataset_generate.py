@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -24,6 +25,7 @@ from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
+from pdcorrect.progress import FileLines
 from pdcorrect.replacement import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
@@ -45,7 +47,7 @@ def generated(tmp_path_factory):
     config = small()
     assert generate(config, folder, on_file=lambda *row: seen.append(row))
     names = [plan.name for plan in make_plan(config)]
-    assert seen == [(name, done, 4) for name, done in zip(names, (1, 3, 4), strict=True)]
+    assert seen == [(name, done, 4, done) for name, done in zip(names, (1, 3, 4), strict=True)]
     return config, folder
 
 
@@ -228,9 +230,35 @@ def test_a_damaged_file_is_made_again_and_a_whole_one_is_not(generated, tmp_path
     data[len(data) // 2] ^= 1
     target.write_bytes(data)
     done = []
-    assert generate(config, tmp_path, on_file=lambda name, *_: done.append(name))
-    assert done == ["training/mesh-0001"]
+    assert generate(config, tmp_path, on_file=lambda *row: done.append(row))
+    (there,) = (p.simulations for p in make_plan(config) if p.name == "training/mesh-0001")
+    assert done == [("training/mesh-0001", 4, 4, there)]
     assert hashes(tmp_path) == hashes(folder)
+
+
+def test_without_a_terminal_the_program_prints_a_line_for_each_file(program, tmp_path):
+    config = small()
+    path, folder = tmp_path / "set.toml", tmp_path / "set"
+    path.write_text(config.to_toml())
+    status, out, _ = program("dataset", "generate", path, "-o", folder)
+    *lines, last = out.splitlines()
+    assert status == 0
+    assert last == f"{folder}: complete"
+    for line, plan, done in zip(lines, make_plan(config), (1, 3, 4), strict=True):
+        text = rf"\d+ s: {plan.name}, {done} of 4 simulations, about \d+ s left"
+        assert re.fullmatch(text, line)
+    assert lines[-1].endswith("about 0 s left")
+
+
+def test_the_rest_is_estimated_from_what_was_computed_since_the_start(monkeypatch, capsys):
+    now = 100.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    on_file = FileLines()
+    now += 30.0
+    on_file("training/mesh-0007", 90, 120, 10)  # 80 were there before
+    assert capsys.readouterr().out == (
+        "30 s: training/mesh-0007, 90 of 120 simulations, about 90 s left\n"
+    )
 
 
 def test_another_configuration_may_not_use_the_folder(generated):

@@ -12,6 +12,7 @@ from pdcorrect.fem.mesh import (
     VTK_EDGES,
     VTK_FACES,
     HexMesh,
+    _distinct_rows,
     boundary_faces,
     coincident_nodes,
     corner_jacobians,
@@ -186,3 +187,11 @@ def test_bad_meshes_are_refused_with_the_place():
         HexMesh.create(mesh.positions, mesh.cells + len(mesh.positions))
     with pytest.raises(MeshError, match="no coincident node"):
         coincident_nodes(mesh.positions, mesh.positions + 0.01, 1e-9)
+
+
+def test_distinct_rows_are_those_of_numpy_in_its_order():
+    rows = np.random.default_rng(0).integers(0, 3, (500, 4))
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    found = _distinct_rows(rows)
+    assert (found[0] == first).all()
+    assert (found[1] == inverse.ravel()).all()

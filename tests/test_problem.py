@@ -2,6 +2,14 @@
 
 import numpy as np
 import pytest
+from skfem import (
+    Basis,
+    BilinearForm,
+    ElementHex1,
+    ElementHex2,
+    LinearForm,
+    MeshHex1,
+)
 
 import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
@@ -9,6 +17,7 @@ from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.fields import cofactor, torsion_field
 from pdcorrect.fem.materials import Materials
+from pdcorrect.fem.mesh import VTK_CORNERS
 from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import problem_from_body
 from test_mesh import distorted_mesh
@@ -490,3 +499,39 @@ def test_discretise_overrides_and_checks():
         pc.discretise(beam(), refine=0)
     with pytest.raises(SceneError, match="hex99"):
         pc.discretise(beam(), element="hex99")
+
+
+@BilinearForm
+def weighted_product(u, v, w):
+    return w.density * u * v
+
+
+@LinearForm
+def work(v, w):
+    return w.load * v
+
+
+@pytest.mark.parametrize(("element", "shape", "order"), [
+    ("hex8", ElementHex1, (3, 5)), ("hex27", ElementHex2, (5, 7)),
+])  # fmt: skip
+def test_masses_and_body_loads_are_those_of_scikit_fem_to_the_bit(element, shape, order):
+    mesh = distorted_mesh()
+    space = Space(mesh, element)
+    rng = np.random.default_rng(3)
+    density = rng.uniform(1.0, 2.0, len(mesh.cells))
+    order_of_corners = np.abs(
+        VTK_CORNERS[:, None] - ElementHex1().doflocs[None]
+    ).max(axis=-1).argmin(axis=1)  # fmt: skip
+    cells = np.empty_like(mesh.cells)
+    cells[:, order_of_corners] = mesh.cells
+    plain = MeshHex1(np.ascontiguousarray(mesh.positions.T), np.ascontiguousarray(cells.T))
+    load_basis, mass_basis = (Basis(plain, shape(), intorder=n) for n in order)
+    per_point = np.broadcast_to(density[:, None], mass_basis.dx.shape)
+    expected = weighted_product.assemble(mass_basis, density=per_point)
+    assert abs(space.mass(density) - expected).max() == 0.0
+    load = rng.normal(size=(*load_basis.dx.shape, 3))
+    columns = [work.assemble(load_basis, load=np.ascontiguousarray(load[..., i])) for i in range(3)]
+    assert (space.body_load(load) == np.stack(columns, axis=1)).all()
+    gradients = np.stack([f[0].grad for f in load_basis.basis])  # K x (3, C, Q), its order
+    found = np.moveaxis(space.quadrature().lanes, (1, 2), (0, 1))
+    assert (np.sort(found, axis=0) == np.sort(gradients, axis=0)).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -175,14 +176,17 @@ def import_(
 
 
 @contextlib.contextmanager
-def _simulations() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar with the time that is left, on a terminal or in a log."""
-    from pdcorrect.progress import progress_bar
+def _simulations() -> Iterator[Callable[[str, int, int, int], None]]:
+    """A bar with the time that is left; where there is no terminal, a line for each file."""
+    from pdcorrect.progress import FileLines, progress_bar
 
+    if not sys.stdout.isatty():
+        yield FileLines()
+        return
     with progress_bar("simulations", apart=True) as progress:
         task = progress.add_task("generating", total=None)
 
-        def on_file(name: str, done: int, total: int) -> None:
+        def on_file(name: str, done: int, total: int, new: int) -> None:
             progress.update(task, completed=done, total=total, description=name)
 
         yield on_file

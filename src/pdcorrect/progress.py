@@ -1,7 +1,8 @@
-"""Progress bars of the command line, on a terminal or in a log."""
+"""Progress of the command line: bars on a terminal, lines in a log."""
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 
@@ -33,3 +34,22 @@ def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), disable=hidden,
         console=Console(stderr=apart),
     )  # fmt: skip
+
+
+class FileLines:
+    """Prints a line for each finished file of a data set, for logs: see `OnFile`.
+
+    Seconds since the start, the file, simulations that are there of all, and the seconds that
+    the rest takes at the pace until now.
+    """
+
+    def __init__(self) -> None:
+        self._started = time.monotonic()
+
+    def __call__(self, name: str, done: int, total: int, new: int) -> None:
+        elapsed = time.monotonic() - self._started
+        rest = elapsed / new * (total - done)
+        print(
+            f"{elapsed:.0f} s: {name}, {done} of {total} simulations, about {rest:.0f} s left",
+            flush=True,
+        )

@@ -278,9 +278,10 @@ class CellBatch:
         return sums_of_rows(flat, self._slots).reshape(n.scenes, n.unknowns, 3)
 
     def summed_numbers(self, local: Tensor) -> Tensor:
-        """The same for one number (B, C, L) each, (B, U); not for work in every step."""
+        """Numbers (B, C, L) of cells summed at the nodes, (B, N); not for work in every step."""
         n = self.sizes
-        return sums(local.reshape(-1, 1), self._slots).reshape(n.scenes, n.unknowns)
+        slots = self._slots.reshape(n.scenes, n.unknowns, -1)[:, : n.nodes].flatten(0, 1)
+        return sums(local.reshape(-1, 1), slots).reshape(n.scenes, n.nodes)
 
     @property
     def _rows(self) -> tuple[int, ...]:

@@ -66,13 +66,13 @@ class DenseInverse:
         for axis in range(self._axes):
             free = self._free[i].ravel() if self._width == 3 else self._free[i][:, axis]
             keep = torch.as_tensor(free.astype(np.float64), device=matrix.device)
-            held = matrix * keep[:, None] * keep
+            held = (matrix * keep[:, None]).mul_(keep)
             held.diagonal().add_(1.0 - keep)
             factor, info = torch.linalg.cholesky_ex(held)
             if int(info):
                 self._inverse[i] = 0.0
                 return False
-            inverse = torch.cholesky_inverse(factor) * keep[:, None] * keep
+            inverse = torch.cholesky_inverse(factor).mul_(keep[:, None]).mul_(keep)
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
         return True
 

@@ -58,11 +58,16 @@ def _rows(u: Tensor, numbers: Tensor) -> Tensor:
 def sums(values: Tensor, numbers: Tensor) -> Tensor:
     """`sums_of_rows` as part of a larger kernel."""
     count = len(values)
-    terms = []
-    for column in numbers.unbind(dim=1):
+
+    def term(column: Tensor) -> Tensor:
         row = values[torch.clamp(column, max=count - 1)]
-        terms.append(torch.where((column < count)[:, None], row, 0.0))
-    return _sum(terms)
+        return torch.where((column < count)[:, None], row, 0.0)
+
+    first, *others = numbers.unbind(dim=1)
+    total = term(first)
+    for column in others:
+        total = total + term(column)
+    return total
 
 
 def _sum(terms: list[Tensor]) -> Tensor:

@@ -42,7 +42,7 @@ class BatchMass:
         self.density.copy_(density)
         rows = self._blocks.sum(dim=-1) * self.density[..., None]
         local = self._filled(rows[..., None])[..., 0]
-        self.nodal.copy_(self._cells.summed_numbers(local))
+        self.nodal[:, : self._cells.sizes.nodes] = self._cells.summed_numbers(local)
 
     def __call__(self, x: Tensor) -> Tensor:
         if self._diagonal:

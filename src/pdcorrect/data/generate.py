@@ -47,8 +47,10 @@ such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 n
 """
 _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
-OnFile = Callable[[str, int, int], None]
-"""Called with a finished file's name, and how many simulations of how many are there now."""
+OnFile = Callable[[str, int, int, int], None]
+"""Called with a finished file's name, how many simulations of how many are there now, and how
+many of them are new since the generation was started.
+"""
 
 
 @dataclass(frozen=True)
@@ -123,11 +125,12 @@ def generate(
     units = _units(missing, workers)
     deadline = None if seconds is None else time.monotonic() + seconds
     total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
+    begun = left
     for unit in _compute(config, folder, units, workers, deadline):
         for plan in unit:
             left -= plan.simulations
             if on_file:
-                on_file(plan.name, total - left, total)
+                on_file(plan.name, total - left, total, begun - left)
     for plan in plans:
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)

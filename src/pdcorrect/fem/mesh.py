@@ -177,13 +177,23 @@ def _lattice(
     order = np.argsort(corner, axis=-1)
     corner = np.take_along_axis(corner, order, axis=-1).reshape(-1, 8)
     weight = np.take_along_axis(weight, order, axis=-1).reshape(-1, 8)
-    keys = np.concatenate([corner, weight], axis=1)
-    _, first, inverse = np.unique(
-        np.ascontiguousarray(keys).view([("", keys.dtype)] * 16).ravel(),
-        return_index=True,
-        return_inverse=True,
-    )
+    first, inverse = _distinct_rows(np.concatenate([corner + 1, weight], axis=1))
     return corner[first], weight[first], inverse.reshape(count, -1)
+
+
+def _distinct_rows(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Where each distinct row of natural numbers (m, even number) is first, and its number.
+
+    In lexicographic order, as `numpy.unique`, but by pairs of columns, which is faster.
+    """
+    base = np.int64(rows.max()) + 1
+    keys = [rows[:, i] * base + rows[:, i + 1] for i in range(0, rows.shape[1], 2)]
+    order = np.lexsort(keys[::-1])
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
+    inverse = np.empty(len(rows), dtype=np.int64)
+    inverse[order] = np.cumsum(new) - 1
+    return order[new], inverse
 
 
 def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

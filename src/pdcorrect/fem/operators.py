@@ -192,8 +192,11 @@ class Space:
         """Nodal forces (N, 3), N, of a force density (C, Q, 3), N/m3, at the quadrature points."""
         load = np.ascontiguousarray(np.moveaxis(density, 2, 1))  # (C, 3, Q)
         dx = self._basis.dx[:, None]
-        shapes = self._shapes[np.argsort(self._to_vtk)]
-        by_shape = [(load * v * dx).sum(axis=2) for v in shapes]  # K x (C, 3)
+        by_shape, product = [], np.empty_like(load)
+        for v in self._shapes[np.argsort(self._to_vtk)]:
+            np.multiply(load, v, out=product)
+            product *= dx
+            by_shape.append(product.sum(axis=2))  # (C, 3)
         nodes = self._basis.element_dofs.ravel()
         columns = [np.bincount(nodes, values) for values in np.concatenate(by_shape).T]
         return np.stack(columns, axis=1)

@@ -102,7 +102,8 @@ class Quadrature:
         ratio = np.linalg.det(centre)[:, None] / np.linalg.det(jacobian)
         slopes = -4.0 * (2.0 * points - 1.0)  # dB_m/dxi_m, (Q, 3)
         inverse = np.linalg.inv(centre)  # (C, m, i): dxi_m/dx_i
-        modes = np.einsum("cq,qm,cmi->cmiq", ratio, slopes, inverse)
+        scaled = ratio[:, None, :] * slopes.T  # (C, m, Q)
+        modes = np.einsum("cmq,cmi->cmiq", scaled, inverse)
         return replace(self, lanes=np.concatenate([self.lanes, modes], axis=1))
 
     def laplacian(self, coefficient: Array, local: NDArray[np.int64], size: int) -> sp.csr_matrix:
