@@ -86,6 +86,7 @@ class Machine:
     def run(self, jobs: Sequence[Job]) -> bool:
         """Run all; whether all were successful."""
         started = time.monotonic()
+        told: list[Job] = []
         try:
             while any(job.status is None for job in jobs):
                 for job in jobs:
@@ -96,6 +97,9 @@ class Machine:
                     elif job.status is None and self._may_start(job, jobs):
                         self._start(job, jobs)
                         self._tell(started, job, "started")
+                    elif job.process is None and job.status is not None and job not in told:
+                        told.append(job)
+                        self._tell(started, job, "cannot run: what it needs failed")
                 time.sleep(0.2)
         finally:
             for job in jobs:

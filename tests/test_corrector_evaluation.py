@@ -143,6 +143,18 @@ def test_a_model_without_correction_has_the_omega_of_its_base(evaluation, cases)
         assert (one.measures.mesh, one.measures.simulation) == (case.mesh, case.simulation)
 
 
+def test_several_processes_measure_what_one_does(evaluation):
+    done = []
+    found = evaluate([], TINY, batch=3, workers=2, on_cases=lambda *row: done.append(row))
+    assert done == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert found.runs.keys() < evaluation.runs.keys()
+    for name, run in found.runs.items():
+        pairs = zip(run.trajectories, evaluation.runs[name].trajectories, strict=True)
+        for one, other in pairs:
+            assert one.measures == other.measures, name
+            np.testing.assert_array_equal(one.errors, other.errors)
+
+
 def test_stored_runs_are_measured_as_the_models_are(evaluation):
     stored, same = evaluation.runs["best"], evaluation.runs["like best"]
     for one, other in zip(stored.trajectories, same.trajectories, strict=True):
@@ -175,6 +187,8 @@ def test_unknown_bases_and_splits_are_refused(cases):
         evaluate([], TINY, "test")
     with pytest.raises(InputError, match="batch = 0"):
         evaluate([], TINY, batch=0)
+    with pytest.raises(InputError, match="workers = 0"):
+        evaluate([], TINY, workers=0)
 
 
 # --- rollouts --------------------------------------------------------------------------

@@ -590,6 +590,37 @@ def test_a_pool_goes_on_where_it_was(folder):
         assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
 
 
+def test_scenes_that_failed_count_once_after_several_processes_resume(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(steps=1)
+    numbers = {"failed": 3, "pool": {}}
+    counts = []
+    for rank in (0, 1):
+        batches = UnrolledBatches(
+            SceneGroups(recordings, "plain", rank=rank, world_size=2),
+            stage.model_copy(update={"batch": 1}),
+        )
+        batches.load_state_dict(numbers, {})
+        counts.append(batches.failed)
+    assert counts == [3, 0]
+
+
+def test_stages_share_the_groups_that_are_alike(folder, tmp_path, monkeypatch):
+    made = []
+
+    class Counted(SceneGroup):
+        def __init__(self, recordings, base, device):
+            made.append([r.name for r in recordings])
+            super().__init__(recordings, base, device)
+
+    monkeypatch.setattr("pdcorrect.training.scenes.SceneGroup", Counted)
+    settings = samples.config(
+        samples.unrolled(steps=1, iterations=2), samples.unrolled(steps=2, iterations=2)
+    )
+    Training(settings, folder, tmp_path / "out").run()
+    assert len(made) == len({tuple(names) for names in made}) == 1
+
+
 def test_too_long_a_horizon_is_refused(folder):
     recordings = load_recordings(folder, "training", "plain")
     with pytest.raises(InputError, match="0 simulations of 21 steps or more"):

@@ -215,10 +215,13 @@ def test_two_workers_write_the_same_as_one(generated, tmp_path):
 
 def test_a_part_can_be_generated_first_and_the_rest_later(generated, tmp_path):
     config, folder = generated
-    assert not generate(config, tmp_path, splits=["evaluation"])
+    assert not generate(config, tmp_path, splits=["evaluation"], seconds=0.0)
+    assert generate(config, tmp_path, splits=["evaluation"])
     assert sorted(all_shards(tmp_path)) == ["evaluation/mesh-0000"]
+    assert not (tmp_path / "manifest.json").exists()
     assert not generate(config, tmp_path, seconds=0.0)
     assert generate(config, tmp_path)
+    assert (tmp_path / "manifest.json").exists()
     assert hashes(tmp_path) == hashes(folder)
 
 

@@ -47,7 +47,8 @@ def generate(
 ) -> None:
     """Compute a data set, or what is not there yet of one that was interrupted.
 
-    The files do not depend on the number of workers.  Exit status 1 if some are still missing.
+    The files do not depend on the number of workers.  Exit status 1 if some that were asked for
+    are still missing.
     """
     from pdcorrect.data.config import DatasetConfig
     from pdcorrect.data.generate import Workers
@@ -100,7 +101,8 @@ def info(
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
     from rich.console import Console
 
-    from pdcorrect.data.info import dataset_files, measure_dataset, summarise
+    from pdcorrect.data.info import summarise
+    from pdcorrect.data.measuring import dataset_files, measure_dataset
 
     damaged: dict[Path, str] = {}
     with _progress("reading", len(dataset_files(folder))) as advance:

@@ -103,7 +103,8 @@ def generate(
     Returns
     -------
     bool
-        Whether the data set is complete; then ``manifest.json`` lists the hashes of its files.
+        Whether all that was asked for is there.  Once that is the whole data set,
+        ``manifest.json`` lists the hashes of its files.
 
     Raises
     ------
@@ -134,7 +135,8 @@ def generate(
     for plan in plans:
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
-    return _write_manifest(config, folder, hashes)
+    _write_manifest(config, folder, hashes)
+    return all(hashes[plan.name] is not None for plan in chosen)
 
 
 def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
@@ -348,10 +350,10 @@ def _device_name(device: str) -> str:
     return str(torch.cuda.get_device_name(device))
 
 
-def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> bool:
+def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:
     """List the files' hashes if all are there."""
     if None in hashes.values():
-        return False
+        return
     whole = hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
     content = {
         "dataset": config.name,
@@ -360,4 +362,3 @@ def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, st
         "files": dict(hashes),
     }
     write_text(folder / MANIFEST, json.dumps(content, indent=1) + "\n")
-    return True

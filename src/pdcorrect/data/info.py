@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdcorrect.data.damage import Damage, whole_files
-from pdcorrect.data.folder import all_shards
-from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
-from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.errors import InputError
-from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
+from pdcorrect.data.damage import Damage
+from pdcorrect.data.measuring import (
+    MeasuredMesh,
+    MeasuredRun,
+    MeasuredSimulation,
+    Range,
+    measure_dataset,
+    value_range,
+)
+from pdcorrect.data.schema import PLAIN, REFERENCE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
-Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -39,78 +41,6 @@ class Spread:
         """Of one value or more."""
         found = np.array(list(values))
         return cls(float(found.mean()), *np.quantile(found, (0, 0.05, 0.5, 0.95, 1)).tolist())
-
-
-@dataclass(frozen=True)
-class MeasuredRun:
-    """One run of one simulation.
-
-    Attributes
-    ----------
-    iterations : tuple of int
-        Of each step.
-    rms_error : float or None
-        Of its rollout from the reference's, m.
-    step_error : float or None
-        RMS distance from the reference after one step from each of its frames, m.
-    omega : float or None
-        Share of the plain run's squared error that it removes, per cent.
-    """
-
-    iterations: tuple[int, ...]
-    rms_error: float | None
-    step_error: float | None
-    omega: float | None
-
-
-@dataclass(frozen=True)
-class MeasuredSimulation:
-    """One simulation.
-
-    Attributes
-    ----------
-    displacement, speed : float
-        Largest of a node of the reference, m and m/s (from frame to frame).
-    force : float
-        Largest nodal force, N.
-    frames : int
-    rejected : int
-        Draws before it.
-    seconds : mapping of str to float
-        Cost by run.
-    runs : mapping of str to MeasuredRun
-    """
-
-    displacement: float
-    speed: float
-    force: float
-    frames: int
-    rejected: int
-    seconds: Mapping[str, float]
-    runs: Mapping[str, MeasuredRun]
-
-
-@dataclass(frozen=True)
-class MeasuredMesh:
-    """One file: its mesh, material and simulations.
-
-    Attributes
-    ----------
-    split : str
-    bytes, nodes, cells : int
-    young, poisson, density : (smallest, largest)
-        Pa, dimensionless, kg/m3.
-    simulations : tuple of MeasuredSimulation
-    """
-
-    split: str
-    bytes: int
-    nodes: int
-    cells: int
-    young: Range
-    poisson: Range
-    density: Range
-    simulations: tuple[MeasuredSimulation, ...]
 
 
 @dataclass(frozen=True)
@@ -205,50 +135,6 @@ class DatasetInfo:
         return Group(*(table(self) for table in _TABLES))
 
 
-def measure_dataset(
-    folder: str | Path,
-    on_file: Callable[[Path], None] | None = None,
-    damaged: Damage | None = None,
-) -> list[MeasuredMesh]:
-    """Read a data set and measure each simulation.
-
-    Parameters
-    ----------
-    folder : path
-    on_file : callable, optional
-        Called with each file after it was read.
-    damaged : dict, optional
-        Where given, damaged files are left out and noted here.
-
-    Raises
-    ------
-    InputError
-        If the folder holds no files of meshes.
-    FileFormatError
-        If one of them is damaged; with ``damaged`` if all are.
-    """
-    meshes = []
-    for path in whole_files(dataset_files(folder), damaged):
-        meshes.append(_mesh(read_shard(path), path.stat().st_size))
-        if on_file:
-            on_file(path)
-    return meshes
-
-
-def dataset_files(folder: str | Path) -> list[Path]:
-    """Files of the meshes in a folder, at least one.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
-    found = all_shards(folder)
-    if not found:
-        raise InputError(f"{folder}: holds no files of a data set: expected SPLIT/mesh-0000.h5 ...")
-    return found
-
-
 def dataset_info(
     folder: str | Path,
     on_file: Callable[[Path], None] | None = None,
@@ -274,74 +160,6 @@ def summarise(
     return DatasetInfo(name, _split(meshes), parts, left_out)
 
 
-# --- measuring ---------------------------------------------------------------------------
-
-
-def _mesh(shard: Shard, size: int) -> MeasuredMesh:
-    step = float(shard.attributes["time_step"])
-    return MeasuredMesh(
-        split=str(shard.attributes["split"]),
-        bytes=size,
-        nodes=len(shard.points),
-        cells=len(shard.cells),
-        young=_range(shard.young),
-        poisson=_range(shard.poisson),
-        density=_range(shard.density),
-        simulations=tuple(_simulation(s, step) for s in shard.simulations),
-    )
-
-
-def _range(values: Any) -> Range:
-    return float(np.min(values)), float(np.max(values))
-
-
-def _simulation(simulation: Simulation, step: float) -> MeasuredSimulation:
-    reference = _rollout(simulation, REFERENCE)
-    velocities = np.diff(reference, axis=0) / step
-    return MeasuredSimulation(
-        displacement=largest_displacement(reference),
-        speed=float(np.linalg.norm(velocities, axis=2).max()),
-        force=float(np.linalg.norm(simulation.forces.astype(np.float64), axis=2).max()),
-        frames=simulation.steps,
-        rejected=simulation.attempt,
-        seconds=simulation.seconds,
-        runs={name: _run(simulation, name, reference) for name in simulation.runs},
-    )
-
-
-def _rollout(simulation: Simulation, name: str) -> Any:
-    """Positions (T+1, N, 3) of a run that must have them, m."""
-    run = simulation.runs.get(name)
-    if run is None or run.positions is None:
-        raise InputError(f"a simulation has no rollout {name!r}: expected one of each.")
-    return run.positions.astype(np.float64)
-
-
-def _run(simulation: Simulation, name: str, reference: Any) -> MeasuredRun:
-    run = simulation.runs[name]
-    steps = run.statistics.get("iterations", np.array([], dtype=np.int32))
-    if name == REFERENCE:
-        return MeasuredRun(tuple(steps.tolist()), None, None, None)
-    rms = None if run.positions is None else rms_error(run.positions, reference)
-    one = None
-    if run.predictions is not None:
-        one = rms_error(np.concatenate([reference[:1], run.predictions]), reference)
-    return MeasuredRun(tuple(steps.tolist()), rms, one, _omega(simulation, name, run, reference))
-
-
-def _omega(simulation: Simulation, name: str, run: Run, reference: Any) -> float | None:
-    """Per cent; None where it means nothing."""
-    plain = simulation.runs.get(PLAIN)
-    if name == PLAIN or run.positions is None or plain is None or plain.positions is None:
-        return None
-    if mean_squared_error(plain.positions, reference) == 0.0:
-        return None
-    return error_corrected(run.positions, plain.positions, reference)
-
-
-# --- summing up --------------------------------------------------------------------------
-
-
 def _split(meshes: Sequence[MeasuredMesh]) -> SplitInfo:
     simulations = [simulation for mesh in meshes for simulation in mesh.simulations]
     rejected = sum(simulation.rejected for simulation in simulations)
@@ -352,11 +170,11 @@ def _split(meshes: Sequence[MeasuredMesh]) -> SplitInfo:
         simulations=len(simulations),
         frames=sum(simulation.frames for simulation in simulations),
         bytes=sum(mesh.bytes for mesh in meshes),
-        nodes=_range([mesh.nodes for mesh in meshes]),
-        cells=_range([mesh.cells for mesh in meshes]),
-        young=_range([mesh.young for mesh in meshes]),
-        poisson=_range([mesh.poisson for mesh in meshes]),
-        density=_range([mesh.density for mesh in meshes]),
+        nodes=value_range([mesh.nodes for mesh in meshes]),
+        cells=value_range([mesh.cells for mesh in meshes]),
+        young=value_range([mesh.young for mesh in meshes]),
+        poisson=value_range([mesh.poisson for mesh in meshes]),
+        density=value_range([mesh.density for mesh in meshes]),
         displacement=Spread.of(simulation.displacement for simulation in simulations),
         speed=Spread.of(simulation.speed for simulation in simulations),
         force=Spread.of(simulation.force for simulation in simulations),

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pdcorrect.data.info import MeasuredMesh, dataset_files, measure_dataset
+from pdcorrect.data.measuring import MeasuredMesh, dataset_files, measure_dataset
 from pdcorrect.data.schema import PLAIN, REFERENCE, Array
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, require_extra

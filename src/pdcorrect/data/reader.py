@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +13,7 @@ from pdcorrect.data.cache import RecentlyUsed
 from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.sampling import ShardShuffle
-from pdcorrect.data.shard_arrays import (
-    MeshArrays,
-    MotionArrays,
-    ShardHeader,
-    read_arrays,
-    read_header,
-)
+from pdcorrect.data.shard_arrays import ShardHeader, read_arrays, read_header
 from pdcorrect.errors import InputError, require_extra
 
 require_extra("torch_geometric", "learn")
@@ -29,79 +21,25 @@ require_extra("torch_geometric", "learn")
 import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 from torch.utils.data import BatchSampler, DataLoader, SequentialSampler  # noqa: E402
-from torch_geometric.data import Batch, Data, Dataset  # noqa: E402
+from torch_geometric.data import Batch, Dataset  # noqa: E402
+
+from pdcorrect.data.samples import (  # noqa: E402
+    DecodedShard,
+    GraphSizes,
+    MeshSample,
+    PackedBatch,
+    WindowPlace,
+    batch_of,
+    decode,
+    decoded_bytes,
+    graph_sizes,
+    joined_along,
+    joined_fields,
+    window_numbers,
+)
 
 CACHE_BYTES = 4 * 2**30
 """Default bound of the decoded files that a process keeps, bytes."""
-
-_MESH = ("rest", "free", "mass", "young", "poisson", "density")
-_CELLS = ("cell_young", "cell_poisson", "cell_density")
-_GRAPHS = ("mesh", "simulation", "frame", "time", "time_step")
-_INDICES = ("cells", "edge_index")
-_ALIGNMENT = 64
-"""Bytes."""
-
-
-class MeshSample(Data):
-    """A window of a simulation on its mesh; batching renumbers ``cells`` like ``edge_index``."""
-
-    def __inc__(self, key: str, value: Any, *args: Any, **kwargs: Any) -> Any:
-        """By how much the next graph's values are raised."""
-        return self.num_nodes if key == "cells" else super().__inc__(key, value, *args, **kwargs)
-
-
-@dataclass(frozen=True, eq=False)
-class _Motion:
-    """Tensors of a simulation, frame first."""
-
-    positions: Tensor
-    velocities: Tensor
-    steps: dict[str, Tensor]
-    rollouts: dict[str, Tensor]
-
-    def window(self, frame: int, length: int) -> dict[str, Tensor]:
-        """Node by node what happens in ``length`` steps from a frame, as views."""
-        last = frame + length
-        found = {
-            "positions": self.positions[frame],
-            "velocities": self.velocities[frame],
-            "targets": self.positions[frame + 1 : last + 1].transpose(0, 1),
-        }
-        for name, values in self.steps.items():
-            found[name] = values[frame:last].transpose(0, 1)
-        for name, values in self.rollouts.items():
-            found[name] = values[frame : last + 1].transpose(0, 1)
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class _Shard:
-    """Tensors of a file."""
-
-    nodal: dict[str, Tensor]
-    cellwise: dict[str, Tensor]
-    cells: Tensor
-    edge_index: Tensor
-    motions: list[_Motion]
-
-
-def _bytes(shard: _Shard) -> int:
-    """What a file's tensors take."""
-    found = [shard.cells, shard.edge_index, *shard.nodal.values(), *shard.cellwise.values()]
-    for motion in shard.motions:
-        found += [motion.positions, motion.velocities]
-        found += [*motion.steps.values(), *motion.rollouts.values()]
-    return sum(tensor.numel() * tensor.element_size() for tensor in found)
-
-
-class _Place(NamedTuple):
-    """Where a window is."""
-
-    header: ShardHeader
-    shard: _Shard
-    simulation: int
-    motion: _Motion
-    frame: int
 
 
 class TrajectoryDataset(Dataset):  # type: ignore[misc]
@@ -201,7 +139,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
                 f"{self.folder}, {split}: no simulation has {window} steps, the longest "
                 f"{longest}: expected a smaller window."
             )
-        self._shards = RecentlyUsed(self._load, _bytes, cache_bytes)
+        self._shards = RecentlyUsed(self._load, decoded_bytes, cache_bytes)
 
     def len(self) -> int:
         """Number of windows."""
@@ -212,7 +150,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         place = self._place(idx)
         shard = place.shard
         fields = {
-            **place.motion.window(place.frame, self.window), **_numbers([place], self.dtype),
+            **place.motion.window(place.frame, self.window), **window_numbers([place], self.dtype),
             **shard.nodal, **shard.cellwise, "cells": shard.cells, "edge_index": shard.edge_index,
         }  # fmt: skip
         copies = {name: values.clone().contiguous() for name, values in fields.items()}
@@ -221,20 +159,20 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     def batch(self, indices: Sequence[int] | NDArray[np.int64]) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
         parts, sizes = self._collect(indices)
-        values = {name: torch.cat(found, _joined_along(name)) for name, found in parts.items()}
-        return _batch(values, sizes)
+        values = {name: torch.cat(found, joined_along(name)) for name, found in parts.items()}
+        return batch_of(values, sizes)
 
-    def packed(self, indices: Sequence[int]) -> _Packed:
+    def packed(self, indices: Sequence[int]) -> PackedBatch:
         """The same for another process."""
-        return _Packed.join(*self._collect(indices))
+        return PackedBatch.join(*self._collect(indices))
 
     def _collect(
         self, indices: Sequence[int] | NDArray[np.int64]
-    ) -> tuple[dict[str, list[Tensor]], _Sizes]:
+    ) -> tuple[dict[str, list[Tensor]], GraphSizes]:
         chosen = self.indices()
         places = [self._place(chosen[int(i)]) for i in indices]
-        sizes = _sizes(places)
-        return _parts(places, sizes, self.window, self.dtype), sizes
+        sizes = graph_sizes(places)
+        return joined_fields(places, sizes, self.window, self.dtype), sizes
 
     def places(
         self, indices: Sequence[int] | NDArray[np.int64]
@@ -255,13 +193,13 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         files, simulations = self._owners[rows].T
         return files, simulations, numbers - self._starts[rows]
 
-    def decoded(self, file: int) -> _Shard:
+    def decoded(self, file: int) -> DecodedShard:
         """A file's tensors, which are kept as far as memory allows."""
         return self._shards[file]
 
     def forget(self) -> None:
         """Drop all decoded files from memory."""
-        self._shards = RecentlyUsed(self._load, _bytes, self.cache_bytes)
+        self._shards = RecentlyUsed(self._load, decoded_bytes, self.cache_bytes)
 
     def shard_numbers(self) -> NDArray[np.int64]:
         """For each window the number of its file in the split, (len(self),)."""
@@ -277,13 +215,13 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             for h in self.headers
         ])  # fmt: skip
 
-    def _place(self, idx: int) -> _Place:
+    def _place(self, idx: int) -> WindowPlace:
         if not 0 <= idx < self.len():
             raise self._no_window(idx)
         row = int(np.searchsorted(self._starts, idx, side="right")) - 1
         number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
-        return _Place(
+        return WindowPlace(
             self.headers[number], shard, simulation, shard.motions[simulation],
             idx - int(self._starts[row]),
         )  # fmt: skip
@@ -291,10 +229,10 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     def _no_window(self, idx: int) -> IndexError:
         return IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
 
-    def _load(self, number: int) -> _Shard:
+    def _load(self, number: int) -> DecodedShard:
         path = self.headers[number].path
         mesh, motions = read_arrays(path, (self.base,) if self.base else (), self.runs)
-        return _tensors(mesh, motions, self.base, self.dtype)
+        return decode(mesh, motions, self.base, self.dtype)
 
 
 class TrajectoryLoader(DataLoader[Any]):
@@ -341,7 +279,7 @@ class TrajectoryLoader(DataLoader[Any]):
         """One epoch, or what is left of it."""
         done = 0 if self.shuffle is None else self.shuffle.start
         for found in super().__iter__():
-            batch = found.batch() if isinstance(found, _Packed) else found
+            batch = found.batch() if isinstance(found, PackedBatch) else found
             done += batch.num_graphs
             self._position = done
             yield batch
@@ -399,144 +337,3 @@ def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> N
                 f"{header.path}: simulation {k} has no positions of run {missing[0]!r}: expected "
                 f"some of {', '.join(sorted(rollouts))}."
             )
-
-
-def _tensors(
-    mesh: MeshArrays, motions: Sequence[MotionArrays], base: str | None, dtype: torch.dtype
-) -> _Shard:
-    def tensor(values: NDArray[Any]) -> Tensor:
-        found = torch.from_numpy(values)
-        return found.to(dtype) if found.is_floating_point() else found
-
-    return _Shard(
-        nodal={name: tensor(getattr(mesh, name)) for name in _MESH},
-        cellwise={name: tensor(getattr(mesh, name)) for name in _CELLS},
-        cells=tensor(mesh.cells),
-        edge_index=tensor(mesh.edge_index),
-        motions=[
-            _Motion(
-                positions=tensor(motion.positions),
-                velocities=tensor(motion.velocities),
-                steps={
-                    "forces": tensor(motion.forces),
-                    **({"predictions": tensor(motion.predictions[base])} if base else {}),
-                },
-                rollouts={f"run_{name}": tensor(x) for name, x in motion.rollouts.items()},
-            )
-            for motion in motions
-        ],
-    )
-
-
-def _numbers(places: Sequence[_Place], dtype: torch.dtype) -> dict[str, Tensor]:
-    """One number a window, (B,)."""
-    which = np.array([(p.header.number, p.simulation, p.frame) for p in places])
-    steps = np.array([p.header.time_step for p in places])
-    seconds = torch.from_numpy(np.stack([which[:, 2] * steps, steps])).to(dtype)
-    mesh, simulation, frame = torch.from_numpy(np.ascontiguousarray(which.T))
-    return {
-        "mesh": mesh, "simulation": simulation, "frame": frame, "time": seconds[0],
-        "time_step": seconds[1],
-    }  # fmt: skip
-
-
-class _Sizes(NamedTuple):
-    """Of each graph of a batch."""
-
-    nodes: list[int]
-    cells: list[int]
-    edges: list[int]
-
-
-def _sizes(places: Sequence[_Place]) -> _Sizes:
-    return _Sizes(
-        [len(place.shard.nodal["rest"]) for place in places],
-        [len(place.shard.cells) for place in places],
-        [place.shard.edge_index.shape[1] for place in places],
-    )
-
-
-def _parts(
-    places: Sequence[_Place], sizes: _Sizes, length: int, dtype: torch.dtype
-) -> dict[str, list[Tensor]]:
-    """By field what is to be joined, in the order of `MeshSample`'s fields."""
-    shards = [place.shard for place in places]
-    windows = [place.motion.window(place.frame, length) for place in places]
-    raised = list(zip(shards, _ends(sizes.nodes)[:-1].tolist(), strict=True))
-    return {
-        **{name: [fields[name] for fields in windows] for name in windows[0]},
-        **{name: [values] for name, values in _numbers(places, dtype).items()},
-        **{name: [shard.nodal[name] for shard in shards] for name in _MESH},
-        **{name: [shard.cellwise[name] for shard in shards] for name in _CELLS},
-        "cells": [shard.cells + first for shard, first in raised],
-        "edge_index": [shard.edge_index + first for shard, first in raised],
-    }
-
-
-def _joined_along(name: str) -> int:
-    return 1 if name == "edge_index" else 0
-
-
-def _batch(values: dict[str, Tensor], sizes: _Sizes) -> Batch:
-    """What ``Batch.from_data_list`` makes of the joined fields."""
-    nodes, cells, edges = (_ends(each) for each in sizes)
-    graphs, offsets = torch.arange(len(nodes)), nodes[:-1]
-    ends = {
-        **dict.fromkeys(_GRAPHS, graphs), **dict.fromkeys((*_CELLS, "cells"), cells),
-        "edge_index": edges,
-    }  # fmt: skip
-    same = torch.zeros_like(offsets)
-    batch = Batch(_base_cls=MeshSample)
-    store = batch._store
-    store.update(values)
-    store._num_nodes, store.num_nodes = sizes.nodes, sum(sizes.nodes)
-    store.batch = torch.from_numpy(np.repeat(np.arange(len(offsets)), sizes.nodes))
-    store.ptr = nodes
-    batch._num_graphs = len(offsets)
-    batch._slice_dict = {name: ends.get(name, nodes) for name in values}
-    batch._inc_dict = {name: offsets if name in _INDICES else same for name in values}
-    return batch
-
-
-@dataclass(frozen=True)
-class _Packed:
-    """A batch in one piece of shared memory, which passes between processes quickly."""
-
-    memory: Tensor
-    layout: dict[str, tuple[int, int, torch.dtype, list[int]]]
-    sizes: _Sizes
-
-    @classmethod
-    def join(cls, parts: dict[str, list[Tensor]], sizes: _Sizes) -> _Packed:
-        """Join the parts of each field, side by side."""
-        layout, end = {}, 0
-        for name, tensors in parts.items():
-            dim, first = _joined_along(name), tensors[0]
-            shape = list(first.shape)
-            shape[dim] = sum(tensor.shape[dim] for tensor in tensors)
-            start = -(-end // _ALIGNMENT) * _ALIGNMENT
-            end = start + math.prod(shape) * first.element_size()
-            layout[name] = (start, end, first.dtype, shape)
-        storage = torch.UntypedStorage._new_shared(end)  # type: ignore[no-untyped-call]
-        packed = cls(torch.empty(0, dtype=torch.uint8).set_(storage), layout, sizes)
-        for name, tensors in parts.items():
-            torch.cat(tensors, _joined_along(name), out=packed.field(name))
-        return packed
-
-    def field(self, name: str) -> Tensor:
-        """A field, as a view."""
-        start, end, dtype, shape = self.layout[name]
-        return self.memory[start:end].view(dtype).view(shape)
-
-    def pin_memory(self) -> _Packed:
-        """The same in page-locked memory."""
-        return replace(self, memory=self.memory.pin_memory())
-
-    def batch(self) -> Batch:
-        """The batch; its fields are views of the one piece."""
-        return _batch({name: self.field(name) for name in self.layout}, self.sizes)
-
-
-def _ends(sizes: Sequence[int]) -> Tensor:
-    """Zero and the running sums."""
-    return torch.from_numpy(np.cumsum([0, *sizes]))

@@ -168,23 +168,30 @@ def evaluate(
             f"({', '.join(stored)})."
         )
     measured: dict[str, dict[int, Measured]] = {name: {} for name in (*names, *stored, REFERENCE)}
+    done = 0
+
+    def take(numbers: Sequence[int], results: Iterator[dict[str, Measured]]) -> None:
+        nonlocal done
+        for i, by_run in zip(numbers, results, strict=True):
+            for name, one in by_run.items():
+                measured[name][i] = one
+            done += 1
+            if on_cases:
+                on_cases(done, len(found.cases))
+
     with _pool(workers) as each:
-        started: list[tuple[list[int], Iterator[dict[str, Measured]]]] = []
+        waiting: list[tuple[list[int], Iterator[dict[str, Measured]]]] = []
         for numbers in _batches(found.cases, bases, batch):
             cases = [found.cases[i] for i in numbers]
             outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in cases]
             for name, new in _outcomes(candidates, cases, device):
                 for by_name, outcome in zip(outcomes, new, strict=True):
                     by_name[name] = outcome
-            started.append((numbers, each(_measure_all, cases, outcomes)))
-        done = 0
-        for numbers, results in started:  # other processes measure while the next ones move
-            for i, by_run in zip(numbers, results, strict=True):
-                for name, one in by_run.items():
-                    measured[name][i] = one
-                done += 1
-                if on_cases:
-                    on_cases(done, len(found.cases))
+            waiting.append((numbers, each(_measure_all, cases, outcomes)))
+            if workers == 1:
+                take(*waiting.pop())
+        for numbers, results in waiting:  # which others measured while the next ones were moving
+            take(numbers, results)
     known = {candidate.name: candidate for candidate in candidates}
     runs = {
         name: EvaluatedRun(

@@ -126,10 +126,11 @@ class UnrolledBatches:
         return numbers, tensors
 
     def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-        """Go on where a state was taken; pools of processes but the first begin anew."""
-        self.failed, self._pool = numbers["failed"], {}
+        """Go on where a state was taken; pools and counts of processes but the first begin anew."""
+        self.failed, self._pool = 0, {}
         if self._seed[1]:
             return
+        self.failed = numbers["failed"]
         for key, at in numbers["pool"].items():
             positions, velocities, correction = (
                 tensors[f"{key}.{name}"].to(self._groups.device)

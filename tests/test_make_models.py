@@ -1,0 +1,104 @@
+"""`models/make_all.py`: in which order its commands run, and what becomes of those that fail."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from argparse import Namespace
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+ROOT = Path(__file__).parents[1]
+SPEC = importlib.util.spec_from_file_location("make_models", ROOT / "models" / "make_all.py")
+make = importlib.util.module_from_spec(SPEC)
+sys.modules["make_models"] = make
+SPEC.loader.exec_module(make)
+
+FINE, REFUSED = ["--help"], ["train", "nowhere.toml"]
+OPTIONS = Namespace(device="cpu", generators=1, batch=60, measurers=1, seconds=None)
+
+
+def machine(folder, together=2):
+    return make.Machine(folder, 0, {"generate": 1, "train": together, "evaluate": 1})
+
+
+def test_a_job_waits_for_those_it_needs(tmp_path, capsys):
+    first = make.Job("first", FINE, [], "generate")
+    second = make.Job("second", FINE, [first], "train")
+    assert machine(tmp_path).run([second, first])
+    told = [line.split(" s  ")[1] for line in capsys.readouterr().out.splitlines()]
+    assert told == ["first started", "first ended with 0", "second started", "second ended with 0"]
+    assert "Usage" in (tmp_path / "second.log").read_text()
+
+
+def test_what_needs_a_failed_job_is_not_run(tmp_path, capsys):
+    data = make.Job("data", REFUSED, [], "generate")
+    training = make.Job("training", FINE, [data], "train")
+    evaluation = make.Job("evaluation", FINE, [training], "evaluate")
+    other = make.Job("other", FINE, [], "train")
+    assert not machine(tmp_path).run([data, training, evaluation, other])
+    assert data.status == training.status == evaluation.status == 2
+    assert other.status == 0
+    assert training.process is None
+    told = capsys.readouterr().out
+    assert "training started" not in told
+    assert "evaluation cannot run: what it needs failed" in told
+
+
+def test_a_training_whose_time_is_up_is_evaluated_but_not_finished(tmp_path):
+    training = make.Job("training", REFUSED, [], "train", status=make.STOPPED)
+    evaluation = make.Job("evaluation", FINE, [training], "evaluate")
+    assert not machine(tmp_path).run([training, evaluation])
+    assert evaluation.status == 0
+
+
+def test_no_more_trainings_run_than_there_are_places(tmp_path):
+    jobs = [make.Job(f"job {k}", FINE, [], "train") for k in range(3)]
+    seen = []
+
+    class Watched(make.Machine):
+        def _start(self, job, jobs):
+            super()._start(job, jobs)
+            seen.append(sum(1 for _ in self._running("train", jobs)))
+
+    assert Watched(tmp_path, 0, {"train": 2}).run(jobs)
+    assert max(seen) == 2
+
+
+def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_path):
+    recipes = [ROOT / "models/recipes/torsion-exact" / f"{n}.toml" for n in ("force", "plain")]
+    recipes.append(ROOT / "models/recipes/torsion-as-published/force.toml")
+    jobs = {job.name: job for job in make.plan(tmp_path, recipes, OPTIONS)}
+    assert len(jobs) == 2 * 2 + 3 + 2
+    last = jobs["evaluate-torsion-exact"]
+    assert {job.name for job in last.after} == {
+        "train-torsion-exact-force", "train-torsion-exact-plain",
+        "generate-torsion-exact-evaluation",
+    }  # fmt: skip
+    assert [job.name for job in jobs["train-torsion-exact-plain"].after] == [
+        "generate-torsion-exact-training"
+    ]
+    assert str(tmp_path / "trainings/torsion-exact/force/model") in last.arguments
+
+
+@pytest.mark.slow
+def test_a_recipe_becomes_an_evaluated_model(tmp_path):
+    recipe = tmp_path / "recipes" / "tiny" / "short.toml"
+    recipe.parent.mkdir(parents=True)
+    recipe.write_text(
+        'base = "best"\n[[stages]]\nkind = "one-step"\niterations = 3\nbatch = 4\n'
+        "[fitting]\nwindows = 20\n"
+    )
+    shutil.copytree(ROOT / "datasets/tiny", tmp_path / "work/data/tiny")
+    call = [sys.executable, ROOT / "models/make_all.py", tmp_path / "work", recipe]
+    done = subprocess.run(call, env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=600)
+    assert done.returncode == 0
+    summary = json.loads((tmp_path / "work/evaluations/tiny/summary.json").read_text())
+    assert summary["data"]["trajectories"] == 4
+    assert "model" in summary["runs"]
