@@ -253,6 +253,15 @@ def test_bodies_with_other_materials_or_mass_rules_are_not_one():
     ] * 2
 
 
+def test_what_is_known_of_bodies_reaches_the_scenes_that_are_left():
+    one, other = pc.discretise(unlike(0)), pc.discretise(unlike(1))
+    cells = pc.BatchStepper([one, one, other]).cells
+    numbers = [np.full(1, 5.0), np.full(1, 7.0)]
+    for rows, expected in (([0, 1, 2], [5, 5, 7]), ([0, 1], [5, 5]), ([2, 0], [7, 5]), ([2], [7])):
+        left = cells.narrowed(torch.tensor(rows))
+        assert left.repeated(numbers, 1).ravel().tolist() == expected
+
+
 def test_scenes_with_the_same_matrix_share_one_inverse():
     loads = [[{"kind": "gravity", "acceleration": [0.0, a, -9.81]}] for a in (0.0, 3.0, 5.0)]
     problems = [pc.discretise(beam((4, 1, 1), loads=load)) for load in loads]

@@ -42,3 +42,8 @@ class Bodies:
                 distinct.append(p)
             owners[i] = seen[key]
         return cls(distinct, owners)
+
+    @property
+    def one_a_scene(self) -> bool:
+        """Whether the scenes are the distinct bodies in their order."""
+        return np.array_equal(self.owners, np.arange(len(self.distinct)))

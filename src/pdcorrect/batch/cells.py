@@ -169,7 +169,7 @@ class CellBatch:
 
     def _of_scenes(self, x: Tensor) -> Tensor:
         """Rows of the bodies for all scenes."""
-        return x if len(x) == self.sizes.scenes else x[self._owners]
+        return x if self.bodies.one_a_scene else x[self._owners]
 
     def _numbers(self, arrays: Sequence[NDArray[np.int64]], fill: int, *shape: int) -> Tensor:
         """As `repeated`, of whole numbers."""
