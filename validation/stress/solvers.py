@@ -63,17 +63,13 @@ def tight(scenario: Scenario, solver: str) -> Run:
     return _steps(scenario, other)
 
 
-LENIENT = 3.0
-"""Margin of the hybrid's gate, deviations: three times the default, so that it is put to work."""
-
-
 @cache
 def _model() -> Any:
     return pc.load_model("tiny").corrector
 
 
 def _hybrid(problem: pc.Problem) -> pc.HybridStepper:
-    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _model(), gate=pc.Gate(margin=LENIENT))
+    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _model(), gate=pc.Gate())
 
 
 MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
