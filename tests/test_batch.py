@@ -134,14 +134,15 @@ def test_stress_and_tangent_at_points_are_those_of_the_energies(energy):
     mu, omega = rng.uniform(1, 2, (2, len(F)))
     points = Points(energy_code(energy), 0, 1, compiled=False)
     weights = torch.as_tensor(np.stack([mu, omega]))
-    density, P = points.stress(rows(F), weights)
+    H = rows(F - np.eye(3))
+    density, P = points.stress(H, weights)
     np.testing.assert_allclose(density, energies.energy_density(F, mu, omega, energy), rtol=1e-10,
                                atol=1e-13)  # fmt: skip
     exact = energies.first_piola(F, mu, omega, energy)
     scale = 1 + np.abs(exact).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(P.numpy().T.reshape(-1, 3, 3) / scale, exact / scale, atol=1e-11)
     D = rng.normal(size=F.shape)
-    found = points.product(points.tangent(rows(F), weights), rows(D)).numpy().T.reshape(-1, 3, 3)
+    found = points.product(points.tangent(H, weights), rows(D)).numpy().T.reshape(-1, 3, 3)
     C = energies.elasticity(F, mu, omega, energy=energy)
     exact = np.einsum("nijkl,nkl->nij", C, D)
     scale = 1 + np.abs(C).max(axis=(1, 2, 3, 4))[:, None, None]

@@ -1,8 +1,9 @@
 """Elastic energy, forces and tangents of many bodies at once.
 
 Bodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
-first, then, from a common place on, its internal modes.  Cells and nodes that a body does
-not have carry no weight and stay at zero.
+first, then, from a common place on, its internal modes, cell by cell.  Cells and nodes that
+a body does not have carry no weight and stay at zero.  What is known at quadrature points
+is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.bodies import Bodies
-from pdcorrect.batch.fused import rows_of, sums, sums_of_rows
+from pdcorrect.batch.fused import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.levels import places
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
@@ -90,13 +91,11 @@ class CellBatch:
         self.device, self.dtype = device, dtype
         n = self.sizes
         self.rest = self.repeated([p.positions for p in distinct], n.unknowns, 3)
-        local = [self._renumbered(p) for p in distinct]
-        scene = torch.arange(n.scenes, device=device).reshape(-1, 1, 1)
-        cells = self._numbers(local, 0, n.cells, width)
-        self._cells = (cells + n.unknowns * scene).reshape(-1)
-        found = [places(cells, n.unknowns) for cells in local]
-        slots = self._numbers(found, -1, n.unknowns, max(table.shape[1] for table in found))
-        values = n.cells * width
+        corners = first.cells.shape[1]
+        self._corners = self._numbers([p.cells for p in distinct], 0, n.cells, corners)
+        found = [places(p.cells, len(p.positions)) for p in distinct]
+        slots = self._numbers(found, -1, n.nodes, max(table.shape[1] for table in found))
+        values, scene = n.cells * corners, torch.arange(n.scenes, device=device)[:, None, None]
         slots = torch.where(slots < 0, n.scenes * values, slots + values * scene)
         self._slots = slots.flatten(0, 1)
         self.present_cells = self._first([len(p.cells) for p in problems], n.cells)
@@ -104,7 +103,7 @@ class CellBatch:
         quadratures = [p.quadrature for p in distinct]
         volumes = [[q.weights for q in quadratures], [q.volume_weights for q in quadratures]]
         self._volumes = torch.stack([self.repeated(v, n.cells, points) for v in volumes])
-        self._volumes = self._volumes.reshape(2, -1)
+        self._volumes = self._volumes.reshape(2, -1, points)
         self._weights = torch.zeros_like(self._volumes)
         self._points = Points(
             first.materials.model,
@@ -112,28 +111,26 @@ class CellBatch:
             points,
             compiled=device.type == "cuda",
         )
-        self._identity = torch.eye(3, dtype=dtype, device=device).reshape(9, 1)
         self._gradients = self._gradient_sets(quadratures)
 
     def narrowed(self, rows: Tensor) -> CellBatch:
         """Of some scenes."""
         n, numbers = self.sizes, rows.tolist()
         moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None]
-        last = n.scenes * n.cells * n.width
+        values = self._corners[0].numel()
         slots = self._slots.reshape(n.scenes, -1)[rows]
-        shifted = slots + moved * n.cells * n.width
-        slots = torch.where(slots < last, shifted, len(rows) * n.cells * n.width)
-        cells = self._cells.reshape(n.scenes, -1)[rows] + moved * n.unknowns
+        shifted = slots + moved * values
+        slots = torch.where(slots < n.scenes * values, shifted, len(rows) * values)
         return with_rows(
-            self, rows, "rest", "present_nodes", "present_cells", "_gradients", "_owners",
+            self, rows,
+            "rest", "present_nodes", "present_cells", "_gradients", "_owners", "_corners",
             sizes=n._replace(scenes=len(rows)),
             bodies=Bodies(self.bodies.distinct, self.bodies.owners[numbers]),
             node_counts=[self.node_counts[i] for i in numbers],
             mode_counts=[self.mode_counts[i] for i in numbers],
-            _cells=cells.reshape(-1),
             _slots=slots.reshape(-1, self._slots.shape[1]),
-            _weights=self._weights.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
-            _volumes=self._volumes.reshape(2, n.scenes, -1)[:, rows].reshape(2, -1),
+            _weights=self._by_scene(self._weights)[:, rows].flatten(1, 2),
+            _volumes=self._by_scene(self._volumes)[:, rows].flatten(1, 2),
         )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
@@ -180,11 +177,6 @@ class CellBatch:
         numbers = torch.arange(most, device=self.device)
         return numbers < torch.tensor(counts, device=self.device)[:, None]
 
-    def _renumbered(self, problem: Problem) -> NDArray[np.int64]:
-        nodes = len(problem.positions)
-        local = problem.space.local
-        return np.where(local < nodes, local, local + self.sizes.nodes - nodes)
-
     def _gradient_sets(self, quadratures: Sequence[Quadrature]) -> Tensor:
         """Gradients (B, L, 3 Q) where a scene's cells are all alike, else (B, C, L, 3 Q)."""
         n = self.sizes
@@ -198,23 +190,22 @@ class CellBatch:
 
     def energy_and_forces(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Elastic energies (B,), J, and forces (B, U, 3), N, of configurations (B, U, 3)."""
-        density, P = self._points.stress(self.gradients(y - self.rest, 1.0), self._weights)
+        density, P = self._points.stress(self.gradients(y - self.rest), self._weights)
         return density.reshape(self.sizes.scenes, -1).sum(dim=1), -self.gathered(P)
 
     def linearise(self, y: Tensor) -> Tangent:
         """The tangent at configurations, for `apply`."""
-        return self._points.tangent(self.gradients(y - self.rest, 1.0), self._weights)
+        return self._points.tangent(self.gradients(y - self.rest), self._weights)
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
-        return self.gathered(self._points.product(tangent, self.gradients(x, 0.0)))
+        return self.gathered(self._points.product(tangent, self.gradients(x)))
 
     def set_weights(self, mu: Tensor, omega: Tensor) -> None:
         """Weights of the two energy terms from now on, (B, C), Pa."""
-        shape = (2, self.sizes.scenes, self.sizes.cells, self.sizes.points)
-        volumes = self._volumes.reshape(shape)
+        volumes = self._by_scene(self._volumes)
         values = torch.stack([mu, omega])[..., None] * volumes
-        self._weights.copy_(torch.where(volumes != 0.0, values, 0.0).reshape(2, -1))
+        self._weights.copy_(torch.where(volumes != 0.0, values, 0.0).flatten(1, 2))
 
     def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
         """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).
@@ -228,60 +219,72 @@ class CellBatch:
         n = self.sizes
         u = torch.zeros_like(self.rest)
         u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
-        a, b, c, d, e, f, g, h, i = self.gradients(u, 1.0).unbind()
-        ratios = a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+        ratios = self._points.volume_ratios(self.gradients(u))
         by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
         return torch.where(self.present_cells, by_cell, math.inf)
 
     def rotations(self, F: Tensor) -> Tensor:
-        """Nearest rotations (9, M) of matrices (9, M)."""
+        """Nearest rotations (9, ...) of matrices (9, ...)."""
         return self._points.rotations(F)
+
+    def mean_rotations(self, u: Tensor, shares: Tensor) -> Tensor:
+        """Nearest rotations (9, B C) of each cell's mean F, for displacements (B, U, 3).
+
+        Points count by ``shares`` (B C, Q), which add up to one in each cell.
+        """
+        return self._points.rotations((self.gradients(u) * shares).sum(dim=-1), moved=True)
 
     def weight_slopes(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of x . dW/dy by each cell's mu and omega, two (B, C)."""
         n = self.sizes
-        F, D = self.gradients(y - self.rest, 1.0), self.gradients(x, 0.0)
+        H, D = self.gradients(y - self.rest), self.gradients(x)
         out = []
         for term in (0, 1):
             weights = torch.zeros_like(self._weights)
             weights[term] = self._volumes[term]
-            _, P = self._points.stress(F, weights)
+            _, P = self._points.stress(H, weights)
             out.append((P * D).sum(dim=0).reshape(n.scenes, n.cells, n.points).sum(dim=2))
         return out[0], out[1]
 
-    def gradients(self, u: Tensor, diagonal: float) -> Tensor:
-        """Diagonal I + sum_k u_k grad N_k, (9, B C Q), for (B, U, 3)."""
+    def gradients(self, u: Tensor) -> Tensor:
+        """H = sum_k u_k grad N_k, (9, B C, Q), for (B, U, 3)."""
         n = self.sizes
-        local = self.local(u).transpose(2, 3)
-        out = local.reshape(*self._rows, n.width) @ self._gradients
-        out = out.reshape(n.scenes, n.cells, 9, n.points).permute(2, 0, 1, 3).reshape(9, -1)
-        if diagonal:
-            out = out + diagonal * self._identity
-        return out
+        rows = in_cells(u, self._corners, n.modes).reshape(*self._rows, n.width)
+        by_cell = (rows @ self._gradients).reshape(-1, 9, n.points).transpose(0, 1)
+        return by_cell if u.is_cuda else by_cell.contiguous()
 
     def gathered(self, P: Tensor) -> Tensor:
-        """sum_q P_ij dN_k/dx_j summed over the cells, (B, U, 3), for P (9, B C Q)."""
+        """sum_q P_ij dN_k/dx_j summed over the cells, (B, U, 3), for P (9, B C, Q)."""
         n = self.sizes
-        P = P.reshape(9, n.scenes, n.cells, n.points).permute(1, 2, 0, 3)
-        local = P.reshape(*self._rows, 3 * n.points) @ self._gradients.transpose(-1, -2)
+        rows = P.transpose(0, 1).reshape(*self._rows, 3 * n.points)
+        local = rows @ self._gradients.transpose(-1, -2)
         return self.summed(local.reshape(n.scenes, n.cells, 3, n.width).transpose(2, 3))
 
-    def local(self, u: Tensor) -> Tensor:
-        """A configuration's values in each cell, (B, C, L, 3)."""
+    def local(self, x: Tensor) -> Tensor:
+        """A nodal field's values (B, N or U, 3) at the corners of each cell, (B, C, K, 3)."""
+        return at_corners(x, self._corners)
+
+    def modes(self, u: Tensor) -> Tensor:
+        """A configuration's modes in each cell, (B, C, L - K, 3)."""
         n = self.sizes
-        return rows_of(u.reshape(-1, 3), self._cells).reshape(n.scenes, n.cells, n.width, 3)
+        return u[:, n.nodes :].reshape(n.scenes, n.cells, -1, 3)
 
     def summed(self, local: Tensor) -> Tensor:
-        """Values (B, C, L, 3) of cells summed into configurations (B, U, 3), in a fixed order."""
-        n = self.sizes
-        flat = local.reshape(n.scenes * n.cells * n.width, 3)
-        return sums_of_rows(flat, self._slots).reshape(n.scenes, n.unknowns, 3)
+        """Values of the cells' corners, or of all their shape functions, as a field.
+
+        (B, C, K, 3) as (B, N, 3), or (B, C, L, 3) as (B, U, 3); corners meet at the nodes
+        and are summed in a fixed order.
+        """
+        return assembled(local, self._slots, self._corners.shape[2])
 
     def summed_numbers(self, local: Tensor) -> Tensor:
-        """Numbers (B, C, L) of cells summed at the nodes, (B, N); not for work in every step."""
+        """Numbers (B, C, K) of cells summed at the nodes, (B, N); not for work in every step."""
         n = self.sizes
-        slots = self._slots.reshape(n.scenes, n.unknowns, -1)[:, : n.nodes].flatten(0, 1)
-        return sums(local.reshape(-1, 1), slots).reshape(n.scenes, n.nodes)
+        return sums(local.reshape(-1, 1), self._slots).reshape(n.scenes, n.nodes)
+
+    def _by_scene(self, x: Tensor) -> Tensor:
+        """(k, B C, Q) as (k, B, C, Q)."""
+        return x.reshape(len(x), self.sizes.scenes, self.sizes.cells, -1)
 
     @property
     def _rows(self) -> tuple[int, ...]:

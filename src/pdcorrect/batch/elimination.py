@@ -91,21 +91,17 @@ class Elimination:
         n = self._cells.sizes
         if not n.modes:
             return r
-        local = self._cells.local(r)
-        back = self._times(self._solved.transpose(-1, -2), local[:, :, self._nodes :])
-        out = r - self._cells.summed(cat([back, 0.0 * local[:, :, self._nodes :]], dim=2))
-        return out[:, : n.nodes]
+        back = self._times(self._solved.transpose(-1, -2), self._cells.modes(r))
+        return r[:, : n.nodes] - self._cells.summed(back)
 
     def recovered(self, x: Tensor, r: Tensor) -> Tensor:
         """The whole solution (B, U, 3) for that of the nodes (B, N, 3) and right-hand side r."""
         n = self._cells.sizes
         if not n.modes:
             return x
-        whole = cat([x, x.new_zeros(n.scenes, n.modes, 3)], dim=1)
-        modes = self._cells.local(r)[:, :, self._nodes :]
-        nodes = self._cells.local(whole)[:, :, : self._nodes]
-        found = self._times(self._inverse, modes) - self._times(self._solved, nodes)
-        return whole + self._cells.summed(cat([0.0 * nodes, found], dim=2))
+        corners = self._times(self._solved, self._cells.local(x))
+        found = self._times(self._inverse, self._cells.modes(r)) - corners
+        return cat([x, found.reshape(n.scenes, n.modes, 3)], dim=1)
 
     def _stored(self, arrays: Sequence[Array]) -> Tensor:
         """(K, m, n) where all cells of each problem are alike, else (K, C, m, n)."""

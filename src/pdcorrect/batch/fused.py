@@ -37,13 +37,33 @@ def rows_of(u: Tensor, numbers: Tensor) -> Tensor:
     return out
 
 
-def sums_of_rows(values: Tensor, numbers: Tensor) -> Tensor:
-    """Sums (M, k) of rows of values (L, k) by their numbers (M, n), in this order.
-
-    A number of L stands for nothing.
-    """
-    out: Tensor = as_kernel(sums, values.is_cuda)(values, numbers)
+def at_corners(x: Tensor, corners: Tensor) -> Tensor:
+    """Values (B, C, K, 3) of fields (B, M, 3) at each scene's own rows ``corners`` (B, C, K)."""
+    out: Tensor = as_kernel(_at_corners, x.is_cuda)(x, corners)
     return out
+
+
+def in_cells(u: Tensor, corners: Tensor, modes: int) -> Tensor:
+    """The same by component, (B, C, 3, K), followed by the cells' modes, (B, C, 3, L).
+
+    Modes are the last rows of u (B, U, 3), cell by cell.
+    """
+    out: Tensor = as_kernel(_in_cells, u.is_cuda)(u, corners, modes)
+    return out
+
+
+def assembled(local: Tensor, slots: Tensor, corners: int) -> Tensor:
+    """Fields (B, U, 3) of the cells' values (B, C, L, 3).
+
+    Of L, ``corners`` are summed at the nodes, whose ``slots`` (B N, most) say where they are
+    found (see `sums`); the others are modes, which have one cell each.
+    """
+    scenes = len(local)
+    kernel = as_kernel(_summed, local.is_cuda)
+    nodal: Tensor = kernel(local, slots, corners).reshape(scenes, -1, 3)
+    if local.shape[2] == corners:
+        return nodal
+    return torch.cat([nodal, local[:, :, corners:].reshape(scenes, -1, 3)], dim=1)
 
 
 def _products(matrices: Tensor, x: Tensor) -> Tensor:
@@ -55,8 +75,29 @@ def _rows(u: Tensor, numbers: Tensor) -> Tensor:
     return u[numbers]
 
 
+def _at_corners(x: Tensor, corners: Tensor) -> Tensor:
+    scene = torch.arange(len(corners), device=x.device)[:, None, None]
+    return x[scene, corners]
+
+
+def _in_cells(u: Tensor, corners: Tensor, modes: int) -> Tensor:
+    values = _at_corners(u, corners)
+    if modes:
+        scenes, cells, _ = corners.shape
+        own = u[:, u.shape[1] - modes :].reshape(scenes, cells, -1, 3)
+        values = torch.cat([values, own], dim=2)
+    return values.transpose(2, 3).contiguous()
+
+
+def _summed(local: Tensor, slots: Tensor, corners: int) -> Tensor:
+    return sums(local[:, :, :corners].reshape(-1, 3), slots)
+
+
 def sums(values: Tensor, numbers: Tensor) -> Tensor:
-    """`sums_of_rows` as part of a larger kernel."""
+    """Sums (M, k) of rows of values (L, k) by their numbers (M, n), in this order.
+
+    A number of L stands for nothing.
+    """
     count = len(values)
 
     def term(column: Tensor) -> Tensor:

@@ -13,7 +13,9 @@ import math
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.batch.narrowing import with_rows
+from pdcorrect.batch.objective import node_dot
 
 _CURVATURE = 1e-12
 
@@ -65,8 +67,9 @@ class BatchHistory:
         w = _times(self._r_inverse, sg)
         mixed = self._d * w + _times(self._yz, w) - zg
         back = _times(self._r_inverse.transpose(1, 2), mixed)
-        out = torch.bmm(w[:, None], self._Z) - torch.bmm(back[:, None], self._S)
-        return out[:, 0] - x
+        ahead = torch.bmm(w[:, None], self._Z), torch.bmm(back[:, None], self._S)
+        out: Tensor = as_kernel(_combined, x.is_cuda)(*ahead, x)
+        return out
 
     def append(
         self, step: Tensor, change: Tensor, gradient: Tensor, new_gradient: Tensor, moved: Tensor
@@ -77,9 +80,11 @@ class BatchHistory:
         out, in whatever scene: what is stored is multiplied by zeros later.
         """
         sg, zg = _times(self._S, new_gradient), _times(self._Z, new_gradient)
-        s_new, z_new = (step * new_gradient).sum(1), (change * new_gradient).sum(1)
-        y_s, y_z = s_new - (step * gradient).sum(1), z_new - (change * gradient).sum(1)
-        floor = _CURVATURE * torch.sqrt(y_z.abs() * (step * step).sum(1))
+        fields = [x.reshape(len(x), -1, 3) for x in (step, change, gradient, new_gradient)]
+        by_node = as_kernel(_pair_products, step.is_cuda)(*fields)
+        s_new, z_new, s_old, z_old, s_s = by_node.sum(dim=-1)
+        y_s, y_z = s_new - s_old, z_new - z_old
+        floor = _CURVATURE * torch.sqrt(y_z.abs() * s_s)
         good = moved & (y_s > floor) & (y_z > 0.0) & (y_s < math.inf)
         place = self._age.argmin(dim=1)
         unit = torch.nn.functional.one_hot(place, self._age.shape[1]).to(sg.dtype)
@@ -111,3 +116,13 @@ class BatchHistory:
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return torch.bmm(matrix, vector[:, :, None])[:, :, 0]
+
+
+def _combined(plus: Tensor, minus: Tensor, x: Tensor) -> Tensor:
+    return (plus - minus)[:, 0] - x
+
+
+def _pair_products(s: Tensor, z: Tensor, old: Tensor, new: Tensor) -> Tensor:
+    """Of (B, U, 3), what each node has in their inner products, (5, B, U)."""
+    pairs = ((s, new), (z, new), (s, old), (z, old), (s, s))
+    return torch.stack([node_dot(a, b) for a, b in pairs])

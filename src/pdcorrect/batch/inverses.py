@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.decomposition import transposed
 from pdcorrect.batch.dense import DenseInverse, add_mass, summed_blocks
 from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, scalar_blocks
 from pdcorrect.batch.multigrid import Multigrid
 from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.sharing import Sharing
-from pdcorrect.batch.turning import Turning, rotated
+from pdcorrect.batch.turning import Turning, rotated, rotated_back
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
@@ -174,13 +173,13 @@ class FirstHessian:
                 kept.copy_(new)
 
     def __call__(self, r: Tensor) -> Tensor:
-        r = r * self._free
-        if self._turned:
-            r = rotated(transposed(self._rotations), r)
-        x = self._modes.recovered(self._solver(self._modes.reduced(r)), r)
-        if self._turned:
-            x = rotated(self._rotations, x)
-        return x * self._free
+        if not self._turned:
+            return self._solved(r * self._free) * self._free
+        x = self._solved(rotated_back(self._rotations, r, self._free))
+        return rotated(self._rotations, x, self._free)
+
+    def _solved(self, r: Tensor) -> Tensor:
+        return self._modes.recovered(self._solver(self._modes.reduced(r)), r)
 
 
 def _blocks(problem: Problem, stiffness: float, kind: BatchHessian) -> Array:

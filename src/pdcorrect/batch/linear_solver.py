@@ -8,12 +8,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
 from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.recording import Recorder
-
-_CHUNK = 2
-"""Steps between two looks at the scenes' progress."""
 
 
 class BatchConjugateGradients:
@@ -50,7 +48,7 @@ class BatchConjugateGradients:
         self.steps = 0
         self._tangent: Tangent
         self._begin = recorder(self._set_up)
-        self._advance = recorder(self._chunk)
+        self._advance = recorder(self._next)
 
     def solve(
         self,
@@ -96,7 +94,7 @@ class BatchConjugateGradients:
         self.steps = 0
         while self.steps < max_steps and bool(self._busy):
             self._advance()
-            self.steps += _CHUNK
+            self.steps += 1
 
     def hessian(self, x: Tensor) -> Tensor:
         """H x on all components, at the y of the last solution."""
@@ -117,9 +115,8 @@ class BatchConjugateGradients:
         self._active.copy_(self._which & (self._r_z > 0.0))
         self._busy.copy_(self._active.any())
 
-    def _chunk(self) -> None:
-        for _ in range(_CHUNK):
-            self._step()
+    def _next(self) -> None:
+        self._step()
         self._busy.copy_(self._active.any())
 
     def _step(self) -> None:
@@ -127,15 +124,27 @@ class BatchConjugateGradients:
         curvature = dot(self._d, image)
         active = self._active & (curvature > 0.0)
         alpha = torch.where(active, self._r_z / curvature, 0.0)
+        on_gpu = image.is_cuda
         change = by_scene(alpha) * self._d
-        self.x.add_(torch.where(by_scene(active), change, 0.0))
-        self._r.sub_(torch.where(by_scene(active), by_scene(alpha) * image, 0.0))
+        as_kernel(_advance, on_gpu)(self.x, self._r, change, image, alpha, active)
         z = self._precondition(self._r)
         r_z = torch.where(active, dot(self._r, z), self._r_z)
         ratio = torch.where(active, r_z / self._r_z, 0.0)
-        self._d.copy_(torch.where(by_scene(active), z + by_scene(ratio) * self._d, self._d))
+        as_kernel(_turn, on_gpu)(self._d, z, ratio, active)
         short = largest_displacement(change) <= self._settled * largest_displacement(self.x)
         done = (r_z <= self._target) & (dot(self._r, self._r) <= self._limit) & short
         self._r_z.copy_(r_z)
         self.converged.logical_or_(active & done)
         self._active.copy_(active & ~done & (r_z > 0.0) & torch.isfinite(r_z))
+
+
+def _advance(
+    x: Tensor, r: Tensor, change: Tensor, image: Tensor, alpha: Tensor, active: Tensor
+) -> None:
+    """Move x by ``change`` and the residual r by -alpha times its ``image``, where active (B,)."""
+    x.add_(torch.where(by_scene(active), change, 0.0))
+    r.sub_(torch.where(by_scene(active), by_scene(alpha) * image, 0.0))
+
+
+def _turn(d: Tensor, z: Tensor, ratio: Tensor, active: Tensor) -> None:
+    d.copy_(torch.where(by_scene(active), z + by_scene(ratio) * d, d))

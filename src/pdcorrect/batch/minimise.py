@@ -2,20 +2,24 @@
 
 One iteration evaluates every scene once: scenes whose trial step is accepted move and take
 a new direction, the others try a shorter step.  It has no branches that depend on values,
-so a GPU replays it (`recording`).  A scene stops when its own step is short; then the
-remaining displacement is estimated with the true Hessian, by conjugate gradients, for all
-scenes that wait for it.  On the CPU, when few scenes are left, the loop goes on with a
-smaller batch of those (recorded work is for one size).
+so a GPU replays it (`recording`); between iterations Python looks at the scenes' progress.
+A scene stops when its own step is short; then the remaining displacement is estimated with
+the true Hessian, by conjugate gradients, for all scenes that wait for it.  On the CPU, when
+few scenes are left, the loop goes on with a smaller batch of those (recorded work is for one
+size).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from enum import IntEnum
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.batch.history import BatchHistory
 from pdcorrect.batch.inverses import FirstHessian
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
@@ -25,8 +29,6 @@ from pdcorrect.solvers.lbfgs import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
 
 _ROUND_OFF = {torch.float64: 1e-13, torch.float32: 1e-5}
 HISTORY = 12
-_CHUNK = 2
-"""Iterations between two looks at the scenes' progress."""
 _CG_STEPS = 60
 _FEW = 4
 """One in so many scenes or less are few."""
@@ -90,7 +92,7 @@ class BatchMinimiser:
         recorder = Recorder(rest.device)
         self.linear_solver = BatchConjugateGradients(objective, self._precondition, recorder)
         self._begin = recorder(self._set_up)
-        self._advance = recorder(self._chunk)
+        self._advance = recorder(self._next)
         self._judge = recorder(self._conclude)
 
     def run(self, start: Tensor, alive: Tensor) -> None:
@@ -140,6 +142,9 @@ class BatchMinimiser:
         x = self._inverse(r)
         return self._history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
 
+    def _kernel(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        return as_kernel(function, self.y.is_cuda)
+
     # --- one iteration ------------------------------------------------------------------
 
     def _set_up(self) -> None:
@@ -170,15 +175,13 @@ class BatchMinimiser:
         self._left[0] = (self.phase == Phase.RUNNING).sum()
         self._left[1] = (self.phase == Phase.WAITING).sum()
 
-    def _chunk(self) -> None:
-        for _ in range(_CHUNK):
-            self._iterate()
+    def _next(self) -> None:
+        self._iterate()
         self._look()
 
     def _iterate(self) -> None:
         running = self.phase == Phase.RUNNING
-        step = torch.where(by_scene(running), by_scene(self._step) * self._d, 0.0)
-        trial = self.y + step
+        step, trial = self._kernel(_trial)(self.y, self._d, self._step, running)
         value, gradient, scale = self._objective(trial)
         fall = value - self._value
         good = fall <= ARMIJO * self._step * self._slope
@@ -189,8 +192,8 @@ class BatchMinimiser:
         x = self._inverse(gradient)
         s, z = step.flatten(1), (x - self._x).flatten(1)
         self._history.append(s, z, self.gradient.flatten(1), gradient.flatten(1), moved)
-        for old, new in ((self.y, trial), (self.gradient, gradient), (self._x, x)):
-            old.copy_(torch.where(by_scene(moved), new, old))
+        known, found = [self.y, self.gradient, self._x], [trial, gradient, x]
+        self._kernel(_accept)(moved, known, found)
         self._value.copy_(torch.where(moved, value, self._value))
         self._scale.copy_(torch.where(moved, scale, self._scale))
         self._backtrack(running & ~moved, fall)
@@ -219,7 +222,7 @@ class BatchMinimiser:
     def _turn(self, moved: Tensor) -> None:
         """New directions for the scenes that moved."""
         d = self._history.direction(self._x.flatten(1)).reshape(self._d.shape)
-        self._d.copy_(torch.where(by_scene(moved), d, self._d))
+        self._kernel(_accept)(moved, [self._d], [d])
         self._slope.copy_(torch.where(moved, dot(self.gradient, self._d), self._slope))
         short = moved & (largest_displacement(self._d) <= self._threshold)
         self.phase.copy_(torch.where(short, int(Phase.WAITING), self.phase))
@@ -258,3 +261,14 @@ class BatchMinimiser:
         phase = torch.where(again, int(Phase.RUNNING), self.phase)
         self.phase.copy_(torch.where(done, int(Phase.CONVERGED), phase))
         self._look()
+
+
+def _trial(y: Tensor, d: Tensor, length: Tensor, running: Tensor) -> tuple[Tensor, Tensor]:
+    step = torch.where(by_scene(running), by_scene(length) * d, 0.0)
+    return step, y + step
+
+
+def _accept(moved: Tensor, known: Sequence[Tensor], found: Sequence[Tensor]) -> None:
+    """Put what was found, (B, U, 3) each, in the place of what was known, where moved (B,)."""
+    for old, new in zip(known, found, strict=True):
+        old.copy_(torch.where(by_scene(moved), new, old))

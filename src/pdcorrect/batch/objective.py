@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.fused import small_products
+from pdcorrect.batch.fused import as_kernel, small_products
 from pdcorrect.batch.narrowing import with_rows
 
 
@@ -41,13 +41,14 @@ class BatchMass:
         """Densities (B, C), kg/m3, from now on."""
         self.density.copy_(density)
         rows = self._blocks.sum(dim=-1) * self.density[..., None]
-        local = self._filled(rows[..., None])[..., 0]
-        self.nodal[:, : self._cells.sizes.nodes] = self._cells.summed_numbers(local)
+        self.nodal[:, : self._cells.sizes.nodes] = self._cells.summed_numbers(rows)
 
-    def __call__(self, x: Tensor) -> Tensor:
+    def __call__(self, x: Tensor, factor: float = 1.0) -> Tensor:
+        """A multiple of M x."""
         if self._diagonal:
-            return self.nodal[..., None] * x
-        return self._cells.summed(self._filled(self.density[..., None, None] * self._by_cell(x)))
+            return (factor * self.nodal)[..., None] * x
+        local = (factor * self.density)[..., None, None] * self._by_cell(x)
+        return self._cells.summed(self._filled(local))
 
     def slopes(self, a: Tensor, b: Tensor) -> Tensor:
         """Derivatives of a . M b by the densities, (B, C), for (B, U, 3)."""
@@ -62,7 +63,7 @@ class BatchMass:
         return small_products(self._blocks, self._local(x))
 
     def _local(self, x: Tensor) -> Tensor:
-        return self._cells.local(x)[:, :, : self._blocks.shape[-1]]
+        return self._cells.local(x)
 
     def _filled(self, local: Tensor) -> Tensor:
         """Zeros for the cells' modes."""
@@ -109,34 +110,59 @@ class BatchObjective:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""
         energy, elastic = self.cells.energy_and_forces(y)
         offset = y - self.target
-        momentum = self.inertia * self.mass(offset)
-        kinetic = 0.5 * dot(offset, momentum)
-        work = dot(self.forces, y - self.cells.rest)
-        gradient = momentum - elastic - self.forces
+        momentum = self.mass(offset, self.inertia)
+        gradient, by_node = as_kernel(_terms, y.is_cuda)(
+            elastic, offset, momentum, self.forces, y - self.cells.rest, self.free
+        )
+        kinetic, work = by_node.sum(dim=-1)
         value, scale = energy + kinetic - work, energy + kinetic + work.abs()
         if self.damping:
             offset = y - self.origin
-            drag = self.damping * self.mass(offset)
+            drag = self.mass(offset, self.damping)
             loss = 0.5 * dot(offset, drag)
-            value, scale, gradient = value + loss, scale + loss, gradient + drag
-        return value, gradient * self.free, scale
+            value, scale, gradient = value + loss, scale + loss, gradient + drag * self.free
+        return value, gradient, scale
 
     def hessian(self, tangent: tuple[Tensor, Tensor, Tensor], x: Tensor) -> Tensor:
         """H x on all components, for a tangent of the cells."""
         out = self.cells.apply(tangent, x)
-        return out + (self.inertia + self.damping) * self.mass(x) if self.inertia else out
+        return out + self.mass(x, self.inertia + self.damping) if self.inertia else out
 
 
 def largest_displacement(x: Tensor) -> Tensor:
     """Largest node norm of each scene, (B,), for (B, U, 3)."""
-    return torch.sqrt((x * x).sum(dim=-1).amax(dim=1))
+    squares: Tensor = as_kernel(node_dot, x.is_cuda)(x, x)
+    return torch.sqrt(squares.amax(dim=1))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products (B,) of (B, U, 3)."""
-    return (a * b).sum(dim=(1, 2))
+    by_node: Tensor = as_kernel(node_dot, a.is_cuda)(a, b)
+    return by_node.sum(dim=1)
 
 
 def by_scene(values: Tensor) -> Tensor:
     """(B,) as factors of (B, U, 3)."""
     return values[:, None, None]
+
+
+# --- what is one kernel on a GPU -----------------------------------------------------------------
+
+
+def _terms(
+    elastic: Tensor,
+    offset: Tensor,
+    momentum: Tensor,
+    forces: Tensor,
+    displacement: Tensor,
+    free: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """The gradient, and each node's share in kinetic energy and work, (2, B, U)."""
+    shares = 0.5 * node_dot(offset, momentum), node_dot(forces, displacement)
+    return (momentum - elastic - forces) * free, torch.stack(shares)
+
+
+def node_dot(a: Tensor, b: Tensor) -> Tensor:
+    """What each node has in the inner product of (B, U, 3), (B, U); part of larger kernels."""
+    x, y, z = (a * b).unbind(dim=-1)
+    return x + y + z

@@ -1,7 +1,8 @@
-"""What is computed at each quadrature point, on tensors (k, M) of M points.
+"""What is computed at each quadrature point, on tensors (k, C, Q) of Q points in C cells.
 
-Compiled, each function is one kernel for any number of points.  The decomposition, which
-is the most of it, is a function of its own, so that it is compiled once.
+Deformation is given by the displacement's gradient H = F - I.  Compiled, each function is one
+kernel for any number of points.  The decomposition, which is the most of it, is a function of
+its own, so that it is compiled once.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pdcorrect.batch.fused import as_kernel
 from pdcorrect.fem.hyperelasticity import COROTATED
 
 Tangent = tuple[Tensor, Tensor, Tensor]
-"""U (9, M), V (9, M) and the tangent (12, M) in their frame."""
+"""U (9, C, Q), V (9, C, Q) and the tangent (12, C, Q) in their frame."""
 
 
 class Points:
@@ -39,55 +40,73 @@ class Points:
         self._model, self._first, self._points = model, first, points
         self._compiled = compiled
 
-    def stress(self, F: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Psi (M,) and P (9, M) for F (9, M) and the weights of both terms (2, M)."""
-        U, s, V = self.decomposed(F)
+    def stress(self, H: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        """Psi (C, Q) and P (9, C, Q) for H (9, C, Q) and the weights of both terms (2, C, Q)."""
+        U, s, V = self._decomposed(H)
         v, k = self._nearest(s)
-        out: tuple[Tensor, Tensor] = self._call(_stress)(self._model, U, s, V, v, k, weights)
-        return out
+        density, P = self._call(_stress)(self._model, U, s, V, v, k, weights)
+        return density, P.transpose(0, 1)
 
-    def tangent(self, F: Tensor, weights: Tensor) -> Tangent:
+    def tangent(self, H: Tensor, weights: Tensor) -> Tangent:
         """The derivative of P."""
-        U, s, V = self.decomposed(F)
+        U, s, V = self._decomposed(H)
         v, k = self._nearest(s)
         return U, V, self._call(_tangent)(self._model, s, v, k, weights)
 
     def product(self, tangent: Tangent, D: Tensor) -> Tensor:
-        """Tangent times D (9, M)."""
+        """Tangent times D (9, C, Q)."""
         out: Tensor = self._call(_product)(*tangent, D)
+        return out.transpose(0, 1)
+
+    def rotations(self, F: Tensor, moved: bool = False) -> Tensor:
+        """Nearest rotations (9, ...); the identity where F is not finite.
+
+        Parameters
+        ----------
+        F : (9, ...)
+        moved : bool
+            Whether F is the gradient H of a displacement.
+        """
+        U, _, V = self._call(_decompose)(torch.nan_to_num(F), moved)
+        out: Tensor = self._call(_rotate)(U, V)
         return out
 
-    def decomposed(self, F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """U (9, M), s (3, M), V (9, M) of the signed SVD."""
-        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(F)
+    def volume_ratios(self, H: Tensor) -> Tensor:
+        """Det F of H (9, ...)."""
+        out: Tensor = self._call(_volume_ratio)(H)
         return out
 
-    def rotations(self, F: Tensor) -> Tensor:
-        """Nearest rotations (9, M); the identity where F is not finite."""
-        out: Tensor = self._call(_rotate)(*self.decomposed(torch.nan_to_num(F)))
+    def _decomposed(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """U (9, C, Q), s (3, C, Q), V (9, C, Q) of the signed SVD of F."""
+        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(H, True)
         return out
 
     def _call(self, function: Callable[..., Any]) -> Callable[..., Any]:
         return as_kernel(function, self._compiled)
 
     def _nearest(self, s: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        """Nearest volume-preserving stretches v (3, M) and k (M,), where there is such a term."""
+        """Nearest volume-preserving stretches v (3, C, p) and k (C, p) at the last p points.
+
+        Those that have a volume term; None if there is none.
+        """
         if self._model != COROTATED or self._first >= self._points:
             return None, None
-        if self._first == 0:
-            found: tuple[Tensor, Tensor] = self._call(_nearest)(s)
-            return found
-        by_cell = s.reshape(3, -1, self._points)
-        v, k = torch.ones_like(by_cell), torch.zeros_like(by_cell[0])
-        part = by_cell[..., self._first :]
-        found = self._call(_nearest)(part.reshape(3, -1))
-        v[..., self._first :] = found[0].reshape(part.shape)
-        k[..., self._first :] = found[1].reshape(part.shape[1:])
-        return v.reshape(3, -1), k.reshape(-1)
+        found: tuple[Tensor, Tensor] = self._call(_nearest)(s[..., self._first :])
+        return found
 
 
-def _decompose(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    U, s, V = signed_svd(list(F.unbind()))
+def _moved(H: Tensor) -> list[Tensor]:
+    """F = I + H."""
+    return [h + 1.0 if i in (0, 4, 8) else h for i, h in enumerate(H.unbind())]
+
+
+def _volume_ratio(H: Tensor) -> Tensor:
+    a, b, c, d, e, f, g, h, i = _moved(H)
+    return a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
+
+
+def _decompose(F: Tensor, moved: bool) -> tuple[Tensor, Tensor, Tensor]:
+    U, s, V = signed_svd(_moved(F) if moved else list(F.unbind()))
     return torch.stack(U), torch.stack(s), torch.stack(V)
 
 
@@ -96,7 +115,18 @@ def _nearest(s: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(v), k
 
 
-def _rotate(U: Tensor, s: Tensor, V: Tensor) -> Tensor:
+def _everywhere(v: Tensor | None, k: Tensor | None, points: int) -> energies.Nearest:
+    """For all points of a cell: neither stretched nor stressed where there is no volume term."""
+    if v is None or k is None:
+        return None
+    first = points - k.shape[-1]
+    if not first:
+        return list(v.unbind()), k
+    none = torch.zeros_like(k[..., :1]).expand(-1, first)
+    return [torch.cat([1.0 + none, a], dim=-1) for a in v.unbind()], torch.cat([none, k], dim=-1)
+
+
+def _rotate(U: Tensor, V: Tensor) -> Tensor:
     return torch.stack(product(list(U.unbind()), transposed(list(V.unbind()))))
 
 
@@ -109,18 +139,19 @@ def _stress(
     k: Tensor | None,
     weights: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    nearest = None if v is None or k is None else (list(v.unbind()), k)
+    """Psi (C, Q), and P (C, 9, Q)."""
+    nearest = _everywhere(v, k, s.shape[-1])
     density, t = energies.principal(model, list(s.unbind()), nearest, weights[0], weights[1])
     rows, columns = list(U.unbind()), transposed(list(V.unbind()))
     scaled = [rows[3 * i + j] * t[j] for i in range(3) for j in range(3)]
-    return density, torch.stack(product(scaled, columns))
+    return density, torch.stack(product(scaled, columns), dim=1)
 
 
 def _tangent(model: int, s: Tensor, v: Tensor | None, k: Tensor | None, weights: Tensor) -> Tensor:
-    nearest = None if v is None or k is None else (list(v.unbind()), k)
+    nearest = _everywhere(v, k, s.shape[-1])
     return torch.stack(energies.tangent(model, list(s.unbind()), nearest, weights[0], weights[1]))
 
 
 def _product(U: Tensor, V: Tensor, T: Tensor, D: Tensor) -> Tensor:
     rows = [list(a.unbind()) for a in (U, V, T, D)]
-    return torch.stack(energies.tangent_product(*rows))
+    return torch.stack(energies.tangent_product(*rows), dim=1)

@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.decomposition import transposed
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.batch.narrowing import with_rows
 
 
@@ -32,10 +34,8 @@ class Turning:
         cells, n = self._cells, self._cells.sizes
         u = y - cells.rest
         u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
-        F = cells.gradients(u, 1.0).reshape(9, n.scenes, n.cells, n.points)
-        mean = (F * self._shares).sum(dim=-1).reshape(9, -1)
-        turns = cells.rotations(mean).T.reshape(n.scenes, n.cells, 1, 9)
-        by_cell = turns.expand(-1, -1, n.width, -1)
+        turns = cells.mean_rotations(u, self._shares.flatten(0, 1)).T
+        by_cell = turns.reshape(n.scenes, n.cells, 1, 9).expand(-1, -1, n.width, -1)
         sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
         total = torch.cat(sums, dim=-1)  # (B, U, 9)
         identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
@@ -45,8 +45,27 @@ class Turning:
         return list(out.reshape(9, n.scenes, n.unknowns))
 
 
-def rotated(R: list[Tensor], x: Tensor) -> Tensor:
-    """R x at each node, nine (B, U) and (B, U, 3)."""
+def rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+    """R x at each node where it is free, for nine (B, U), (B, U, 3) and 0 or 1 (B, U, 3)."""
+    out: Tensor = as_kernel(_rotated, x.is_cuda)(R, x, free)
+    return out
+
+
+def rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+    """R^T of what is free of x at each node."""
+    out: Tensor = as_kernel(_rotated_back, x.is_cuda)(R, x, free)
+    return out
+
+
+def _rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+    return _products(R, x) * free
+
+
+def _rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+    return _products(transposed(R), x * free)
+
+
+def _products(R: list[Tensor], x: Tensor) -> Tensor:
     a, b, c = x.unbind(-1)
     rows = [R[3 * i] * a + R[3 * i + 1] * b + R[3 * i + 2] * c for i in range(3)]
     return torch.stack(rows, dim=-1)
