@@ -301,9 +301,17 @@ def _client(distributed: Any, workers: Workers) -> Any:
     """A client of the given scheduler, or of new processes on this machine."""
     if workers.scheduler is not None:
         return distributed.Client(workers.scheduler, set_as_default=False)
-    names = {"n_workers": workers.count, "threads_per_worker": 1, "processes": True}
-    cluster = distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
-    return distributed.Client(cluster, set_as_default=False)
+    return distributed.Client(local_cluster(workers.count), set_as_default=False)
+
+
+def local_cluster(count: int) -> Any:
+    """A Dask cluster of ``count`` processes on this machine, each with one thread.
+
+    Its workers are named 0, 1, ..., by which each finds a GPU of its own.
+    """
+    distributed = require_extra("distributed", "cluster")
+    names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
+    return distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
 
 
 def _work(
