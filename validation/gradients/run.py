@@ -22,7 +22,6 @@ SHARES = (1e-2, 1e-3, 1e-4, 1e-5)
 """Steps of the difference quotients, of each input's scale."""
 INTEGRATORS = ("backward-euler", "bdf2", "midpoint", "generalised-alpha")
 METHODS = {"PD": pc.ProjectiveDynamics, "Newton": pc.Newton}
-SOLVERS = ("direct", "cg")
 MATERIAL = ("young", "poisson", "density")
 
 
@@ -57,15 +56,16 @@ class Step:
         }
         changed = any(name in changes for name in MATERIAL)
         body = self.body.with_material(**material) if changed else self.body
-        state = self.state
+        state, step = self.state, body.time_step + changes.get("time_step", 0.0)
+        memory = dict(state.memory)
+        if "previous_times" in memory:  # as if the step before were as long
+            memory["previous_times"] = np.full_like(state.positions, state.time - step)
         moved = pc.State(
             state.positions + changes.get("positions", 0.0),
             state.velocities + changes.get("velocities", 0.0),
-            state.time, state.memory,
+            state.time, memory,
         )  # fmt: skip
-        forces = changes.get("forces")
-        step = body.time_step + changes.get("time_step", 0.0)
-        after = METHODS[self.method](body)(moved, forces, step).state
+        after = METHODS[self.method](body, time_step=step)(moved, changes.get("forces")).state
         return float(
             np.vdot(self.weights[0], after.positions) + np.vdot(self.weights[1], after.velocities)
         )
