@@ -236,6 +236,14 @@ def test_an_export_does_not_mix_with_another(folder, exported, tmp_path):
         assert mine < names(target)
 
 
+def test_a_file_of_another_origin_is_not_replaced(folder, tmp_path):
+    (tmp_path / "train.h5").write_text("mine")
+    with pytest.raises(OutputError, match=r"train\.h5: exists already, not from an export"):
+        export_meshgraphnet(folder, tmp_path, overwrite=True)
+    assert names(tmp_path) == {"train.h5"}
+    assert (tmp_path / "train.h5").read_text() == "mine"
+
+
 def test_an_export_that_fails_leaves_the_earlier_one(folder, tmp_path):
     target = tmp_path / "target"
     export_meshgraphnet(folder, target, split="longer")
@@ -391,6 +399,14 @@ def test_wrong_arrays_are_refused_with_the_place(changes, words):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["coarse", "predictions"])
+def test_simulations_of_a_mesh_have_the_same_runs(name):
+    first, second = arguments()["motions"]
+    words = f"simulation 1 has no {name}, unlike simulation 0: expected {name} of all"
+    with pytest.raises(InputError, match=words):
+        shard_from_arrays(**arguments(motions=[first, replace(second, **{name: None})]))
+
+
 def test_an_inverted_mesh_is_refused():
     cells = arguments()["cells"].copy()
     cells[2] = cells[2][[4, 5, 6, 7, 0, 1, 2, 3]]
@@ -482,7 +498,8 @@ def saved_arrays(path, **changes):
     first, second = given.pop("motions")
     arrays = {
         **given, "reference_0": first.reference, "forces_0": first.forces,
-        "reference_1": second.reference, "predictions_1": second.predictions, **changes,
+        "predictions_0": first.predictions, "reference_1": second.reference,
+        "predictions_1": second.predictions, **changes,
     }  # fmt: skip
     np.savez(path, **{name: values for name, values in arrays.items() if values is not None})
     return path
@@ -493,8 +510,10 @@ def test_an_npz_file_is_imported(tmp_path):
     path = import_trajectories([source], tmp_path / "set", split="validation", number=3)
     assert path == tmp_path / "set" / "validation" / "mesh-0003.h5"
     one, other = read_shard(path).simulations
-    assert set(one.runs) == {"reference"}
+    assert set(one.runs) == set(other.runs) == {"reference", "plain"}
+    assert one.runs["plain"].predictions.shape == (4, 24, 3)
     assert other.runs["plain"].predictions.shape == (3, 24, 3)
+    assert one.runs["plain"].positions is None
     assert one.forces.any()
     assert not other.forces.any()
     with pytest.raises(InputError, match="exists already"):
@@ -560,7 +579,8 @@ def test_wrong_npz_files_are_refused_by_name(tmp_path):
         (
             {
                 "reference": REFERENCE, "reference_0": None, "reference_1": None,
-                "forces_0": None, "predictions_1": None, "force": REFERENCE[1:],
+                "forces_0": None, "predictions_0": None, "predictions_1": None,
+                "force": REFERENCE[1:],
             },
             "'force': unknown; did you mean 'forces'?",
         ),

@@ -226,10 +226,16 @@ def _staging(target: Path, overwrite: bool) -> Iterator[Path]:
 def _placed(written: Sequence[Path], target: Path) -> list[Path]:
     """Move all files of the staging folder to ``target``, instead of an earlier export's."""
     try:
-        for path in _exported(target):
+        earlier, new = _exported(target), sorted((target / _STAGING).iterdir())
+        for place in (target / path.name for path in new):
+            if place.exists() and place not in earlier:
+                raise OutputError(f"{place}: exists already, not from an export; move it first.")
+        for path in earlier:
             path.unlink()
-        for path in sorted((target / _STAGING).iterdir()):
+        for path in new:
             path.replace(target / path.name)
+    except OutputError:
+        raise
     except OSError as error:
         raise OutputError(f"{target}: cannot be written ({error.strerror or error}).") from None
     return [target / path.name for path in written]

@@ -146,6 +146,7 @@ def shard_from_arrays(
         _simulation(f"simulation {k}", motion, mesh, movable, stepper, time_step)
         for k, motion in enumerate(motions)
     )
+    _check_alike(simulations)
     if scene is not None:
         simulations = tuple(replace(one, scene_toml=scene.to_toml()) for one in simulations)
     return Shard(
@@ -193,6 +194,18 @@ def _simulation(
     if coarse is not None or predictions is not None:
         runs[PLAIN] = Run(coarse, predictions, attributes={"time_step": time_step})
     return Simulation(np.zeros(steps) if forces is None else forces, runs)
+
+
+def _check_alike(simulations: Sequence[Simulation]) -> None:
+    """Refuse simulations of which one has a rollout or predictions and another has not."""
+    for name in ("positions", "predictions"):
+        given = [getattr(one.runs.get(PLAIN), name, None) is not None for one in simulations]
+        if any(given) and not all(given):
+            word = "coarse" if name == "positions" else name
+            raise InputError(
+                f"simulation {given.index(False)} has no {word}, unlike simulation "
+                f"{given.index(True)}: expected {word} of all simulations of a mesh, or of none."
+            )
 
 
 def _frames(name: str, positions: ArrayLike) -> int:
