@@ -71,7 +71,7 @@ def write(folder, shards, dtype="float64"):
     """Write shards to their places in a data set's folder."""
     for one in shards:
         name = f"mesh-{one.attributes['number']:04d}.h5"
-        write_shard(folder / one.attributes["split"] / name, one, dtype)
+        write_shard(folder / one.attributes["split"] / name, one, dtype, overwrite=True)
     return folder
 
 

@@ -135,7 +135,7 @@ def test_other_programs_read_the_file(shard, saved):
 
 def test_the_hash_is_of_the_content_without_provenance_and_cost(shard, saved, tmp_path):
     def written(changed, dtype="float32"):
-        return write_shard(tmp_path / "other.h5", changed, dtype)
+        return write_shard(tmp_path / "other.h5", changed, dtype, overwrite=True)
 
     expected = written(shard)
     with h5py.File(saved) as file:
@@ -165,6 +165,22 @@ def test_a_file_that_cannot_be_written_is_named(shard, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file/shard.h5: cannot be written"):
         write_shard(tmp_path / "file" / "shard.h5", shard)
+
+
+def test_an_existing_file_is_replaced_only_when_asked(shard, tmp_path):
+    path = str(tmp_path / "shard.h5")
+    first = write_shard(path, shard)
+    with pytest.raises(OutputError, match=r"shard\.h5: exists already; .* overwrite=True"):
+        write_shard(path, shard, "float64")
+    assert stored_hashes(tmp_path / "shard.h5")[1] == first
+    assert write_shard(path, shard, "float64", overwrite=True) != first
+
+
+@pytest.mark.parametrize("dtype", ["float16", "int32", "double", "f4", "text"])
+def test_numbers_are_stored_in_one_of_two_types(shard, tmp_path, dtype):
+    with pytest.raises(InputError, match=f"dtype = '{dtype}': expected 'float32' or 'float64'"):
+        write_shard(tmp_path / "shard.h5", shard, dtype)
+    assert not (tmp_path / "shard.h5").exists()
 
 
 # --- damage ------------------------------------------------------------------------------
@@ -483,7 +499,7 @@ def dataset(original, tmp_path):
 
 def changed(path, change):
     """Rewrite a file with ``change`` made to its shard."""
-    write_shard(path, change(read_shard(path)))
+    write_shard(path, change(read_shard(path)), overwrite=True)
 
 
 def findings(folder, severity="error"):
@@ -549,7 +565,7 @@ def test_files_of_another_configuration_are_found(dataset):
     other = sample_config(seed=8)
     mesh = make_plan(sample_config())[0]
     shard = sample_shard(other, mesh)
-    write_shard(dataset / FIRST, shard)
+    write_shard(dataset / FIRST, shard, overwrite=True)
     assert "config_hash" in one(dataset)
 
 
@@ -566,6 +582,18 @@ def test_attributes_are_compared_with_the_configuration(dataset, name, value):
         lambda s: dataclasses.replace(s, attributes={**s.attributes, name: value}),
     )
     assert f"its {name} is {value!r}: expected " in one(dataset)
+
+
+def test_a_file_from_elsewhere_is_one_error(dataset):
+    imported = {"dataset": "mine", "setting": "imported", "config_hash": "", "tolerance": 0.0}
+
+    def foreign(shard):
+        return dataclasses.replace(
+            shard, attributes={**shard.attributes, **imported}, mass=-shard.mass
+        )
+
+    changed(dataset / FIRST, foreign)
+    assert "of another data set: its config_hash is '': expected " in one(dataset)
 
 
 def test_an_inverted_reference_is_found(dataset):

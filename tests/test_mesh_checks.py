@@ -70,6 +70,15 @@ def test_a_mirrored_mesh_is_told_from_a_bad_cell():
     assert "mirror" not in str(refused.value)
 
 
+def test_lexicographic_node_order_is_told_from_a_mirrored_mesh():
+    mesh = grid(3, 2, 1)
+    order = [0, 1, 3, 2, 4, 5, 7, 6]
+    with pytest.raises(MeshError, match="lexicographic one with x fastest") as refused:
+        HexMesh.create(mesh.positions, mesh.cells[:, np.argsort(order)])
+    assert f"Take nodes {', '.join(map(str, order))} of every cell" in str(refused.value)
+    assert "mirror" not in str(refused.value)
+
+
 def test_duplicate_nodes_are_named_both_with_their_places():
     left, right = grid(2, 1, 1), grid(1, 1, 1)
     right = HexMesh.create(right.positions + np.array([2, 0, 0]), right.cells)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Optional
@@ -127,26 +127,60 @@ def export(
     folder: Folder,
     target: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
     to: Annotated[Layout, typer.Option(help="Layout.")] = Layout.meshgraphnet,
-    base: Annotated[
-        str, typer.Option(help="meshgraphnet: run whose predictions are given as base_pos.")
-    ] = "plain",
-    split: Annotated[str, typer.Option(help="vtu: split.")] = "evaluation",
-    mesh: Annotated[int, typer.Option(help="vtu: number of the mesh.", min=0)] = 0,
-    simulation: Annotated[int, typer.Option(help="vtu: number of the simulation.", min=0)] = 0,
-    run: Annotated[
-        Optional[list[str]], typer.Option(help="vtu: run beside the reference; repeatable.")
+    split: Annotated[
+        Optional[str],
+        typer.Option(help="The only split; meshgraphnet: all by default; vtu: evaluation."),
     ] = None,
+    base: Annotated[
+        Optional[str],
+        typer.Option(help="meshgraphnet: run whose predictions are given as base_pos; plain."),
+    ] = None,
+    mesh: Annotated[Optional[int], typer.Option(help="vtu: number of the mesh; 0.", min=0)] = None,
+    simulation: Annotated[
+        Optional[int], typer.Option(help="vtu: number of the simulation; 0.", min=0)
+    ] = None,
+    run: Annotated[
+        Optional[list[str]],
+        typer.Option(help="vtu: run beside the reference; repeatable; plain, if there is one."),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Delete the files of an earlier export first.")
+    ] = False,
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
     from pdcorrect.data import export as exports
 
     if to is Layout.meshgraphnet:
-        written = exports.export_meshgraphnet(folder, target, base=base)
+        _unused(to, {"--mesh": mesh, "--simulation": simulation, "--run": run})
+        with contextlib.suppress(InputError):  # of config.toml, which no export needs
+            _warn_of_missing(exports.missing_files(folder, split))
+        written = exports.export_meshgraphnet(
+            folder, target, base=base or "plain", split=split, overwrite=overwrite
+        )
     else:
-        runs = ("plain",) if run is None else tuple(run)
-        written = exports.export_vtu(folder, target, split, mesh, simulation, runs)
+        _unused(to, {"--base": base})
+        written = exports.export_vtu(
+            folder, target, split or "evaluation", mesh or 0, simulation or 0, run,
+            overwrite=overwrite,
+        )  # fmt: skip
     for path in written:
         typer.echo(f"wrote {path}")
+
+
+def _unused(to: Layout, options: Mapping[str, object]) -> None:
+    """Refuse options that do nothing in a layout."""
+    for name, value in options.items():
+        if value is not None and value != []:
+            raise InputError(f"{name} with --to {to}: it has no use there; leave it out.")
+
+
+def _warn_of_missing(paths: Sequence[Path]) -> None:
+    if paths:
+        typer.echo(
+            f"warning: the data set is incomplete: {len(paths)} of the files that its config.toml "
+            f"asks for are missing, as {paths[0]}.",
+            err=True,
+        )
 
 
 @app.command("import")
@@ -164,16 +198,13 @@ def import_(
     ] = None,
     split: Annotated[str, typer.Option(help="Split.")] = "training",
     number: Annotated[int, typer.Option(help="Number of the mesh in the split.", min=0)] = 0,
-    moved: Annotated[bool, typer.Option(help=".npz: frame 0 need not be the rest shape.")] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
     from pdcorrect.data.import_files import import_trajectories
 
     if "/" in split or split in ("", ".", ".."):
         raise InputError(f"--split {split!r}: expected a name.")
-    path = import_trajectories(
-        sources, output, coarse=coarse or (), split=split, number=number, starts_at_rest=not moved
-    )
+    path = import_trajectories(sources, output, coarse=coarse or (), split=split, number=number)
     typer.echo(f"wrote {path}")
 
 

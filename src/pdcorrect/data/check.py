@@ -192,6 +192,13 @@ class _Check:
         except InputError as error:
             self.error(path, _reason(path, error))
             return
+        found = shard.attributes["config_hash"]
+        if self.config is not None and found != self.config.hash():
+            wanted = self.config.hash()
+            self.error(
+                path, f"of another data set: its config_hash is {found!r}: expected {wanted!r}"
+            )
+            return
         try:
             HexMesh.create(shard.points, shard.cells.astype(np.int64))
         except MeshError as error:
@@ -210,9 +217,10 @@ class _Check:
         plan = self.plans.get(path) if self.plans is not None else None
         if self.config is not None:
             wanted |= {
-                "config_hash": self.config.hash(), "dataset": self.config.name,
-                "setting": self.config.setting, "tolerance": self.config.tolerance,
-            }  # fmt: skip
+                "dataset": self.config.name,
+                "setting": self.config.setting,
+                "tolerance": self.config.tolerance,
+            }
         if plan is not None:
             wanted["time_step"] = plan.step
         for name, value in wanted.items():

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,10 +14,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.graph import node_means, tetrahedra, velocities
-from pdcorrect.data.schema import REFERENCE, SUFFIX, Shard, Simulation
+from pdcorrect.data.plan import make_plan
+from pdcorrect.data.schema import CONFIG, PLAIN, REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
@@ -26,12 +30,23 @@ NORMAL, HANDLE = 0, 3
 
 _SPLITS = {TRAINING: "train", VALIDATION: "valid", EVALUATION: "test"}
 _DYNAMIC = ("world_pos", "base_pos", "forces")
+_SIMULATOR = "pdcorrect"
+"""In ``meta.json``."""
+_SERIES = re.compile(r".+-\d{4,}-\d+-.+(\.pvd|_\d{4,}\.vtu)")
+"""Names of the files of `export_vtu`."""
+_STAGING = "export.part"
+"""Folder in the target of what is not whole yet."""
 
 Array = NDArray[Any]
 
 
 def export_meshgraphnet(
-    folder: str | Path, target: str | Path, *, base: str = "plain"
+    folder: str | Path,
+    target: str | Path,
+    *,
+    base: str = PLAIN,
+    split: str | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write a data set in the layout of DeepMind's MeshGraphNet data sets, as HDF5.
 
@@ -60,6 +75,10 @@ def export_meshgraphnet(
     folder, target : path
     base : str
         Run whose predictions become ``base_pos``.
+    split : str, optional
+        The only one to write; all by default.
+    overwrite : bool
+        Delete the files of an earlier export in ``target``.
 
     Returns
     -------
@@ -69,16 +88,23 @@ def export_meshgraphnet(
     Raises
     ------
     InputError
-        If there is no data set, the base model's predictions are missing, or a split has
-        trajectories of different lengths.
+        If there is no data set or no such split, the base model's predictions are missing, or
+        a split has trajectories of different lengths.
     OutputError
-        If ``target`` cannot be written.
+        If ``target`` cannot be written, or holds files of an export already.
     """
-    target, written = Path(target), []
-    make_folder(target)
     splits = sorted(splits_of(folder), key=lambda name: (name not in _SPLITS, name))
     if TRAINING in splits:
         splits.insert(0, splits.pop(splits.index(TRAINING)))
+    if split is not None:
+        shard_paths(folder, split)
+        splits = [split]
+    with _staging(Path(target), overwrite) as staging:
+        return _placed(_write_splits(staging, folder, splits, base), Path(target))
+
+
+def _write_splits(target: Path, folder: str | Path, splits: Sequence[str], base: str) -> list[Path]:
+    written: list[Path] = []
     common: dict[str, Any] | None = None
     for split in splits:
         name = _SPLITS.get(split, f"extra-{split}" if split in _SPLITS.values() else split)
@@ -100,7 +126,9 @@ def export_vtu(
     split: str,
     mesh: int,
     simulation: int,
-    runs: Sequence[str] = ("plain",),
+    runs: Sequence[str] | None = None,
+    *,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Write a simulation's reference and runs as VTU series for ParaView.
 
@@ -114,20 +142,23 @@ def export_vtu(
     split : str
     mesh, simulation : int
         Number of the mesh in the split, and of the simulation on it.
-    runs : sequence of str
-        With rollouts.
+    runs : sequence of str, optional
+        With rollouts; "plain" by default, if it has one.
+    overwrite : bool
+        Delete the files of an earlier export in ``target``.
 
     Returns
     -------
     list of Path
-        PVD files, ``reference.pvd`` first.
+        PVD files, the reference's first, ``SPLIT-MMMM-K-reference.pvd`` of mesh MMMM and
+        simulation K.
 
     Raises
     ------
     InputError
         If there is no such simulation or run.
     OutputError
-        If ``target`` cannot be written.
+        If ``target`` cannot be written, or holds files of an export already.
     """
     shard = read_shard(_shard_path(folder, split, mesh))
     if not 0 <= simulation < len(shard.simulations):
@@ -136,10 +167,106 @@ def export_vtu(
             f"expected 0 to {len(shard.simulations) - 1}."
         )
     found = shard.simulations[simulation]
-    names = [REFERENCE, *(name for name in runs if name != REFERENCE)]
+    names = [REFERENCE, *(name for name in _chosen(found, runs) if name != REFERENCE)]
     for name in names:
         _positions(found, name)
-    return [_write_series(shard, found, name, Path(target)) for name in names]
+    series = f"{split}-{mesh:04d}-{simulation}"
+    with _staging(Path(target), overwrite) as staging:
+        written = [_write_series(shard, found, name, staging, series) for name in names]
+        return _placed(written, Path(target))
+
+
+def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
+    """Files that a data set's ``config.toml`` asks for and that are not there.
+
+    Parameters
+    ----------
+    folder : path
+    split : str, optional
+        The only one to look at; all by default.
+
+    Raises
+    ------
+    InputError
+        If the configuration cannot be used.
+    """
+    folder = Path(folder)
+    if not (folder / CONFIG).exists():
+        return []
+    plans = make_plan(DatasetConfig.load(folder / CONFIG))
+    paths = [folder / f"{p.name}{SUFFIX}" for p in plans if split in (None, p.split)]
+    return [path for path in paths if not path.exists()]
+
+
+@contextlib.contextmanager
+def _staging(target: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder in ``target`` to write to, which is gone in the end.
+
+    If that fails, ``target`` is as it was before.
+    """
+    earlier = _exported(target)
+    if earlier and not overwrite:
+        raise OutputError(
+            f"{target}: holds files of an export already, as {earlier[0].name}; choose another "
+            "folder, or delete them with --overwrite (overwrite=True)."
+        )
+    existed = target.is_dir()
+    staging = target / _STAGING
+    shutil.rmtree(staging, ignore_errors=True)
+    make_folder(staging)
+    try:
+        yield staging
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+        if not existed:
+            with contextlib.suppress(OSError):  # not empty: it was filled
+                target.rmdir()
+
+
+def _placed(written: Sequence[Path], target: Path) -> list[Path]:
+    """Move all files of the staging folder to ``target``, instead of an earlier export's."""
+    try:
+        earlier, new = _exported(target), sorted((target / _STAGING).iterdir())
+        for place in (target / path.name for path in new):
+            if place.exists() and place not in earlier:
+                raise OutputError(f"{place}: exists already, not from an export; move it first.")
+        for path in earlier:
+            path.unlink()
+        for path in new:
+            path.replace(target / path.name)
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written ({error.strerror or error}).") from None
+    return [target / path.name for path in written]
+
+
+def _exported(target: Path) -> list[Path]:
+    """Files of earlier exports in a folder; their content or name tells."""
+    if not target.is_dir():
+        return []
+    return [path for path in sorted(target.iterdir()) if path.is_file() and _is_exported(path)]
+
+
+def _is_exported(path: Path) -> bool:
+    if path.suffix == ".json":
+        with contextlib.suppress(OSError, ValueError, RecursionError):
+            meta = json.loads(path.read_text(encoding="utf-8"))
+            return isinstance(meta, dict) and meta.get("simulator") == _SIMULATOR
+        return False
+    if path.suffix == ".h5":
+        with contextlib.suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
+            return "0/world_pos" in file and "0/mesh_pos" in file
+        return False
+    return _SERIES.fullmatch(path.name) is not None
+
+
+def _chosen(simulation: Simulation, runs: Sequence[str] | None) -> Sequence[str]:
+    """Runs to write beside the reference."""
+    if runs is not None:
+        return runs
+    plain = simulation.runs.get(PLAIN)
+    return () if plain is None or plain.positions is None else (PLAIN,)
 
 
 def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
@@ -172,9 +299,7 @@ def _fields(where: str, shard: Shard, simulation: Simulation, base: str) -> dict
     run = simulation.runs.get(base)
     if run is None or run.predictions is None:
         names = [name for name, each in simulation.runs.items() if each.predictions is not None]
-        raise InputError(
-            f"{where}: no predictions of run {base!r}: expected one of {', '.join(names)}."
-        )
+        raise InputError(f"{where}: no predictions of run {base!r}: {_expected(names)}.")
     world, nodes = _positions(simulation, REFERENCE), len(shard.points)
     handles = np.where(shard.free.any(axis=1), NORMAL, HANDLE)
     moduli = {name: getattr(shard, name) for name in ("young", "poisson", "density")}
@@ -208,7 +333,7 @@ def _meta(fields: dict[str, Array], time_step: float) -> dict[str, Any]:
         for name, values in fields.items()
     }
     return {
-        "simulator": "pdcorrect",
+        "simulator": _SIMULATOR,
         "dt": time_step,
         "trajectory_length": frames,
         "field_names": list(fields),
@@ -236,11 +361,17 @@ def _positions(simulation: Simulation, name: str) -> Array:
     run = simulation.runs.get(name)
     if run is None or run.positions is None:
         names = [key for key, each in simulation.runs.items() if each.positions is not None]
-        raise InputError(f"no positions of run {name!r}: expected one of {', '.join(names)}.")
+        raise InputError(f"no positions of run {name!r}: {_expected(names)}.")
     return run.positions
 
 
-def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path) -> Path:
+def _expected(names: Sequence[str]) -> str:
+    return f"expected one of {', '.join(names)}" if names else "the simulation has none at all"
+
+
+def _write_series(
+    shard: Shard, simulation: Simulation, name: str, target: Path, series: str
+) -> Path:
     step = float(shard.attributes["time_step"])
     positions, reference = (
         np.asarray(_positions(simulation, each), dtype=np.float64) for each in (name, REFERENCE)
@@ -258,5 +389,6 @@ def _write_series(shard: Shard, simulation: Simulation, name: str, target: Path)
 
     moduli = {"young": shard.young, "poisson": shard.poisson, "density": shard.density}
     return write_vtu_series(
-        trajectory, target, name=name, point_data=points, cell_data=lambda frame: moduli
-    )
+        trajectory, target, name=f"{series}-{name}", point_data=points,
+        cell_data=lambda frame: moduli,
+    )  # fmt: skip

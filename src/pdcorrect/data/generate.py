@@ -218,7 +218,7 @@ def produce(
     provenance = _provenance(device)
     for plan, shard in zip(plans, shards, strict=True):
         path = folder / f"{plan.name}{SUFFIX}"
-        write_shard(path, replace(shard, provenance=provenance), config.dtype)
+        write_shard(path, replace(shard, provenance=provenance), config.dtype, overwrite=True)
     return plans
 
 

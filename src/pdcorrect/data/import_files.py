@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.import_checks import finite_array
-from pdcorrect.data.importing import Motion, shard_from_arrays
-from pdcorrect.data.schema import SUFFIX, Shard, write_shard
+from pdcorrect.data.importing import INTEGRATOR, Motion, shard_from_arrays
+from pdcorrect.data.schema import CONFIG, SUFFIX, Shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.fem.problem import discretise
+from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.io.trajectory import load_trajectory
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
@@ -34,8 +35,10 @@ def shard_from_trajectories(
 ) -> Shard:
     """A file of a data set from runs of ``pdcorrect simulate`` on one mesh, checked.
 
-    The scenes in the runs give mesh, material, clamps and loads.  References are restricted
-    to the coarse nodes; predictions are computed with `ProjectiveDynamics` on the coarse mesh.
+    The scenes in the runs give mesh, material, clamps and loads, and the coarse runs' where
+    there are any, else the references', element and masses of the coarse model.  References
+    are restricted to the coarse nodes; predictions are computed with `ProjectiveDynamics` on
+    the coarse mesh.
 
     Parameters
     ----------
@@ -49,8 +52,9 @@ def shard_from_trajectories(
     Raises
     ------
     InputError
-        If a run has no scene, the scenes differ in mesh, material, clamps or time step, or
-        a check of `shard_from_arrays` fails.
+        If a run has no scene, another material than it, another integrator than backward
+        Euler or does not start at rest, the runs differ in mesh, material, clamps or time step,
+        a coarse run also in loads from its reference, or a check of `shard_from_arrays` fails.
     """
     references = [reference] if isinstance(reference, Trajectory) else list(reference)
     rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())
@@ -77,7 +81,6 @@ def import_trajectories(
     dataset: str | None = None,
     split: str = "training",
     number: int = 0,
-    starts_at_rest: bool = True,
 ) -> Path:
     """Write a file of a data set from trajectory files or from an ``.npz`` file.
 
@@ -93,7 +96,7 @@ def import_trajectories(
         Trajectories of the coarse model, as many as sources.
     dataset : str, optional
         Its name; the folder's by default.
-    split, number, starts_at_rest
+    split, number
         See `shard_from_arrays`.
 
     Returns
@@ -104,8 +107,14 @@ def import_trajectories(
     Raises
     ------
     FileFormatError, InputError, OutputError
-        If a file cannot be read, fails a check, or the file exists already or cannot be written.
+        If a file cannot be read or fails a check, the folder is that of a generated data set,
+        or the file exists already or cannot be written.
     """
+    if (Path(folder) / CONFIG).exists():
+        raise InputError(
+            f"{folder} holds {CONFIG}, as a generated data set: expected a folder of its own for "
+            "imported files."
+        )
     path = Path(folder) / split / f"mesh-{number:04d}{SUFFIX}"
     if path.exists():
         raise InputError(f"{path} exists already: choose another number, or delete it first.")
@@ -116,7 +125,7 @@ def import_trajectories(
             raise InputError(
                 f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
             )
-        shard = _shard_of_npz(files[0], name, split, number, starts_at_rest)
+        shard = _shard_of_npz(files[0], name, split, number)
     else:
         runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
         shard = shard_from_trajectories(runs, others, dataset=name, split=split, number=number)
@@ -124,56 +133,92 @@ def import_trajectories(
     return path
 
 
-_SCALARS = ("young", "poisson", "density")
+_NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
 _MOTION = ("reference", "forces", "coarse", "predictions")
+_NUMBERED = re.compile(rf"({'|'.join(_MOTION)})_(0|[1-9]\d*)")
+_BODY = ("body", "material", "materials", "clamps", "loads", "damping")
+"""Sections of a scene in which a reference and its coarse run must agree."""
 
 
-def _shard_of_npz(path: Path, dataset: str, split: str, number: int, starts_at_rest: bool) -> Shard:
+def _shard_of_npz(path: Path, dataset: str, split: str, number: int) -> Shard:
+    arrays = _read_npz(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError) as error:
-        raise FileFormatError(f"{path}: cannot be read as .npz ({error}).") from None
-    needed = ("points", "cells", "free", *_SCALARS, "time_step")
-    missing = [name for name in needed if name not in arrays]
-    if missing:
-        raise InputError(f"{path}: no array {missing[0]!r}: expected {', '.join(needed)}.")
-    try:
+        missing = [name for name in _NEEDED if name not in arrays]
+        if missing:
+            raise InputError(f"no array {missing[0]!r}: expected {', '.join(_NEEDED)}.")
+        motions = _motions(arrays)
         return shard_from_arrays(
-            arrays["points"], arrays["cells"], _motions(path, arrays), free=arrays["free"],
-            **{name: arrays[name] for name in _SCALARS},
-            time_step=float(finite_array("time_step", arrays["time_step"], ())),
-            mass=arrays.get("mass"), dataset=dataset, split=split, number=number,
-            starts_at_rest=starts_at_rest,
+            motions=motions, mass=arrays.get("mass"), dataset=dataset, split=split, number=number,
+            **{name: arrays[name] for name in _NEEDED},
         )  # fmt: skip
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
 
 
-def _motions(path: Path, arrays: dict[str, Array]) -> list[Motion]:
-    if "reference" in arrays:
-        return [Motion(**{name: arrays[name] for name in _MOTION if name in arrays})]
-    motions: list[Motion] = []
-    while f"reference_{len(motions)}" in arrays:
-        names = {name: f"{name}_{len(motions)}" for name in _MOTION}
-        motions.append(Motion(**{k: arrays[name] for k, name in names.items() if name in arrays}))
-    if not motions:
-        raise InputError(f"{path}: no array 'reference' or 'reference_0'.")
-    return motions
+def _read_npz(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(len(_ARRAY))
+        if head == _ARRAY:
+            raise FileFormatError(
+                f"{path}: a single array, as .npy: expected an .npz of several, by numpy.savez."
+            )
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except FileFormatError:
+        raise
+    except Exception as error:  # zip, zlib and NumPy raise nearly every type on damaged bytes
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise FileFormatError(
+            f"{path}: cannot be read as .npz ({reason or type(error).__name__})."
+        ) from None
+
+
+_ARRAY = b"\x93NUMPY"
+"""How an .npy file begins."""
+
+
+def _motions(arrays: dict[str, Any]) -> list[Motion]:
+    count = 0
+    while f"reference_{count}" in arrays:
+        count += 1
+    if "reference" in arrays and count:
+        raise InputError("arrays 'reference' and 'reference_0': expected one of them.")
+    if "reference" not in arrays and not count:
+        raise InputError("no array 'reference' or 'reference_0': expected one of them.")
+    names = (
+        [{name: f"{name}_{k}" for name in _MOTION} for k in range(count)]
+        if count
+        else [{name: name for name in _MOTION}]
+    )
+    known = {*_NEEDED, "mass", *(name for one in names for name in one.values())}
+    for name in arrays:
+        if name not in known:
+            raise InputError(f"array {name!r}: {_advice(name, count, known)}")
+    return [Motion(**{k: arrays[n] for k, n in one.items() if n in arrays}) for one in names]
+
+
+def _advice(name: str, count: int, known: set[str]) -> str:
+    """What was expected instead of an array that is not known."""
+    if _NUMBERED.fullmatch(name) and count:
+        last = f"reference_{count - 1}"
+        return f"the references end with {last!r}: expected numbers 0, 1, 2, … without gaps."
+    if _NUMBERED.fullmatch(name) or name in _MOTION:
+        other = "with numbers, as 'reference_0'" if count else "without number, as 'reference'"
+        return f"expected it {other}."
+    close = get_close_matches(name, sorted(known), n=1)
+    return f"unknown; did you mean {close[0]!r}?" if close else "unknown: remove or rename it."
 
 
 def _shard_of_run(
     run: Trajectory, coarse: Trajectory | None, dataset: str, split: str, number: int
 ) -> Shard:
-    if not run.scene_toml:
-        raise InputError(
-            "the reference has no scene: expected a run of pdcorrect simulate; for others use "
-            "shard_from_arrays."
-        )
-    scene = Scene.from_toml(run.scene_toml)
+    scene = _scene("the reference", run)
+    if coarse is not None:
+        scene = _scene_of_coarse(coarse, run, scene)
     problem = discretise(scene)
     step = _uniform_step(run)
-    rollout = None if coarse is None else restrict(coarse, problem).positions
+    rollout = None if coarse is None else _on_coarse_mesh(coarse, problem)
     motion = Motion(restrict(run, problem).positions, coarse=rollout)
     materials = problem.materials
     return shard_from_arrays(
@@ -182,6 +227,67 @@ def _shard_of_run(
         poisson=materials.poisson, density=materials.density, time_step=step,
         dataset=dataset, split=split, number=number, scene=scene,
     )  # fmt: skip
+
+
+def _scene(name: str, run: Trajectory) -> Scene:
+    """The scene of a run that a file of a data set can be made of."""
+    if not run.scene_toml:
+        raise InputError(
+            f"{name} has no scene: expected a run of pdcorrect simulate; for others use "
+            "shard_from_arrays."
+        )
+    if run.attributes.get("material") == "changed after the scene":
+        raise InputError(
+            f"{name} has another material than its scene, changed after it was read: expected "
+            "the scene's; for others use shard_from_arrays."
+        )
+    scene = Scene.from_toml(run.scene_toml)
+    integrator = run.attributes.get("integrator", scene.time.integrator)
+    if {integrator, scene.time.integrator} != {INTEGRATOR}:
+        other = scene.time.integrator if integrator == INTEGRATOR else integrator
+        raise InputError(
+            f"{name} has the integrator {other!r}: expected {INTEGRATOR!r}, for the velocities of "
+            "a data set are backward differences of its positions, and its predictions start "
+            "from them."
+        )
+    if run.times[0] != 0 or run.velocities[0].any():
+        raise InputError(
+            f"{name} starts at {run.times[0]:g} s with velocities up to "
+            f"{np.abs(run.velocities[0]).max():.3g} m/s: expected a start at 0 s, at rest."
+        )
+    return scene
+
+
+def _scene_of_coarse(coarse: Trajectory, run: Trajectory, reference: Scene) -> Scene:
+    """The scene of a coarse run, if it simulates the same as the reference."""
+    scene = _scene("the coarse run", coarse)
+    for section in _BODY:
+        if getattr(scene, section) != getattr(reference, section):
+            raise InputError(
+                f"the scenes of the reference and the coarse run differ in {section}: expected "
+                f"equal {', '.join(_BODY)}."
+            )
+    if len(coarse) != len(run):
+        raise InputError(
+            f"the coarse run has {len(coarse)} steps, the reference {len(run)}: expected as many."
+        )
+    if not np.allclose(coarse.times, run.times, rtol=1e-6, atol=0):
+        frame = int(np.argmax(~np.isclose(coarse.times, run.times, rtol=1e-6, atol=0)))
+        raise InputError(
+            f"frame {frame} of the coarse run is at {coarse.times[frame]:g} s, that of the "
+            f"reference at {run.times[frame]:g} s: expected equal times."
+        )
+    return scene
+
+
+def _on_coarse_mesh(run: Trajectory, problem: Problem) -> Array:
+    """Positions of a run on the nodes of the coarse mesh, which must be its own, m."""
+    if len(run.points) != len(problem.positions):
+        raise InputError(
+            f"the coarse run has {len(run.points)} nodes, the coarse mesh of its scene "
+            f"{len(problem.positions)}: expected a run with --refine 1."
+        )
+    return restrict(run, problem).positions
 
 
 def _uniform_step(run: Trajectory) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,12 +12,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.import_checks import (
+    bool_array,
     check_moduli,
-    check_rest,
     check_volumes,
     finite_array,
+    from_rest,
+    integer_array,
     optional_array,
     per_cell,
+    real_array,
+    with_held_nodes,
 )
 from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import InputError
@@ -34,6 +39,8 @@ from pdcorrect.state import State
 Array = NDArray[Any]
 
 SETTING = "imported"
+INTEGRATOR = "backward-euler"
+"""The one that velocities and predictions of a data set suppose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +68,7 @@ class Motion:
 def shard_from_arrays(
     points: ArrayLike,
     cells: ArrayLike,
-    motions: Sequence[Motion],
+    motions: Motion | Sequence[Motion],
     *,
     free: ArrayLike,
     young: ArrayLike,
@@ -73,7 +80,6 @@ def shard_from_arrays(
     number: int = 0,
     mass: ArrayLike | None = None,
     scene: Scene | None = None,
-    starts_at_rest: bool = True,
 ) -> Shard:
     """A file of a data set from the arrays of any solver, checked.
 
@@ -83,10 +89,10 @@ def shard_from_arrays(
         Rest positions of the coarse mesh, m.
     cells : (C, 8)
         Node numbers, VTK order.
-    motions : sequence of Motion
+    motions : Motion or sequence of Motion
         At least one.
     free : (N, 3) bool
-        Components that may move.
+        Components that may move, or 1 for them and 0 for the others, which stay at rest.
     young, poisson, density : float or (C,)
         Pa, dimensionless, kg/m3.
     time_step : float
@@ -96,10 +102,9 @@ def shard_from_arrays(
     mass : (N,), optional
         kg; by default the scene's, or the density integrated with the shape functions.
     scene : Scene, optional
-        Of the coarse model, whose mesh must be this one.  With it, missing forces are its
-        loads and missing predictions are computed with `ProjectiveDynamics`.
-    starts_at_rest : bool
-        Whether frame 0 of each motion must be the rest shape.
+        Of the coarse model, by backward Euler, whose mesh, material and clamps must be these.
+        With it, missing forces are its loads and missing predictions are computed with
+        `ProjectiveDynamics`.  Its time step is replaced by this one.
 
     Returns
     -------
@@ -111,24 +116,26 @@ def shard_from_arrays(
     MeshError
         If the mesh has a cell that is inverted, collapsed or not connected.
     InputError
-        If an array has a wrong shape or is not finite, frame 0 has moved, or a cell of the
-        reference is inverted; names simulation, frame and cell or node.
+        If an array has a wrong type or shape or is not finite, frame 0 or a held node has
+        moved, a cell of the reference is inverted, or the scene is another; names simulation,
+        frame and cell or node.
     """
-    mesh = HexMesh.create(np.asarray(points), np.asarray(cells))
+    motions = [motions] if isinstance(motions, Motion) else list(motions)
+    mesh = HexMesh.create(real_array("points", points), integer_array("cells", cells))
     count, nodes = len(mesh.cells), len(mesh.positions)
     moduli = {
         name: per_cell(name, values, count)
         for name, values in (("young", young), ("poisson", poisson), ("density", density))
     }
+    time_step = float(finite_array("time_step", time_step, ()))
     check_moduli(moduli, time_step)
     if not motions:
         raise InputError("no simulations: expected at least one.")
-    fixed = np.asarray(free)
-    if fixed.dtype != np.bool_ or fixed.shape != (nodes, 3):
-        raise InputError(
-            f"free: {fixed.dtype} of shape {fixed.shape}: expected bool of shape ({nodes}, 3)."
-        )
-    stepper = _stepper(scene, mesh, time_step) if scene is not None else None
+    movable = bool_array("free", free, (nodes, 3))
+    stepper = None
+    if scene is not None:
+        scene, time_step = _in_step(scene, time_step)
+        stepper = _stepper(scene, mesh, {"free": movable, **moduli})
     if mass is not None:
         masses = finite_array("mass", mass, (nodes,))
     else:
@@ -136,17 +143,18 @@ def shard_from_arrays(
     if (masses <= 0).any():
         raise InputError("mass: expected more than 0 kg at every node.")
     simulations = tuple(
-        _simulation(f"simulation {k}", motion, mesh, stepper, time_step, starts_at_rest)
+        _simulation(f"simulation {k}", motion, mesh, movable, stepper, time_step)
         for k, motion in enumerate(motions)
     )
+    _check_alike(simulations)
     if scene is not None:
         simulations = tuple(replace(one, scene_toml=scene.to_toml()) for one in simulations)
     return Shard(
         attributes={
             "dataset": dataset, "split": split, "number": number, "setting": SETTING,
-            "config_hash": "", "time_step": float(time_step), "tolerance": _tolerance(scene),
+            "config_hash": "", "time_step": time_step, "tolerance": _tolerance(scene),
         },
-        points=mesh.positions, cells=mesh.cells, free=fixed, mass=masses,
+        points=mesh.positions, cells=mesh.cells, free=movable, mass=masses,
         young=moduli["young"], poisson=moduli["poisson"], density=moduli["density"],
         simulations=simulations,
     )  # fmt: skip
@@ -156,20 +164,23 @@ def _simulation(
     where: str,
     motion: Motion,
     mesh: HexMesh,
+    free: Array,
     stepper: ProjectiveDynamics | None,
     time_step: float,
-    starts_at_rest: bool,
 ) -> Simulation:
-    frames, nodes = len(np.asarray(motion.reference)), len(mesh.positions)
-    if frames < 2:
-        raise InputError(f"{where}, reference: {frames} frames: expected 2 or more.")
+    if not isinstance(motion, Motion):
+        raise InputError(f"{where}: {type(motion).__name__}: expected Motion.")
+    nodes = len(mesh.positions)
+    frames = _frames(f"{where}, reference", motion.reference)
     every, steps = (frames, nodes, 3), (frames - 1, nodes, 3)
     reference = finite_array(f"{where}, reference", motion.reference, every)
-    coarse = optional_array(f"{where}, coarse", motion.coarse, every)
-    for name, positions in (("reference", reference), ("coarse", coarse)):
-        if starts_at_rest and positions is not None:
-            check_rest(f"{where}, {name}", positions[0], mesh)
+    reference = from_rest(f"{where}, reference", reference, mesh)
     check_volumes(f"{where}, reference", reference, mesh)
+    reference = with_held_nodes(f"{where}, reference", reference, mesh, free)
+    coarse = optional_array(f"{where}, coarse", motion.coarse, every)
+    if coarse is not None:
+        coarse = from_rest(f"{where}, coarse", coarse, mesh)
+        coarse = with_held_nodes(f"{where}, coarse", coarse, mesh, free)
     forces = optional_array(f"{where}, forces", motion.forces, steps)
     predictions = optional_array(f"{where}, predictions", motion.predictions, steps)
     if stepper is not None:
@@ -177,19 +188,64 @@ def _simulation(
             predictions = _predict(stepper, reference, time_step)
         if forces is None:
             forces = _loads(stepper.problem, reference, time_step)
+    if predictions is not None:
+        predictions = with_held_nodes(f"{where}, predictions", predictions, mesh, free)
     runs = {REFERENCE: Run(reference, attributes={"solver": "imported", "time_step": time_step})}
     if coarse is not None or predictions is not None:
         runs[PLAIN] = Run(coarse, predictions, attributes={"time_step": time_step})
     return Simulation(np.zeros(steps) if forces is None else forces, runs)
 
 
-def _stepper(scene: Scene, mesh: HexMesh, time_step: float) -> ProjectiveDynamics:
+def _check_alike(simulations: Sequence[Simulation]) -> None:
+    """Refuse simulations of which one has a rollout or predictions and another has not."""
+    for name in ("positions", "predictions"):
+        given = [getattr(one.runs.get(PLAIN), name, None) is not None for one in simulations]
+        if any(given) and not all(given):
+            word = "coarse" if name == "positions" else name
+            raise InputError(
+                f"simulation {given.index(False)} has no {word}, unlike simulation "
+                f"{given.index(True)}: expected {word} of all simulations of a mesh, or of none."
+            )
+
+
+def _frames(name: str, positions: ArrayLike) -> int:
+    """T + 1, of positions (T+1, N, 3)."""
+    shape = real_array(name, positions).shape
+    if len(shape) != 3:
+        raise InputError(f"{name}: shape {shape}: expected (T + 1, N, 3).")
+    if shape[0] < 2:
+        raise InputError(f"{name}: {shape[0]} frames: expected 2 or more.")
+    return shape[0]
+
+
+def _in_step(scene: Scene, time_step: float) -> tuple[Scene, float]:
+    """A scene and a time step (s) that agree: where they nearly do, by the scene's."""
+    if math.isclose(time_step, scene.time.step, rel_tol=1e-6):
+        return scene, scene.time.step
+    return scene.with_changes(time={"step": time_step}), time_step
+
+
+def _stepper(scene: Scene, mesh: HexMesh, body: dict[str, Array]) -> ProjectiveDynamics:
+    """The scene's coarse model, if it is of this mesh, material and clamps."""
+    if scene.time.integrator != INTEGRATOR:
+        raise InputError(
+            f"scene: its time.integrator is {scene.time.integrator!r}: expected {INTEGRATOR!r}, "
+            "for predictions start from backward differences of the positions."
+        )
     problem = discretise(scene)
     if not np.array_equal(problem.mesh.cells, mesh.cells) or not np.allclose(
         problem.mesh.positions, mesh.positions, rtol=0, atol=1e-9
     ):
         raise InputError("scene: its coarse mesh is not the one given: expected equal nodes.")
-    return ProjectiveDynamics(problem, time_step=time_step)
+    materials = problem.materials
+    found = {
+        "free": problem.free[: len(mesh.positions)], "young": materials.young,
+        "poisson": materials.poisson, "density": materials.density,
+    }  # fmt: skip
+    for name, values in found.items():
+        if not np.allclose(values, body[name], rtol=1e-9, atol=0):
+            raise InputError(f"scene: its {name} is not the one given: expected equal values.")
+    return ProjectiveDynamics(problem)
 
 
 def _predict(stepper: ProjectiveDynamics, reference: Array, time_step: float) -> Array:

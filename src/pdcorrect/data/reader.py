@@ -327,9 +327,11 @@ def _unchanged(batch: Any) -> Any:
 def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> None:
     for k, (rollouts, predictions) in enumerate(header.runs):
         if base is not None and base not in predictions:
+            names = sorted(predictions)
+            found = f"expected one of {', '.join(names)}" if names else "it has none at all"
             raise InputError(
-                f"{header.path}: simulation {k} has no predictions of run {base!r}: expected one "
-                f"of {', '.join(sorted(predictions)) or 'none'} (base=None leaves them out)."
+                f"{header.path}: simulation {k} has no predictions of run {base!r}: {found} "
+                "(base=None leaves them out)."
             )
         missing = sorted(set(runs) - rollouts)
         if missing:

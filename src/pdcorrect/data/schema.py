@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
-from pdcorrect.errors import OutputError
+from pdcorrect.errors import InputError, OutputError
 from pdcorrect.replacement import part_of_process, replacing
 
 REFERENCE, PLAIN = "reference", "plain"
@@ -162,22 +162,35 @@ ATTRIBUTES = {
 """Attributes of a `Shard` and their types."""
 
 
-def write_shard(path: Path, shard: Shard, dtype: str = "float32") -> str:
+def write_shard(
+    path: str | Path, shard: Shard, dtype: str = "float32", overwrite: bool = False
+) -> str:
     """Write a file whole or not at all; returns the hash of its content.
 
     Parameters
     ----------
-    path : Path
+    path : path
         In a folder that need not exist.
     shard : Shard
     dtype : {"float32", "float64"}
         Of forces and positions.
+    overwrite : bool
+        Replace an existing file.
 
     Raises
     ------
+    InputError
+        If the type is another.
     OutputError
-        If it cannot be written.
+        If the file exists already or cannot be written.
     """
+    path = Path(path)
+    if dtype not in ("float32", "float64"):
+        raise InputError(f"dtype = {dtype!r}: expected 'float32' or 'float64'.")
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"{path}: exists already; choose another name, or overwrite it with overwrite=True."
+        )
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK) as file:
         _fill(file, shard, np.dtype(dtype))

@@ -21,6 +21,9 @@ TOLERANCE = 1e-4
 _CHECKED_POINTS = np.concatenate([VTK_CORNERS, gauss_points(2), gauss_points(3)])
 """Where the Jacobian must be positive: the corners and both Gauss rules, (43, 3)."""
 
+_LEXICOGRAPHIC = [0, 1, 3, 2, 4, 5, 7, 6]
+"""Corners in VTK order, of cells that count them by x, then y, then z."""
+
 _MOST_CANDIDATES = 10**6
 """Pairs of a face and a node that are compared at a time."""
 
@@ -107,14 +110,25 @@ def check_cells(
         "order and a convex cell."
     )
     if 2 * bad > len(cells):
-        text += (
-            f" {bad} of the {len(cells)} cells are so: the mesh seems to use another node order, "
-            "most often the mirror image. Swap nodes 0-1-2-3 with 4-5-6-7 of every cell, or undo "
-            "the reflection of the coordinates."
-        )
+        text += f" {bad} of the {len(cells)} cells are so: {_other_order(positions, cells, points)}"
     elif bad > 1:
         text += f" {bad} of the {len(cells)} cells are so."
     raise MeshError(text)
+
+
+def _other_order(
+    positions: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
+) -> str:
+    """What to do about cells of which most are inverted."""
+    if jacobians(positions, cells[:, _LEXICOGRAPHIC], points).min() > 0:
+        return (
+            "the mesh uses another node order, the lexicographic one with x fastest. Take nodes "
+            f"{', '.join(map(str, _LEXICOGRAPHIC))} of every cell in this order."
+        )
+    return (
+        "the mesh seems to use another node order, most often the mirror image. Swap nodes "
+        "0-1-2-3 with 4-5-6-7 of every cell, or undo the reflection of the coordinates."
+    )
 
 
 def check_connections(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 from pdcorrect.errors import FileFormatError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_DATASET = b"pdcorrect-dataset "  # see pdcorrect.data.seal
 _SIZE = 48  # bytes of a version 3 superblock with 8-byte offsets
 _END, _CHECKSUM = 28, 44  # byte positions of the end-of-file address and the checksum
 _WORD = 0xFFFFFFFF
@@ -62,6 +63,10 @@ def read_superblock(path: Path) -> Superblock:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from None
     if not size:
         raise FileFormatError(f"{path}: the file is empty: expected an HDF5 trajectory.")
+    if head.startswith(_DATASET):
+        raise FileFormatError(
+            f"{path}: a file of a data set already: expected a trajectory of pdcorrect."
+        )
     if head[:8] != _SIGNATURE[: len(head)]:
         raise FileFormatError(f"{path}: not an HDF5 file: expected a trajectory of pdcorrect.")
     if len(head) < _SIZE:
