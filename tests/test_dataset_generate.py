@@ -65,7 +65,12 @@ def test_its_card_says_what_it_is_and_how_it_fares(generated, tmp_path):
         "| training | `best` |", "| evaluation | `plain` |", "3 frames of 0.01 s",
     ):  # fmt: skip
         assert words in text
-    with pytest.raises(InputError, match=r"no manifest.json: expected a complete data set"):
+    with pytest.raises(InputError, match=r"no config.toml: expected a generated data set"):
+        dataset_card(tmp_path, dataset_info(folder))
+    shutil.copy(folder / "config.toml", tmp_path)
+    with pytest.raises(
+        InputError, match=r"no manifest.json: expected a complete .* generate again"
+    ):
         dataset_card(tmp_path, dataset_info(folder))
 
 
@@ -476,6 +481,26 @@ def interrupted(config, folder, delay, workers):
                 os.kill(each.pid, signal.SIGKILL)
         psutil.wait_procs(every[1:], timeout=30)
     return process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_workers_without_further_words(tmp_path):
+    (tmp_path / "set.toml").write_text(small(frames=200).to_toml())
+    command = [
+        sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", tmp_path / "set.toml",
+        "-o", tmp_path / "set", "--workers", "2",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout.readline().startswith("0 of 4 simulations")
+    time.sleep(8)  # the workers have begun
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert re.fullmatch(
+        r"interrupted: \d of 4 simulations are there; the same command goes on\n", err
+    )
 
 
 @pytest.mark.slow

@@ -10,7 +10,10 @@ import asyncio
 import contextlib
 import hashlib
 import json
+import logging
 import re
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -397,8 +400,23 @@ def _client(distributed: Any, workers: Workers) -> Any:
     if workers.scheduler is not None:
         return _scheduler_client(distributed, workers.scheduler)
     names = {"n_workers": workers.count, "threads_per_worker": 1, "processes": True}
-    cluster = distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
+    quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
+    with _ctrl_c_ignored():
+        cluster = distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
     return distributed.Client(cluster, set_as_default=False)
+
+
+@contextlib.contextmanager
+def _ctrl_c_ignored() -> Iterator[None]:
+    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _scheduler_client(distributed: Any, address: str) -> Any:
