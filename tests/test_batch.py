@@ -1,7 +1,9 @@
 """Many scenes in one batch are many scenes one by one."""
 
+import gc
 import json
 import pickle
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -808,3 +810,17 @@ def test_a_volume_term_alone_is_solved_one_by_one():
     found, result = stepped(stepper, [problem.rest_state()], 1)
     assert result.statuses[0].ok
     assert furthest(alone(problem, problem.rest_state(), 1), found[0]) < 1e-9
+
+
+@on_every_device
+def test_a_stepper_that_is_dropped_frees_its_memory_at_once(device):
+    problems = [pc.discretise(unlike(k)) for k in range(3)]
+    stepper = pc.BatchStepper(problems, device=device)
+    stepper(stepper.rest_state())
+    known = weakref.ref(stepper._minimiser), weakref.ref(stepper)
+    gc.disable()
+    try:
+        del stepper
+        assert [ref() for ref in known] == [None, None]
+    finally:
+        gc.enable()

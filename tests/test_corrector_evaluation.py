@@ -437,6 +437,17 @@ def test_intervals_cover_the_true_mean_about_as_often_as_they_say():
     assert by_value / 200 < 0.8  # as if trajectories on one mesh told as much as others
 
 
+@pytest.mark.parametrize(("count", "least"), [(5, 0.9), (10, 0.93), (20, 0.93)])
+def test_intervals_of_few_meshes_cover_nearly_as_often_as_those_of_many(count, least):
+    rng = np.random.default_rng(1)
+    trials = 1000
+    hits = 0
+    for trial in range(trials):
+        low, high = mean_interval(rng.normal(size=count), range(count), trial, resamples=1000)
+        hits += low <= 0.0 <= high
+    assert least <= hits / trials <= 0.97
+
+
 def test_an_interval_of_equal_values_is_a_point_and_of_one_mesh_unknown():
     assert mean_interval([2.0] * 6, [0, 0, 1, 1, 2, 2]) == (2.0, 2.0)
     assert mean_interval([1.0, 2.0], [4, 4]) is None

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
@@ -47,6 +48,18 @@ class Phase(IntEnum):
     LIMIT = 5
 
 
+@dataclass
+class Improved:
+    """The first Hessian's inverse, improved by the pairs of the steps since the start."""
+
+    inverse: FirstHessian
+    history: BatchHistory
+
+    def __call__(self, r: Tensor) -> Tensor:
+        x = self.inverse(r)
+        return self.history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
+
+
 class BatchMinimiser:
     """L-BFGS on a `BatchObjective`.
 
@@ -57,6 +70,8 @@ class BatchMinimiser:
     tolerance : (B,)
         m, of each scene's estimated largest displacement from its minimum.
     max_iterations : int
+    history : BatchHistory, optional
+        Of steps under way.
 
     Attributes
     ----------
@@ -73,6 +88,7 @@ class BatchMinimiser:
         inverse: FirstHessian,
         tolerance: Tensor,
         max_iterations: int,
+        history: BatchHistory | None = None,
     ) -> None:
         self._objective, self._inverse = objective, inverse
         self._tolerance, self._most = tolerance, max_iterations
@@ -88,9 +104,10 @@ class BatchMinimiser:
         self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
         self._left = torch.zeros(2, dtype=torch.int64, device=rest.device)
         self._narrows = rest.device.type == "cpu" and scenes >= _FEW
-        self._history = BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
+        self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        self.linear_solver = BatchConjugateGradients(objective, self._precondition, recorder)
+        improved = Improved(inverse, self._history)
+        self.linear_solver = BatchConjugateGradients(objective, improved, recorder)
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._next)
         self._judge = recorder(self._conclude)
@@ -124,8 +141,8 @@ class BatchMinimiser:
         rows = left.nonzero()[:, 0]
         objective = self._objective.narrowed(rows)
         inverse = self._inverse.narrowed(objective.cells, rows)
-        part = BatchMinimiser(objective, inverse, self._tolerance[rows], self._most)
-        part._history = self._history.narrowed(rows)
+        history = self._history.narrowed(rows)
+        part = BatchMinimiser(objective, inverse, self._tolerance[rows], self._most, history)
         for name in (*_OUTCOME, *_PROGRESS):
             getattr(part, name).copy_(getattr(self, name)[rows])
         part._look()
@@ -137,10 +154,6 @@ class BatchMinimiser:
     def forget(self) -> None:
         """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
         self._history.clear(torch.ones_like(self._alive))
-
-    def _precondition(self, r: Tensor) -> Tensor:
-        x = self._inverse(r)
-        return self._history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
 
     def _kernel(self, function: Callable[..., Any]) -> Callable[..., Any]:
         return as_kernel(function, self.y.is_cuda)

@@ -11,6 +11,7 @@ import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from weakref import WeakMethod
 
 import torch
 
@@ -23,25 +24,36 @@ class Recorder:
         self._device = device
         self._pool: Any = None
 
-    def __call__(self, function: Callable[[], None]) -> Callable[[], None]:
-        """The function as something to replay.
+    def __call__(self, method: Callable[[], None]) -> Callable[[], None]:
+        """The method as something to replay, which does not keep the method's owner alive.
 
         On a GPU it is run twice for this, so what it works on must not matter yet.
         """
         if not self._on_gpu:
-            return function
+            return _unowned(method)
         with torch.cuda.device(self._device):
             stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                function()
-                function()
+                method()
+                method()
             torch.cuda.current_stream().wait_stream(stream)
             graph = torch.cuda.CUDAGraph()
             with _no_collection(), torch.cuda.graph(graph, pool=self._pool):
-                function()
+                method()
             self._pool = graph.pool()
         return graph.replay
+
+
+def _unowned(method: Callable[[], None]) -> Callable[[], None]:
+    known = WeakMethod(method)
+
+    def call() -> None:
+        found = known()
+        assert found is not None
+        found()
+
+    return call
 
 
 @contextmanager

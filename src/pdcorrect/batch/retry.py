@@ -26,8 +26,6 @@ class OneByOne:
     Parameters
     ----------
     cells : CellBatch
-    problem : callable
-        The problem of a scene, by its number, as it is now.
     tolerances : sequence of float
         The scenes', of their cell sizes.
     time_step, integrator
@@ -37,22 +35,27 @@ class OneByOne:
     def __init__(
         self,
         cells: CellBatch,
-        problem: Callable[[int], Problem],
         tolerances: Sequence[float],
         time_step: float,
         integrator: str,
     ) -> None:
-        self._cells, self._problem = cells, problem
-        self._tolerances = tolerances
+        self._cells, self._tolerances = cells, tolerances
         self._time_step, self._integrator = time_step, integrator
         self._steppers: dict[int, ProjectiveDynamics] = {}
 
     def __call__(
-        self, before: BatchState, forces: Tensor | None, result: BatchResult
+        self,
+        before: BatchState,
+        forces: Tensor | None,
+        result: BatchResult,
+        problem_now: Callable[[int], Problem],
     ) -> BatchResult:
-        """The result with those scenes' in it that now converged."""
+        """The result with those scenes' in it that now converged.
+
+        ``problem_now`` gives the problem of a scene, by its number, as it is now.
+        """
         failed = [i for i, status in enumerate(result.statuses) if status in _WORTH_IT]
-        found = {i: self._step(i, before, forces, result) for i in failed}
+        found = {i: self._step(i, before, forces, result, problem_now(i)) for i in failed}
         steps = {i: step for i, step in found.items() if step is not None}
         if not steps:
             return result
@@ -79,7 +82,12 @@ class OneByOne:
         )
 
     def _step(
-        self, i: int, before: BatchState, forces: Tensor | None, result: BatchResult
+        self,
+        i: int,
+        before: BatchState,
+        forces: Tensor | None,
+        result: BatchResult,
+        problem: Problem,
     ) -> StepResult | None:
         """The step of one scene; None, and the batch's own status stands, if that fails too."""
         extra = None
@@ -87,13 +95,12 @@ class OneByOne:
             rows = forces[i, : self._cells.node_counts[i]]
             extra = rows.detach().to("cpu", torch.float64).numpy()
         try:
-            found = self._stepper(i)(state_of(self._cells, before, i), extra)
+            found = self._stepper(i, problem)(state_of(self._cells, before, i), extra)
         except PdcorrectError:
             return None
         return found if set(found.state.memory) == set(result.state.memory) else None
 
-    def _stepper(self, i: int) -> ProjectiveDynamics:
-        problem = self._problem(i)
+    def _stepper(self, i: int, problem: Problem) -> ProjectiveDynamics:
         if i not in self._steppers or self._steppers[i].problem is not problem:
             self._steppers[i] = ProjectiveDynamics(
                 problem,

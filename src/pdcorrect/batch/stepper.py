@@ -143,9 +143,7 @@ class BatchStepper:
         self._lock = threading.RLock()
         self._minimiser: BatchMinimiser | None = None
         self._inverse: FirstHessian | None = None
-        self._one_by_one = OneByOne(
-            self.cells, self.problem_now, self.tolerances, self.time_step, self.integrator
-        )
+        self._one_by_one = OneByOne(self.cells, self.tolerances, self.time_step, self.integrator)
 
     def __getstate__(self) -> dict[str, Any]:
         left = ("_lock", "_minimiser", "_inverse", "_one_by_one")
@@ -312,7 +310,9 @@ class BatchStepper:
         """
         with self.alone():
             result = self._step(state, forces, guess)
-            return self._one_by_one(state, forces, result) if self._recover else result
+            if not self._recover:
+                return result
+            return self._one_by_one(state, forces, result, self.problem_now)
 
     def _step(self, state: BatchState, forces: Tensor | None, guess: Tensor | None) -> BatchResult:
         if guess is not None:

@@ -75,6 +75,8 @@ class Batched:
         return {"solver": self.solver, "engine": f"batches on {kind}"}
 
     def _stepper(self, problems: Sequence[Problem], divisor: int) -> BatchStepper:
+        if torch.device(self._device).type == "cuda":
+            torch.cuda.empty_cache()  # of the last stepper, since others may share the GPU
         return BatchStepper(
             problems,
             self._tolerance,

@@ -399,11 +399,19 @@ def _client(distributed: Any, workers: Workers) -> Any:
     """A client of the given scheduler, or of new processes on this machine."""
     if workers.scheduler is not None:
         return _scheduler_client(distributed, workers.scheduler)
-    names = {"n_workers": workers.count, "threads_per_worker": 1, "processes": True}
+    return distributed.Client(local_cluster(workers.count), set_as_default=False)
+
+
+def local_cluster(count: int) -> Any:
+    """A Dask cluster of ``count`` processes on this machine, each with one thread.
+
+    Its workers are named 0, 1, ..., by which each finds a GPU of its own.
+    """
+    distributed = require_extra("distributed", "cluster")
+    names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
     quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
     with _ctrl_c_ignored():
-        cluster = distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
-    return distributed.Client(cluster, set_as_default=False)
+        return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
 
 
 @contextlib.contextmanager

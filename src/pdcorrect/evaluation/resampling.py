@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from pdcorrect.errors import InputError
 
@@ -84,10 +85,13 @@ def mean_interval(
     resamples: int = RESAMPLES,
     level: float = LEVEL,
 ) -> tuple[float, float] | None:
-    """Percentile bootstrap interval of the mean (Efron and Tibshirani 1993, chapter 13).
+    """Expanded percentile bootstrap interval of the mean (Hesterberg 2015, section 5.2).
 
     Clusters are drawn with replacement, not values: trajectories on one mesh share its
-    shape and material, so they tell less than as many on different meshes.
+    shape and material, so they tell less than as many on different meshes.  With n clusters
+    the percentiles are those at which a normal variable with the deviation of a resample,
+    too small by sqrt((n - 1) / n), is Student's t with n - 1 degrees of freedom: 0.9 and
+    99.1 instead of 2.5 and 97.5 for ten clusters.
 
     Parameters
     ----------
@@ -121,8 +125,15 @@ def mean_interval(
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(names), size=(resamples, len(names)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    low, high = np.quantile(means, ((1 - level) / 2, (1 + level) / 2)).tolist()
+    tail = _expanded_tail(len(names), level)
+    low, high = np.quantile(means, (tail, 1.0 - tail)).tolist()
     return low, high
+
+
+def _expanded_tail(clusters: int, level: float) -> float:
+    """Share of the resamples below an interval."""
+    t = stats.t.ppf((1.0 + level) / 2.0, clusters - 1)
+    return float(stats.norm.cdf(-t * np.sqrt(clusters / (clusters - 1.0))))
 
 
 def over_seeds(means: Sequence[float]) -> SeedSummary:

@@ -1,0 +1,87 @@
+"""`datasets/make_all.py`: several sets by the same workers, each with its summary."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SET = """
+name = "{name}"
+seed = {seed}
+family = "cross"
+setting = "as-published"
+coarse_nodes = [72, 108]
+cell_size = 0.05
+step = 0.01
+frames = 3
+validation_share = 0.5
+
+[reference]
+refine = 2
+
+[material]
+young = [1.0e5, 4.0e5]
+poisson = [0.3, 0.45]
+density = [800.0, 1200.0]
+
+[motion]
+kind = "torsion"
+strength = [1.0, 4.0]
+
+[training]
+meshes = 2
+simulations = 2
+
+[evaluation]
+meshes = 1
+simulations = 1
+"""
+
+
+def make(folder, *options):
+    script = folder / "datasets" / "make_all.py"
+    command = [sys.executable, script, folder / "data", folder / "summaries", *options]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture
+def sets(tmp_path):
+    (tmp_path / "datasets").mkdir()
+    shutil.copy(ROOT / "datasets" / "make_all.py", tmp_path / "datasets")
+    for seed, name in enumerate(("one", "two")):
+        folder = tmp_path / "datasets" / name
+        folder.mkdir()
+        (folder / "config.toml").write_text(SET.format(name=name, seed=seed))
+    return tmp_path
+
+
+def test_sets_are_made_by_the_same_workers_and_summarised(sets):
+    said = make(sets, "one", "two", "--workers", "2")
+    for name in ("one", "two"):
+        assert f"{name}: 0 findings" in said
+        kept = {path.name for path in (sets / "summaries" / name).iterdir()}
+        expected = {"info.json", "README.md", "manifest.json", "statistics.json", "sample.h5"}
+        assert kept == expected
+        with h5py.File(sets / "summaries" / name / "sample.h5") as file:
+            assert file.attrs["dataset"] == name
+
+
+def test_a_set_that_cannot_be_made_does_not_keep_the_next_from_it(sets):
+    config = sets / "datasets" / "one" / "config.toml"
+    config.write_text(config.read_text().replace("frames = 3", "frames = none"))
+    said = make(sets, "one", "two")
+    assert "two: 0 findings" in said
+    assert not (sets / "summaries" / "one").exists()
+
+
+def test_without_time_nothing_is_begun(sets):
+    assert "no time left" in make(sets, "one", "--seconds", "-1")
+    assert not (sets / "data").exists()
