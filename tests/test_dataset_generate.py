@@ -25,7 +25,7 @@ from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
-from pdcorrect.progress import FileLines
+from pdcorrect.progress import FileBar, FileLines, progress_bar
 from pdcorrect.replacement import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
@@ -284,6 +284,24 @@ def test_a_damaged_file_is_named_before_it_is_made_again(capsys):
     assert rest.startswith("2 of 4 simulations are there, computing 2; ")
 
 
+def test_on_a_terminal_the_same_is_said_above_a_bar(capsys):
+    bar = progress_bar("simulations", apart=True)
+    shown = FileBar(bar)
+    assert shown.interrupted().startswith("interrupted before anything was computed")
+    with bar:
+        shown.begin(1, 4, ["training/mesh-0001"])
+        shown("training/mesh-0001", 3, 4, 2)
+    (task,) = bar.tasks
+    assert (task.completed, task.total, task.description) == (3, 4, "training/mesh-0001")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "training/mesh-0001 is damaged: computed again" in err
+    assert "1 of 4 simulations are there, computing 3" in err
+    assert shown.interrupted() == (
+        "interrupted: 3 of 4 simulations are there; the same command goes on"
+    )
+
+
 def test_the_program_says_which_splits_are_complete(program, tmp_path):
     path, folder = tmp_path / "set.toml", tmp_path / "set"
     path.write_text(small(frames=1).to_toml())
@@ -371,6 +389,15 @@ def test_a_file_in_place_of_the_folder_is_bad_input(program, tmp_path):
     status, _, err = program("dataset", "generate", path, "-o", path)
     assert status == 2
     assert "set.toml: not a folder: expected that of a data set, or a new one" in err
+
+
+def test_negative_seconds_are_bad_input(program, tmp_path):
+    path = tmp_path / "set.toml"
+    path.write_text(small().to_toml())
+    status, _, err = program("dataset", "generate", path, "-o", tmp_path / "s", "--seconds", "-1")
+    assert status == 2
+    assert "--seconds" in err
+    assert not (tmp_path / "s").exists()
 
 
 def test_impossible_numbers_of_workers_are_refused():

@@ -78,7 +78,7 @@ class FileLines:
     def interrupted(self) -> str:
         """What to tell after an interruption."""
         if not self.total:
-            return "interrupted: nothing was computed; the same command begins again"
+            return "interrupted before anything was computed; the same command goes on"
         counts = f"{self.done} of {self.total} simulations are there"
         return f"interrupted: {counts}; the same command goes on"
 

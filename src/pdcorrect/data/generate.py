@@ -150,7 +150,8 @@ def generate(
     config : DatasetConfig
     folder : path
         New, or of a generation of the same configuration that was interrupted.  One that was
-        begun with another configuration is taken over as long as it holds no file of a mesh.
+        begun with another configuration is taken over as long as it holds no file of a mesh
+        and its ``config.toml`` is as it was written.
     workers : Workers
     splits : sequence of str, optional
         Only these.
