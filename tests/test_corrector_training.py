@@ -88,7 +88,7 @@ pytestmark = pytest.mark.usefixtures("few_threads")
         (BASIC.replace("one-step", "unrolled") + "steps = [4, 2]\n", "stages.0.steps"),
         (BASIC.replace("one-step", "unrolled") + "steps = 0\n", "stages.0.steps"),
         (BASIC.replace("one-step", "unrolled") + "[stages.noise]\ntau = 0.1\n", "noise has no"),
-        (BASIC.replace("one-step", "two-step"), "stages.0.kind = 'two-step'"),
+        (BASIC.replace("one-step", "two-step"), 'stages.0.kind = "two-step"'),
         ("stages = []\n", "stages"),
         ('[corrector]\npreset = "huge"\n' + BASIC, "corrector .*preset 'huge'"),
         ("[corrector]\nchanges = {widths = 3}\n" + BASIC, "corrector .*widths"),

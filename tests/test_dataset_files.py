@@ -502,9 +502,15 @@ def changed(path, change):
     write_shard(path, change(read_shard(path)), overwrite=True)
 
 
+NO_MANIFEST = "no manifest.json: start generate again to write it"
+
+
 def findings(folder, severity="error"):
-    """(path in the folder, message) of each finding, all of them of one severity."""
-    found = check_dataset(folder)
+    """(path in the folder, message) of each finding, all of them of one severity.
+
+    Besides that samples have no manifest.
+    """
+    found = [f for f in check_dataset(folder) if f.message != NO_MANIFEST]
     assert all(f.severity == severity for f in found)
     return [(f.path.relative_to(folder).as_posix(), f.message) for f in found]
 
@@ -526,7 +532,8 @@ def one(folder, path=FIRST, severity="error"):
 
 def test_a_sound_data_set_has_no_findings(original):
     seen = []
-    assert check_dataset(original, on_file=seen.append) == []
+    (finding,) = check_dataset(original, on_file=seen.append)
+    assert str(finding) == f"warning: {original}: {NO_MANIFEST}"
     names = [path.relative_to(original).as_posix() for path in seen]
     assert names == [
         "training/mesh-0000.h5", "training/mesh-0001.h5", "validation/mesh-0000.h5",
@@ -536,7 +543,7 @@ def test_a_sound_data_set_has_no_findings(original):
 
 def test_double_precision_is_sound_too(tmp_path):
     write_dataset(tmp_path / "sample", dtype="float64")
-    assert check_dataset(tmp_path / "sample") == []
+    assert findings(tmp_path / "sample") == []
 
 
 def test_a_corrupt_file_is_named_and_the_others_are_read(dataset):
@@ -776,6 +783,12 @@ def test_a_mesh_in_an_extra_split_and_another_is_found(tmp_path):
     assert "leakage" in one(tmp_path, "softer/mesh-0000.h5")
 
 
+def test_an_incomplete_data_set_needs_no_manifest(dataset):
+    (dataset / "training/mesh-0001.h5").unlink()
+    (finding,) = check_dataset(dataset)
+    assert finding.message == "missing: config.toml asks for it"
+
+
 def test_missing_and_unexpected_files_are_found(dataset):
     (dataset / "training/mesh-0001.h5").rename(dataset / "training/mesh-0002.h5")
     found = dict(findings(dataset))
@@ -812,15 +825,20 @@ def test_a_short_simulation_is_found(dataset):
     assert one(dataset) == "simulation 0001 has 3 frames: expected 5"
 
 
-def test_files_made_by_different_code_are_pointed_out(dataset):
+@pytest.mark.parametrize(
+    ("what", "values", "told"),
+    [
+        ("code", ("a" * 64, "b" * 64), "made by other code than {} (SHA-256 bbbbbbbbbbbb)"),
+        ("device", ("cpu", "NVIDIA H100"), "computed on another device than {}: NVIDIA H100"),
+    ],
+)
+def test_files_of_different_code_or_devices_are_pointed_out(dataset, what, values, told):
     paths = all_shards(dataset)
-    for path, code in zip(paths, ["a" * 64] * 2 + ["b" * 64] * 2, strict=True):
-        changed(path, lambda s, code=code: dataclasses.replace(s, provenance={"code": code}))
-    found = check_dataset(dataset)
-    assert [(f.path, f.severity) for f in found] == [(paths[2], "warning")]
-    assert f"made by other code than {paths[0].relative_to(dataset)} (SHA-256 bbbbbbbbbbbb)" in str(
-        found[0]
-    )
+    for path, value in zip(paths, np.repeat(values, 2).tolist(), strict=True):
+        changed(path, lambda s, value=value: dataclasses.replace(s, provenance={what: value}))
+    assert findings(dataset, "warning") == [
+        (paths[2].relative_to(dataset).as_posix(), told.format(paths[0].relative_to(dataset)))
+    ]
 
 
 def test_a_content_other_than_the_manifest_has_is_found(dataset):
@@ -1005,6 +1023,11 @@ def test_there_are_not_more_thumbnails_than_simulations(view, original):
     assert [path for path, _ in view._choice(files, 2)] == [files[0], files[2]]
 
 
+def test_labels_of_stiffness_have_no_powers_of_ten(view):
+    found = [view._kilo(young) for young in (1.0, 1234.0, 99_960.0, 1_004_000.0, 2e8)]
+    assert found == ["0.001", "1.23", "100", "1004", "200000"]
+
+
 def test_bad_pictures_are_refused(view, original, tmp_path):
     for path, count in ((tmp_path / "a.jpg", 8), (tmp_path / "a.png", 0)):
         with pytest.raises(InputError, match="count"):
@@ -1037,19 +1060,21 @@ def test_histograms_count_every_simulation(view, original, tmp_path, monkeypatch
 
 def test_check_ends_with_1_if_there_are_errors(program, dataset):
     status, out, _ = program("dataset", "check", dataset)
-    assert (status, out) == (0, "4 files, 0 errors, 0 warnings\n")
+    assert (status, out) == (
+        0, f"warning: {dataset}: {NO_MANIFEST}\n4 files, 0 errors, 1 warnings\n"
+    )  # fmt: skip
     (dataset / "notes.txt").write_text("")
     status, out, _ = program("dataset", "check", dataset)
     assert status == 0
-    assert "4 files, 0 errors, 1 warnings" in out
+    assert "4 files, 0 errors, 2 warnings" in out
     (dataset / FIRST).write_bytes(b"")
     status, out, _ = program("dataset", "check", dataset)
     assert status == 1
     assert f"error: {dataset / FIRST}: the file is empty" in out
-    assert "4 files, 1 errors, 1 warnings" in out
-    status, _, err = program("dataset", "check", dataset / "none")
-    assert status == 2
-    assert "not a folder" in err
+    assert "4 files, 1 errors, 2 warnings" in out
+    status, out, err = program("dataset", "check", dataset / "none")
+    assert (status, out) == (2, "")
+    assert err == (f"error: {dataset / 'none'}: not a folder: expected that of a data set.\n")
 
 
 def test_info_prints_tables_and_writes_json(program, dataset, tmp_path, monkeypatch):
@@ -1063,9 +1088,26 @@ def test_info_prints_tables_and_writes_json(program, dataset, tmp_path, monkeypa
     assert record["splits"]["training"]["runs"]["best"]["omega"]["mean"] == pytest.approx(
         96, abs=0.1
     )
-    status, _, err = program("dataset", "info", dataset, "--json", tmp_path / "no" / "info.json")
+    again = tmp_path / "no" / "info.json"
+    assert program("dataset", "info", dataset, "--json", again)[0] == 0
+    assert json.loads(again.read_text()) == record
+    status, _, err = program("dataset", "info", dataset, "--json", again / "info.json")
     assert status == 1
-    assert "cannot be written" in err
+    assert "cannot be created" in err
+
+
+def test_tables_without_rows_are_left_out(program, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    shard = counted_shard("training", 0, 1.0)
+    simulation = shard.simulations[0]
+    bare = {"reference": dataclasses.replace(simulation.runs["reference"], statistics={})}
+    one = dataclasses.replace(simulation, runs=bare, seconds={})
+    write_shard(tmp_path / "training/mesh-0000.h5", dataclasses.replace(shard, simulations=(one,)))
+    status, out, _ = program("dataset", "info", tmp_path)
+    assert status == 0
+    assert "largest values of each simulation" in out
+    for title in ("mean distance from the reference", "solver iterations", "cost"):
+        assert title not in out
 
 
 def test_info_draws_figures(program, view, dataset, tmp_path):

@@ -25,7 +25,7 @@ from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
-from pdcorrect.progress import FileLines
+from pdcorrect.progress import FileBar, FileLines, progress_bar
 from pdcorrect.replacement import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
@@ -65,7 +65,12 @@ def test_its_card_says_what_it_is_and_how_it_fares(generated, tmp_path):
         "| training | `best` |", "| evaluation | `plain` |", "3 frames of 0.01 s",
     ):  # fmt: skip
         assert words in text
-    with pytest.raises(InputError, match=r"no manifest.json: expected a complete data set"):
+    with pytest.raises(InputError, match=r"no config.toml: expected a generated data set"):
+        dataset_card(tmp_path, dataset_info(folder))
+    shutil.copy(folder / "config.toml", tmp_path)
+    with pytest.raises(
+        InputError, match=r"no manifest.json: expected a complete .* generate again"
+    ):
         dataset_card(tmp_path, dataset_info(folder))
 
 
@@ -232,9 +237,15 @@ def test_a_damaged_file_is_made_again_and_a_whole_one_is_not(generated, tmp_path
     data = bytearray(target.read_bytes())
     data[len(data) // 2] ^= 1
     target.write_bytes(data)
-    done = []
-    assert generate(config, tmp_path, on_file=lambda *row: done.append(row))
+    done, begun = [], []
+    assert generate(
+        config,
+        tmp_path,
+        on_begin=lambda *row: begun.append(row),
+        on_file=lambda *row: done.append(row),
+    )
     (there,) = (p.simulations for p in make_plan(config) if p.name == "training/mesh-0001")
+    assert begun == [(4 - there, 4, ["training/mesh-0001"])]
     assert done == [("training/mesh-0001", 4, 4, there)]
     assert hashes(tmp_path) == hashes(folder)
 
@@ -244,8 +255,9 @@ def test_without_a_terminal_the_program_prints_a_line_for_each_file(program, tmp
     path, folder = tmp_path / "set.toml", tmp_path / "set"
     path.write_text(config.to_toml())
     status, out, _ = program("dataset", "generate", path, "-o", folder)
-    *lines, last = out.splitlines()
+    first, *lines, last = out.splitlines()
     assert status == 0
+    assert first.startswith("0 of 4 simulations are there, computing 4; on first use kernels are")
     assert last == f"{folder}: complete"
     for line, plan, done in zip(lines, make_plan(config), (1, 3, 4), strict=True):
         text = rf"\d+ s: {plan.name}, {done} of 4 simulations, about \d+ s left"
@@ -264,12 +276,157 @@ def test_the_rest_is_estimated_from_what_was_computed_since_the_start(monkeypatc
     )
 
 
+def test_a_damaged_file_is_named_before_it_is_made_again(capsys):
+    FileLines().begin(2, 4, ["training/mesh-0001"])
+    FileLines().begin(4, 4, [])
+    damaged, rest = capsys.readouterr().out.splitlines()
+    assert damaged == "training/mesh-0001 is damaged: computed again"
+    assert rest.startswith("2 of 4 simulations are there, computing 2; ")
+
+
+def test_on_a_terminal_the_same_is_said_above_a_bar(capsys):
+    bar = progress_bar("simulations", apart=True)
+    shown = FileBar(bar)
+    assert shown.interrupted().startswith("interrupted before anything was computed")
+    with bar:
+        shown.begin(1, 4, ["training/mesh-0001"])
+        shown("training/mesh-0001", 3, 4, 2)
+    (task,) = bar.tasks
+    assert (task.completed, task.total, task.description) == (3, 4, "training/mesh-0001")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "training/mesh-0001 is damaged: computed again" in err
+    assert "1 of 4 simulations are there, computing 3" in err
+    assert shown.interrupted() == (
+        "interrupted: 3 of 4 simulations are there; the same command goes on"
+    )
+
+
+def test_the_program_says_which_splits_are_complete(program, tmp_path):
+    path, folder = tmp_path / "set.toml", tmp_path / "set"
+    path.write_text(small(frames=1).to_toml())
+    command = ("dataset", "generate", path, "-o", folder)
+    status, out, _ = program(*command, "--seconds", 0)
+    assert status == 1
+    assert out.splitlines()[-1] == (
+        f"{folder}: 0 of 4 simulations are there; the same command goes on"
+    )
+    status, out, _ = program(*command, "--split", "evaluation")
+    assert status == 0
+    assert out.splitlines()[-1] == f"{folder}: evaluation complete; training is still missing"
+    status, out, _ = program(*command, "--split", "evaluation", "--split", "training")
+    assert status == 0
+    assert out.splitlines()[-1] == f"{folder}: complete"
+
+
+def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, monkeypatch):
+    from pdcorrect import cli
+    from pdcorrect.data import generate as module
+
+    real = module.produce
+
+    def interrupted_at_the_second(config, folder, plans, device):
+        if plans[0].number == 1:
+            raise KeyboardInterrupt
+        return real(config, folder, plans, device)
+
+    monkeypatch.setattr(module, "produce", interrupted_at_the_second)
+    path = tmp_path / "set.toml"
+    path.write_text(small(frames=1).to_toml())
+    status, _, err = program("dataset", "generate", path, "-o", tmp_path / "set")
+    assert status == cli.INTERRUPTED
+    assert err == "interrupted: 1 of 4 simulations are there; the same command goes on\n"
+
+
 def test_another_configuration_may_not_use_the_folder(generated):
     _, folder = generated
-    with pytest.raises(InputError, match="is another configuration"):
+    with pytest.raises(
+        InputError, match=r"is another configuration \(seed: 7 there, 99 here\): expected a new"
+    ):
         generate(small(seed=99), folder)
     with pytest.raises(InputError, match="splits nonsense: expected some of training, evaluation"):
         generate(small(), folder, splits=["nonsense"])
+    with pytest.raises(InputError, match=r"splits = 'training': expected a list of names"):
+        generate(small(), folder, splits="training")
+
+
+def test_many_differences_of_configurations_are_cut_short(generated):
+    _, folder = generated
+    extra = [{"name": "stiffer", "meshes": 1, "simulations": 1}]
+    with pytest.raises(InputError, match=r"extra.0.meshes: nothing there, 1 here; .*; 1 more\)"):
+        generate(small(extra=extra), folder)
+
+
+def test_what_is_refused_leaves_no_folder(tmp_path):
+    folder = tmp_path / "set"
+    few = small(coarse_nodes=[72, 72], training={"meshes": 500, "simulations": 500})
+    for config, options, words in (
+        (few, {}, "the configuration asks for 501 meshes"),
+        (small(), {"splits": ["nonsense"]}, "splits nonsense"),
+        (small(), {"seconds": -1.0}, "seconds = -1.0: expected 0 or more"),
+        (small(), {"seconds": float("nan")}, "seconds = nan: expected 0 or more"),
+    ):
+        with pytest.raises(InputError, match=words):
+            generate(config, folder, **options)
+    assert not folder.exists()
+
+
+def test_a_configuration_of_which_nothing_is_there_yet_is_replaced(tmp_path):
+    config, other = small(), small(seed=8)
+    assert not generate(config, tmp_path, seconds=0.0)
+    assert not generate(other, tmp_path, seconds=0.0)
+    written = (tmp_path / "config.toml").read_text()
+    assert written == other.to_toml()
+    (tmp_path / "config.toml").write_text("# by hand\n" + written)
+    with pytest.raises(InputError, match="is another configuration"):
+        generate(config, tmp_path, seconds=0.0)
+    assert (tmp_path / "config.toml").read_text() == "# by hand\n" + written
+
+
+def test_a_file_in_place_of_the_folder_is_bad_input(program, tmp_path):
+    path = tmp_path / "set.toml"
+    path.write_text(small().to_toml())
+    status, _, err = program("dataset", "generate", path, "-o", path)
+    assert status == 2
+    assert "set.toml: not a folder: expected that of a data set, or a new one" in err
+
+
+def test_negative_seconds_are_bad_input(program, tmp_path):
+    path = tmp_path / "set.toml"
+    path.write_text(small().to_toml())
+    status, _, err = program("dataset", "generate", path, "-o", tmp_path / "s", "--seconds", "-1")
+    assert status == 2
+    assert "--seconds" in err
+    assert not (tmp_path / "s").exists()
+
+
+def test_impossible_numbers_of_workers_are_refused():
+    for options, words in (
+        ({"count": 0}, "count = 0: expected 1 or more"),
+        ({"count": -3}, "count = -3"),
+        ({"batch": 0}, "batch = 0: expected 1 or more"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Workers(**options)
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
+def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch, address):
+    monkeypatch.setattr("pdcorrect.data.generate._ANSWER", 0.5)
+    with pytest.raises(
+        InputError, match=f"--scheduler {address}: no scheduler answers there .*tcp://HOST:8786"
+    ):
+        generate(small(), tmp_path, Workers(scheduler=address))
+
+
+def test_a_scheduler_without_workers_is_bad_input(tmp_path, monkeypatch):
+    monkeypatch.setattr("pdcorrect.data.generate._PATIENCE", 0.2)
+    options = {"n_workers": 0, "processes": False, "dashboard_address": ":0"}
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        pytest.raises(InputError, match="no worker joined in 0.2 s: expected one or more"),
+    ):
+        generate(small(), tmp_path, Workers(scheduler=cluster.scheduler_address))
 
 
 def test_files_of_others_are_never_overwritten(generated, tmp_path, monkeypatch):
@@ -351,6 +508,26 @@ def interrupted(config, folder, delay, workers):
                 os.kill(each.pid, signal.SIGKILL)
         psutil.wait_procs(every[1:], timeout=30)
     return process.wait() == -signal.SIGKILL
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_workers_without_further_words(tmp_path):
+    (tmp_path / "set.toml").write_text(small(frames=200).to_toml())
+    command = [
+        sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", tmp_path / "set.toml",
+        "-o", tmp_path / "set", "--workers", "2",
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert process.stdout.readline().startswith("0 of 4 simulations")
+    time.sleep(8)  # the workers have begun
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert re.fullmatch(
+        r"interrupted: \d of 4 simulations are there; the same command goes on\n", err
+    )
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from dataset_configs import small
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
-from pdcorrect.data.families import PUBLISHED, draw, extreme, node_levels
+from pdcorrect.data.families import PUBLISHED, count_bodies, draw, extreme, node_levels
 from pdcorrect.data.plan import draw_scene, make_plan
 
 RNG = np.random.default_rng
@@ -44,7 +44,9 @@ def test_the_published_ranges_are_the_theses():
 
 
 def test_a_range_without_bodies_is_refused():
-    with pytest.raises(pc.errors.InputError, match="no body of family 'cross' has between 10"):
+    with pytest.raises(
+        pc.errors.InputError, match=r"coarse_nodes = \[10, 11\]: family 'cross' has no body"
+    ):
         node_levels("cross", (10, 11))
 
 
@@ -144,21 +146,30 @@ def test_extra_splits_leave_the_training_distribution_as_told():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": 0}, "frames"),
+        ({"frames": 0}, "frames = 0: expected at least 1"),
+        ({"frames": 1.5}, "frames = 1.5: expected an integer"),
         ({"surprise": 1}, "surprise: unknown key"),
         ({"training": {"meshes": 3, "simulations": 2}}, "at least one simulation a mesh"),
+        ({"training": 3}, "training = 3: expected a table"),
         ({"material": {"young": [2.0, 1.0], "poisson": [0.3, 0.3], "density": [1.0, 1.0]}},
-         "low <= high"),
+         "material.young = [2.0, 1.0]: expected [low, high] with low <= high"),
         ({"material": {"young": [1.0, 2.0], "poisson": [0.3, 0.5], "density": [1.0, 1.0]}},
-         "material.poisson.1"),
+         "material.poisson.1 = 0.5: expected less than 0.5"),
+        ({"material": {"young": 2.0, "poisson": [0.3, 0.3], "density": [1.0]}},
+         "material.young = 2.0: expected [low, high]. material.density = [1.0]: expected [low,"),
+        ({"coarse_nodes": [200, 100]}, "coarse_nodes = [200, 100]: expected [low, high] with low"),
         ({"extra": [{"name": "a", "meshes": 1, "simulations": 1, "poisson": [0.3, 0.6]}]},
          "extra.0.poisson.1"),
         ({"extra": [{"name": "a", "meshes": 1, "simulations": 1, "young": [2.0, 1.0]}]},
-         "low <= high"),
-        ({"motion": {"kind": "torsion", "strength": [2.0, 1.0]}}, "low <= high"),
-        ({"extra": [{"name": "training", "meshes": 1, "simulations": 1}]}, "a name of its own"),
-        ({"name": "../up"}, "name"),
-        ({"setting": "nearly"}, "setting"),
+         "extra.0.young = [2.0, 1.0]: expected [low, high] with low <= high"),
+        ({"motion": {"kind": "torsion", "strength": [2.0, 1.0]}},
+         "motion.strength = [2.0, 1.0]: expected [low, high] with low <= high"),
+        ({"extra": [{"name": "training", "meshes": 1, "simulations": 1}]},
+         'configuration: extra.0.name = "training": is taken; expected a name of its own.'),
+        ({"extra": 2 * [{"name": "a", "meshes": 1, "simulations": 1}]},
+         'configuration: extra.1.name = "a": is taken; expected a name of its own.'),
+        ({"name": "../up"}, 'name = "../up": expected lower-case letters, digits and hyphens'),
+        ({"setting": "nearly"}, "setting = \"nearly\": expected 'as-published' or 'exact'"),
     ],
 )  # fmt: skip
 def test_wrong_configurations_are_refused_by_name(change, message):
@@ -180,9 +191,40 @@ def test_mirrored_bodies_count_as_the_same():
 
 
 def test_more_meshes_than_a_family_has_bodies_are_refused():
-    config = small(family="beam", training={"meshes": 50, "simulations": 50})
-    with pytest.raises(pc.errors.InputError, match="Ask for fewer meshes or a wider range"):
+    config = small(
+        family="beam",
+        coarse_nodes=[36, 72],
+        training={"meshes": 4, "simulations": 4},
+        extra=[
+            {"name": "stiffer", "meshes": 1, "simulations": 1},
+            {"name": "crosses", "meshes": 1, "simulations": 1, "family": "cross"},
+        ],
+    )
+    told = (
+        "coarse_nodes = [36, 72]: family 'beam' has 4 bodies there, the configuration asks for 6 "
+        "meshes (training 4, evaluation 1, stiffer 1). Ask for fewer meshes or a wider range."
+    )
+    with pytest.raises(pc.errors.InputError, match=re.escape(told)):
         make_plan(config)
+
+
+@pytest.mark.parametrize(
+    ("family", "nodes"), [("beam", (36, 72)), ("cross", (72, 90)), ("weight", (150, 175))]
+)
+def test_the_bodies_of_a_family_are_counted(family, nodes):
+    rng = RNG(4)
+    drawn = {draw(family, nodes, rng).key() for _ in range(3000)}
+    assert count_bodies(family, nodes) == len(drawn)
+
+
+def test_configurations_that_differ_are_told_apart_by_their_keys():
+    one = small(extra=[{"name": "stiffer", "meshes": 1, "simulations": 1}])
+    other = small(seed=8, coarse_nodes=None)
+    assert one.differences(one) == []
+    found = other.differences(one)
+    assert found[:2] == ["seed: 7 there, 8 here", "coarse_nodes: [72, 108] there, nothing here"]
+    assert 'extra.0.name: "stiffer" there, nothing here' in found
+    assert 'extra.0.name: nothing there, "stiffer" here' in one.differences(other)
 
 
 def test_a_file_that_is_no_configuration_is_named(tmp_path):

@@ -163,11 +163,16 @@ def test_what_is_not_there_is_named(folder, tmp_path):
         ({"base": "fine"}, "no predictions of run 'fine': expected one of best, plain"),
         ({"runs": ["fine"]}, "no positions of run 'fine'"),
         ({"window": 0}, "window = 0"),
+        ({"window": 2.5}, "window = 2.5: expected 1 step or more, a whole number"),
+        ({"runs": "best"}, r"runs = 'best': expected a list of names, such as \['best'\]"),
     ):
         with pytest.raises(InputError, match=words):
             opened(folder, **options)
     with pytest.raises(InputError, match="no data set"):
         opened(tmp_path)
+    samples.dataset(tmp_path, splits=("training",))
+    with pytest.raises(InputError, match=r"no split 'validation' \(it has round\(validation_share"):
+        opened(tmp_path, "validation")
     with pytest.raises(IndexError):
         opened(folder).get(4 * STEPS)
 
@@ -338,6 +343,15 @@ def test_files_are_read_block_by_block(folder, block):
     assert [len(each) for each in blocks] == [block] * (4 // block)
     assert set.union(*blocks) == {0, 1, 2, 3}
     assert (np.diff(order[:STEPS]) < 0).any()
+
+
+def test_orders_that_are_not_to_be_had_are_refused(folder):
+    dataset = opened(folder)
+    with pytest.raises(InputError, match="seed = -1: expected 0 or more"):
+        ShardShuffle(dataset, seed=-1)
+    with pytest.raises(InputError, match=r"shuffle = True: .*ShardShuffle\(dataset\)"):
+        TrajectoryLoader(dataset, 4, shuffle=True)
+    assert len(TrajectoryLoader(dataset, 48, shuffle=False)) == 1
 
 
 def test_by_default_a_block_is_what_the_memory_holds(folder):

@@ -129,6 +129,26 @@ def test_the_scene_page_names_every_key():
             assert re.search(rf"[`\[ ]{key}[`\] =]", page), f"{model.__name__}.{key}"
 
 
+def test_the_first_data_set_of_the_pages_is_the_one_of_the_examples():
+    text = (ROOT / "examples" / "datasets" / "small.toml").read_text()
+    assert f"```toml\n{text}```" in (ROOT / "docs" / "datasets.md").read_text()
+
+
+def test_the_data_set_page_names_every_key():
+    from pdcorrect.data import config
+
+    page = (ROOT / "docs" / "datasets.md").read_text()
+    tables = {
+        "": config.DatasetConfig, "material.": config.MaterialRange, "motion.": config.MotionRange,
+        "reference.": config.Reference, "training.": config.Split, "evaluation.": config.Split,
+        "extra.": config.ExtraSplit,
+    }  # fmt: skip
+    for start, model in tables.items():
+        for name in model.model_fields:
+            if f"{name}." not in tables:
+                assert f"`{start}{name}`" in page, start + name
+
+
 def test_documented_links_exist():
     for page in PAGES:
         for target in re.findall(r"\]\((?!http|#)([^)#]+)", page.read_text()):

@@ -11,7 +11,7 @@ import typer
 
 from pdcorrect import dataset_cli, evaluation_cli, train_cli, validate_cli
 from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
-from pdcorrect.interruption import Terminated, terminable
+from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated, terminable
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
@@ -30,7 +30,7 @@ app.command()(evaluation_cli.evaluate)
 app.command()(train_cli.train)
 app.command()(validate_cli.validate)
 
-FAILED, BAD_INPUT, INTERRUPTED, TERMINATED = 1, 2, 130, 143
+FAILED, BAD_INPUT = 1, 2
 
 
 class SolverName(StrEnum):

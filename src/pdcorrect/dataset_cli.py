@@ -7,11 +7,15 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from pdcorrect.errors import InputError
+from pdcorrect.interruption import INTERRUPTED, Terminated
+
+if TYPE_CHECKING:
+    from pdcorrect.progress import FileLines
 
 app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
 
@@ -40,12 +44,15 @@ def generate(
     ] = None,
     device: Annotated[str, typer.Option(help="cpu, or cuda (extra 'learn').")] = "cpu",
     batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
-    split: Annotated[Optional[list[str]], typer.Option(help="Only these splits.")] = None,
+    split: Annotated[Optional[list[str]], typer.Option(help="Only this split; repeatable.")] = None,
     seconds: Annotated[
-        Optional[float], typer.Option(help="Begin nothing new after so many seconds.")
+        Optional[float],
+        typer.Option(
+            help="Begin nothing new after so many seconds; the mesh in hand is finished.", min=0
+        ),
     ] = None,
 ) -> None:
-    """Compute a data set, or what is not there yet of one that was interrupted.
+    """Compute a data set, or what is missing or damaged of one that was begun.
 
     The files do not depend on the number of workers.  Exit status 1 if some that were asked for
     are still missing.
@@ -54,13 +61,13 @@ def generate(
     from pdcorrect.data.generate import Workers
     from pdcorrect.data.generate import generate as run
 
-    with _simulations() as on_file:
-        done = run(
+    with _simulations() as shown:
+        found = run(
             DatasetConfig.load(config), output, Workers(workers, scheduler, device, batch),
-            splits=split, seconds=seconds, on_file=on_file,
+            splits=split, seconds=seconds, on_begin=shown.begin, on_file=shown,
         )  # fmt: skip
-    typer.echo(f"{output}: {'complete' if done else 'files are still missing; start again'}")
-    if not done:
+    typer.echo(f"{output}: {found}")
+    if not found:
         raise typer.Exit(_UNFIT)
 
 
@@ -209,20 +216,25 @@ def import_(
 
 
 @contextlib.contextmanager
-def _simulations() -> Iterator[Callable[[str, int, int, int], None]]:
-    """A bar with the time that is left; where there is no terminal, a line for each file."""
-    from pdcorrect.progress import FileLines, progress_bar
+def _simulations() -> Iterator[FileLines]:
+    """A bar with the time that is left; where there is no terminal, a line for each file.
 
-    if not sys.stdout.isatty():
-        yield FileLines()
-        return
-    with progress_bar("simulations", apart=True) as progress:
-        task = progress.add_task("generating", total=None)
+    An interruption ends the program, and says what is there.
+    """
+    from pdcorrect.progress import FileBar, FileLines, progress_bar
 
-        def on_file(name: str, done: int, total: int, new: int) -> None:
-            progress.update(task, completed=done, total=total, description=name)
-
-        yield on_file
+    terminal = sys.stdout.isatty()
+    bar = progress_bar("simulations", apart=True, hidden=not terminal)
+    shown = FileBar(bar) if terminal else FileLines()
+    try:
+        with bar:
+            yield shown
+    except KeyboardInterrupt:
+        typer.echo(shown.interrupted(), err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    except Terminated:
+        typer.echo(shown.interrupted(), err=True)
+        raise
 
 
 @app.command()
@@ -240,17 +252,18 @@ def card(
 
 
 def _write(path: Path, text: str) -> None:
-    from pdcorrect.replacement import write_text
+    from pdcorrect.replacement import make_folder, write_text
 
+    make_folder(path.parent)
     write_text(path, text)
     typer.echo(f"wrote {path}")
 
 
 @contextlib.contextmanager
 def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
-    """A bar on the terminal; gives what to call after each of ``count`` files."""
+    """A bar on the terminal, if there are files; gives what to call after each of ``count``."""
     from pdcorrect.progress import progress_bar
 
-    with progress_bar("files", apart=True) as progress:
+    with progress_bar("files", apart=True, hidden=not count) as progress:
         task = progress.add_task(title, total=count)
         yield lambda path: progress.advance(task)

@@ -11,6 +11,8 @@ from types import FrameType
 from typing import Any
 
 _PAUSE = 0.01  # s
+INTERRUPTED, TERMINATED = 130, 143
+"""Exit status after Ctrl-C and after SIGTERM."""
 
 
 class Terminated(BaseException):

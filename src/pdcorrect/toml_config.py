@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import tomli_w
 from pydantic import ValidationError
 
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import Strict
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 
 class TomlConfig(Strict):
@@ -48,15 +52,50 @@ class TomlConfig(Strict):
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
 
+def as_toml(value: object) -> str:
+    """A value as it would stand in a TOML file, on one line, for messages."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {as_toml(own)}' for key, own in value.items())} }}"
+    return str(value)
+
+
 def _explain(error: ValidationError) -> str:
-    sentences = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"]) or "the configuration"
-        if item["type"] == "extra_forbidden":
-            sentences.append(f"{key}: unknown key; remove it or check its spelling.")
-        elif item["type"] == "missing":
-            sentences.append(f"{key}: missing; a value is required.")
-        else:
-            message = item["msg"].removeprefix("Value error, ")
-            sentences.append(f"{key} = {item['input']!r:.80}: {message}.")
-    return " ".join(sentences)
+    return " ".join(map(_sentence, error.errors()))
+
+
+def _sentence(item: ErrorDetails) -> str:
+    key, message = ".".join(map(str, item["loc"])), _in_words(item["msg"])
+    if item["type"] == "extra_forbidden":
+        return f"{key}: unknown key; remove it or check its spelling."
+    if item["type"] == "missing":
+        return f"{key}: missing; a value is required."
+    if item["type"] == "model_type":
+        message = "expected a table of keys"
+    return f"{key} = {as_toml(item['input']):.80}: {message}." if key else f"{message}."
+
+
+_WORDS = (
+    ("Value error, ", ""),
+    ("Input should be greater than or equal to", "expected at least"),
+    ("Input should be less than or equal to", "expected at most"),
+    ("Input should be greater than", "expected more than"),
+    ("Input should be less than", "expected less than"),
+    ("Input should be a valid integer", "expected an integer"),
+    ("Input should be a valid tuple", "expected a list"),
+    ("Input should be a valid", "expected a"),
+    ("Input should be", "expected"),
+)
+"""How pydantic's messages begin, and what stands there in ours."""
+
+
+def _in_words(message: str) -> str:
+    for theirs, ours in _WORDS:
+        if message.startswith(theirs):
+            return ours + message.removeprefix(theirs)
+    return message

@@ -59,14 +59,21 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
     Raises
     ------
     InputError
-        If the data set is not complete.
+        If the data set was not generated, or is not complete.
     """
     folder = Path(folder)
+    if not (folder / CONFIG).exists():
+        raise InputError(
+            f"{folder}: no {CONFIG}: expected a generated data set; imported ones have no card."
+        )
+    config = DatasetConfig.load(folder / CONFIG)
     try:
         manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except OSError:
-        raise InputError(f"{folder}: no {MANIFEST}: expected a complete data set.") from None
-    config = DatasetConfig.load(folder / CONFIG)
+        raise InputError(
+            f"{folder}: no {MANIFEST}: expected a complete data set. Start generate again, which "
+            "computes what is missing and writes it."
+        ) from None
     made_with = read_shard(all_shards(folder)[0], simulations=(), verify=False).provenance
     sections = [
         f"# {config.name}",

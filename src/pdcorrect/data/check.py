@@ -115,8 +115,8 @@ class _Check:
         First file with a mesh, and with a mesh and its material, by their digests.
     forces : dict of str to str
         Where forces on a mesh came first.
-    origins : dict of str to Path
-        First file made by each state of the code.
+    origins : dict of str to dict of str to Path
+        First file made by each state of the code, and on each device.
     """
 
     folder: Path
@@ -127,11 +127,15 @@ class _Check:
     meshes: dict[str, Path] = field(default_factory=dict)
     bodies: dict[str, Path] = field(default_factory=dict)
     forces: dict[str, str] = field(default_factory=dict)
-    origins: dict[str, Path] = field(default_factory=dict)
+    origins: dict[str, dict[str, Path]] = field(default_factory=dict)
 
     def error(self, path: Path, message: str) -> None:
         """Note an error."""
         self.findings.append(Finding(path, "error", message))
+
+    def warn(self, path: Path, message: str) -> None:
+        """Note a warning."""
+        self.findings.append(Finding(path, "warning", message))
 
     def load_config(self) -> None:
         """Read the configuration and derive the files that it asks for."""
@@ -174,9 +178,12 @@ class _Check:
         for path in sorted(path for path in self.folder.rglob("*") if path.is_file()):
             if path.suffix == ".part":
                 text = "left over from a write that was interrupted; it may be deleted"
-                self.findings.append(Finding(path, "warning", text))
+                self.warn(path, text)
             elif path not in paths and path not in [self.folder / name for name in _OTHERS]:
-                self.findings.append(Finding(path, "warning", "not part of the data set"))
+                self.warn(path, "not part of the data set")
+        whole = self.plans is not None and set(self.plans) <= set(paths)
+        if whole and not (self.folder / MANIFEST).exists():
+            self.warn(self.folder, f"no {MANIFEST}: start generate again to write it")
 
     def _gaps(self, paths: list[Path]) -> None:
         """Numbers left out in a split, where no configuration tells how many there are."""
@@ -235,16 +242,16 @@ class _Check:
             yield from _plan_faults(self.config, plan, shard)
 
     def _origin(self, path: Path, shard: Shard) -> None:
-        """A change of the code between files, where they tell."""
-        code = shard.provenance.get("code")
-        if code is None:
-            return
-        known = code in self.origins
-        first = self.origins.setdefault(code, path)
-        oldest = next(iter(self.origins.values()))
-        if not known and first != oldest:
-            text = f"made by other code than {self._short(oldest)} (SHA-256 {code:.12})"
-            self.findings.append(Finding(path, "warning", text))
+        """Changes of the code and of the device between files, where they tell."""
+        for what, told in (("code", "made by other code than {} (SHA-256 {:.12})"),
+                           ("device", "computed on another device than {}: {}")):  # fmt: skip
+            own = shard.provenance.get(what)
+            if own is None:
+                continue
+            known = self.origins.setdefault(what, {})
+            if known and own not in known:
+                self.warn(path, told.format(self._short(next(iter(known.values()))), own))
+            known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pdcorrect.scene.regions import Count, NonNegative, Poisson, Positive, PositiveCount, Strict
-from pdcorrect.toml_config import TomlConfig
+from pdcorrect.toml_config import TomlConfig, as_toml
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
+
+
+def _pair(ends: Any) -> Any:
+    if not isinstance(ends, (list, tuple)) or len(ends) != 2:
+        raise ValueError("expected [low, high]")
+    return ends
 
 
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
@@ -21,11 +29,19 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
     return ends
 
 
-Range = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-Span = Annotated[tuple[NonNegative, NonNegative], AfterValidator(_ordered)]
-PoissonRange = Annotated[tuple[Poisson, Poisson], AfterValidator(_ordered)]
+def _plain(name: str) -> str:
+    if not re.fullmatch(r"[a-z0-9][a-z0-9-]*", name):
+        raise ValueError("expected lower-case letters, digits and hyphens, the first no hyphen")
+    return name
+
+
+_PAIR, _ORDERED = BeforeValidator(_pair), AfterValidator(_ordered)
+Range = Annotated[tuple[Positive, Positive], _PAIR, _ORDERED]
+Span = Annotated[tuple[NonNegative, NonNegative], _PAIR, _ORDERED]
+PoissonRange = Annotated[tuple[Poisson, Poisson], _PAIR, _ORDERED]
+NodeCounts = Annotated[tuple[PositiveCount, PositiveCount], _PAIR, _ORDERED]
 Share = Annotated[float, Field(strict=True, ge=0, lt=1)]
-Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]*$", max_length=80)]
+Name = Annotated[str, Field(max_length=80), AfterValidator(_plain)]
 
 TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
 """The splits that every data set has."""
@@ -165,7 +181,7 @@ class DatasetConfig(TomlConfig):
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]
     family: FamilyName
     setting: Literal["as-published", "exact"]
-    coarse_nodes: tuple[PositiveCount, PositiveCount] | None = None
+    coarse_nodes: NodeCounts | None = None
     cell_size: Positive = 0.05
     step: Positive = 0.01
     frames: PositiveCount
@@ -183,12 +199,38 @@ class DatasetConfig(TomlConfig):
 
     @model_validator(mode="after")
     def _names(self) -> DatasetConfig:
-        names = [split.name for split in self.extra]
-        if len(set(names)) != len(names) or set(names) & {TRAINING, VALIDATION, EVALUATION}:
-            raise ValueError("expected each extra split to have a name of its own")
+        taken = {TRAINING, VALIDATION, EVALUATION}
+        for number, split in enumerate(self.extra):
+            if split.name in taken:
+                key = f"extra.{number}.name = {as_toml(split.name)}"
+                raise ValueError(f"{key}: is taken; expected a name of its own")
+            taken.add(split.name)
         return self
+
+    def differences(self, other: DatasetConfig) -> list[str]:
+        """Keys whose values differ, with the other's value and this one's, for messages."""
+        here, there = (dict(_leaves(each.model_dump(mode="json"))) for each in (self, other))
+        return [
+            f"{key}: {there.get(key, _NOTHING)} there, {here.get(key, _NOTHING)} here"
+            for key in dict.fromkeys([*there, *here])
+            if there.get(key) != here.get(key)
+        ]
 
     def hash(self) -> str:
         """SHA-256 of the configuration's content."""
         content: Any = self.model_dump(mode="json")
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+_NOTHING = "nothing"
+
+
+def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted keys that are set, and their values as in TOML; tables in a list by number."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        value = dict(enumerate(value))
+    if isinstance(value, dict):
+        for name, own in value.items():
+            yield from _leaves(own, f"{key}.{name}" if key else str(name))
+    elif value not in (None, []):
+        yield key, as_toml(value)

@@ -17,6 +17,7 @@ import numpy as np
 
 from pdcorrect.data.config import FamilyName
 from pdcorrect.errors import InputError
+from pdcorrect.toml_config import as_toml
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Shape = dict[str, Any]
@@ -110,10 +111,25 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
             levels.setdefault(count, []).append(size)
     if not levels:
         raise InputError(
-            f"no body of family {family!r} has between {nodes[0]} and {nodes[1]} nodes: expected "
-            f"a range such as {published.coarse}."
+            f"coarse_nodes = {as_toml(nodes)}: family {family!r} has no body there; expected a "
+            f"range such as {as_toml(published.coarse)}."
         )
     return tuple(tuple(levels[count]) for count in sorted(levels))
+
+
+def count_bodies(family: FamilyName, nodes: tuple[int, int]) -> int:
+    """Different bodies, by `Design.key`, that a family has in a range of nodes."""
+    return sum(_places(family, size) for level in node_levels(family, nodes) for size in level)
+
+
+def _places(family: FamilyName, size: Size) -> int:
+    """Different bodies of one size: places of the branches, or of the pendulum and its weight."""
+    if family == "beam":
+        return 1
+    if family == "cross":
+        return size[0] - 3
+    support, _, pendulum, _, high = size
+    return (support - 2) // 2 * (pendulum - high)
 
 
 def _beam_sizes() -> Iterator[Size]:

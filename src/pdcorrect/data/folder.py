@@ -51,7 +51,9 @@ def shard_paths(folder: str | Path, split: str) -> list[Path]:
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
         names = ", ".join(splits_of(folder))
-        raise InputError(f"{folder}: no split {split!r}: expected one of {names}.")
+        few = " (it has round(validation_share * training.meshes) meshes, which may be none)"
+        hint = few if split == VALIDATION else ""
+        raise InputError(f"{folder}: no split {split!r}{hint}: expected one of {names}.")
     return paths
 
 

@@ -6,12 +6,17 @@ is whole, so an interrupted generation is continued by starting it again.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import json
+import logging
 import re
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +52,14 @@ such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 n
 """
 _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
+_ANSWER = 10
+"""Seconds to wait for a scheduler's answer."""
+_MOST_DIFFERENCES = 5
+"""Keys of another configuration that are told."""
+OnBegin = Callable[[int, int, Sequence[str]], None]
+"""Called once before anything is computed with how many simulations of how many are there, and
+with the names of files that are damaged and will be computed again.
+"""
 OnFile = Callable[[str, int, int, int], None]
 """Called with a finished file's name, how many simulations of how many are there now, and how
 many of them are new since the generation was started.
@@ -68,12 +81,56 @@ class Workers:
         machine each takes a GPU of its own.
     batch : int
         Simulations that are computed together on a GPU.
+
+    Raises
+    ------
+    InputError
+        If ``count`` or ``batch`` is less than 1.
     """
 
     count: int = 1
     scheduler: str | None = None
     device: str = "cpu"
     batch: int = 32
+
+    def __post_init__(self) -> None:
+        for name, value in (("count", self.count), ("batch", self.batch)):
+            if value < 1:
+                raise InputError(f"{name} = {value}: expected 1 or more.")
+
+
+@dataclass(frozen=True)
+class Generated:
+    """What is there of a data set; true if that is all that was asked for.
+
+    Attributes
+    ----------
+    simulations : mapping of str to (int, int)
+        By split: how many simulations of how many are there.
+    asked : tuple of str
+        Splits that were to be computed.
+    """
+
+    simulations: Mapping[str, tuple[int, int]]
+    asked: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        return not set(self.missing) & set(self.asked)
+
+    @property
+    def missing(self) -> list[str]:
+        """Splits of which something is missing."""
+        return [name for name, (there, total) in self.simulations.items() if there < total]
+
+    def __str__(self) -> str:
+        if not self:
+            there, total = (sum(self.simulations[name][k] for name in self.asked) for k in (0, 1))
+            return f"{there} of {total} simulations are there; the same command goes on"
+        if not self.missing:
+            return "complete"
+        verb = "is" if len(self.missing) == 1 else "are"
+        complete = [name for name in self.simulations if name not in self.missing]
+        return f"{', '.join(complete)} complete; {', '.join(self.missing)} {verb} still missing"
 
 
 def generate(
@@ -83,33 +140,37 @@ def generate(
     *,
     splits: Sequence[str] | None = None,
     seconds: float | None = None,
+    on_begin: OnBegin | None = None,
     on_file: OnFile | None = None,
-) -> bool:
-    """Compute what is not there yet of a data set.
+) -> Generated:
+    """Compute what is not there yet of a data set, and again what is damaged.
 
     Parameters
     ----------
     config : DatasetConfig
     folder : path
-        New, or of a generation of the same configuration that was interrupted.
+        New, or of a generation of the same configuration that was interrupted.  One that was
+        begun with another configuration is taken over as long as it holds no file of a mesh
+        and its ``config.toml`` is as it was written.
     workers : Workers
     splits : sequence of str, optional
         Only these.
     seconds : float, optional
-        Begin nothing new after so much time.
-    on_file : callable, optional
+        Begin nothing new after so much time; what is under way is finished.
+    on_begin, on_file : callable, optional
         For progress.
 
     Returns
     -------
-    bool
-        Whether all that was asked for is there.  Once that is the whole data set,
+    Generated
+        True if all that was asked for is there.  Once that is the whole data set,
         ``manifest.json`` lists the hashes of its files.
 
     Raises
     ------
     InputError
-        If the folder holds another data set, or a split is unknown.
+        If the folder holds another data set, a split is unknown, the family has fewer bodies
+        than the configuration asks for, or no scheduler or worker answers.
     ConvergenceError
         If the loads are so strong that no draw is accepted.
     OutputError
@@ -117,17 +178,20 @@ def generate(
     """
     folder = Path(folder)
     check_device(workers.device)
-    _claim(config, folder)
-    clear_parts(folder)
+    if seconds is not None and not seconds >= 0:
+        raise InputError(f"seconds = {seconds}: expected 0 or more.")
     plans = make_plan(config)
     chosen = _chosen(plans, splits)
+    _claim(config, folder)
+    clear_parts(folder)
     hashes = {plan.name: finished(config, folder, plan) for plan in chosen}
     missing = [plan for plan in chosen if hashes[plan.name] is None]
-    units = _units(missing, workers)
-    deadline = None if seconds is None else time.monotonic() + seconds
     total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
+    if on_begin:
+        on_begin(total - left, total, [p.name for p in missing if _file(folder, p).exists()])
+    deadline = None if seconds is None else time.monotonic() + seconds
     begun = left
-    for unit in _compute(config, folder, units, workers, deadline):
+    for unit in _compute(config, folder, _units(missing, workers), workers, deadline):
         for plan in unit:
             left -= plan.simulations
             if on_file:
@@ -136,7 +200,18 @@ def generate(
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
     _write_manifest(config, folder, hashes)
-    return all(hashes[plan.name] is not None for plan in chosen)
+    return _generated(plans, chosen, hashes)
+
+
+def _generated(
+    plans: Sequence[MeshPlan], chosen: Sequence[MeshPlan], hashes: Mapping[str, str | None]
+) -> Generated:
+    counts: dict[str, tuple[int, int]] = {}
+    for plan in plans:
+        there, total = counts.get(plan.split, (0, 0))
+        new = 0 if hashes[plan.name] is None else plan.simulations
+        counts[plan.split] = there + new, total + plan.simulations
+    return Generated(counts, tuple(dict.fromkeys(plan.split for plan in chosen)))
 
 
 def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
@@ -147,7 +222,7 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     InputError
         If there is a whole file of something else.
     """
-    path = folder / f"{plan.name}{SUFFIX}"
+    path = _file(folder, plan)
     if not path.exists():
         return None
     try:
@@ -161,25 +236,50 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     return content_hash
 
 
+def _file(folder: Path, plan: MeshPlan) -> Path:
+    return folder / f"{plan.name}{SUFFIX}"
+
+
 def _claim(config: DatasetConfig, folder: Path) -> None:
     """Make the folder this configuration's, or find that it is."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder}: not a folder: expected that of a data set, or a new one.")
     path = folder / CONFIG
-    if path.exists():
-        if DatasetConfig.load(path).hash() != config.hash():
-            raise InputError(
-                f"{path} is another configuration: expected a new folder, or the one that this "
-                "data set was begun in."
-            )
+    if path.exists() and not _replaceable(config, path):
         return
-    if all_shards(folder):
+    if not path.exists() and all_shards(folder):
         raise InputError(f"{folder} holds files of meshes but no {CONFIG}: use another folder.")
     make_folder(folder)
     write_text(path, config.to_toml())
 
 
+def _replaceable(config: DatasetConfig, path: Path) -> bool:
+    """Whether ``config.toml`` was written here for another configuration and never used.
+
+    Raises
+    ------
+    InputError
+        If it is another one and in use, or written by hand.
+    """
+    there = DatasetConfig.load(path)
+    if there.hash() == config.hash():
+        return False
+    if not all_shards(path.parent) and path.read_text(encoding="utf-8") == there.to_toml():
+        return True
+    found = config.differences(there)
+    told = "; ".join(found[:_MOST_DIFFERENCES])
+    more = len(found) - _MOST_DIFFERENCES
+    raise InputError(
+        f"{path} is another configuration ({told}{f'; {more} more' if more > 0 else ''}): expected "
+        "a new folder, or the one that this data set was begun in."
+    )
+
+
 def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[MeshPlan]:
     if splits is None:
         return list(plans)
+    if isinstance(splits, str):
+        raise InputError(f"splits = {splits!r}: expected a list of names, such as [{splits!r}].")
     known = list(dict.fromkeys(plan.split for plan in plans))
     unknown = sorted(set(splits) - set(known))
     if unknown:
@@ -217,7 +317,7 @@ def produce(
         shards = simulate(config, plans, engines)
     provenance = _provenance(device)
     for plan, shard in zip(plans, shards, strict=True):
-        path = folder / f"{plan.name}{SUFFIX}"
+        path = _file(folder, plan)
         write_shard(path, replace(shard, provenance=provenance), config.dtype, overwrite=True)
     return plans
 
@@ -278,7 +378,7 @@ def _distributed(
     distributed = require_extra("distributed", "cluster")
     folder = folder.resolve()
     with _client(distributed, workers) as client, client.as_current():
-        client.wait_for_workers(1, timeout=_PATIENCE)
+        _wait_for_worker(client)
         waiting = iter(units)
         running = distributed.as_completed(raise_errors=True)
 
@@ -300,7 +400,7 @@ def _distributed(
 def _client(distributed: Any, workers: Workers) -> Any:
     """A client of the given scheduler, or of new processes on this machine."""
     if workers.scheduler is not None:
-        return distributed.Client(workers.scheduler, set_as_default=False)
+        return _scheduler_client(distributed, workers.scheduler)
     return distributed.Client(local_cluster(workers.count), set_as_default=False)
 
 
@@ -311,7 +411,50 @@ def local_cluster(count: int) -> Any:
     """
     distributed = require_extra("distributed", "cluster")
     names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
-    return distributed.LocalCluster(**names, dashboard_address=":0", memory_limit=0)
+    quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
+    with _ctrl_c_ignored():
+        return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
+
+
+@contextlib.contextmanager
+def _ctrl_c_ignored() -> Iterator[None]:
+    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _scheduler_client(distributed: Any, address: str) -> Any:
+    """A client of a scheduler that was seen to answer: a failed one takes long to close."""
+    with ThreadPoolExecutor(1) as thread:  # this one may have a loop of its own
+        try:
+            thread.submit(asyncio.run, _greet(address)).result()
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {address}: no scheduler answers there ({error}): expected the "
+                "address of one that is running, such as tcp://HOST:8786."
+            ) from None
+    return distributed.Client(address, set_as_default=False)
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler and leave."""
+    comm = await require_extra("distributed.comm", "cluster").connect(address, timeout=_ANSWER)
+    await comm.close()
+
+
+def _wait_for_worker(client: Any) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_PATIENCE)
+    except TimeoutError:
+        raise InputError(
+            f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
+        ) from None
 
 
 def _work(

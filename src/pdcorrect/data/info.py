@@ -129,10 +129,10 @@ class DatasetInfo:
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
     def tables(self) -> RenderableType:
-        """For rich's console."""
+        """For rich's console; those without rows are left out."""
         from rich.console import Group
 
-        return Group(*(table(self) for table in _TABLES))
+        return Group(*(found for found in (table(self) for table in _TABLES) if found.row_count))
 
 
 def dataset_info(
@@ -292,7 +292,8 @@ def _error_table(info: DatasetInfo) -> Any:
 def _iteration_table(info: DatasetInfo) -> Any:
     table = _table("solver iterations of a step", "split", "run", "simulations", "mean", "most")
     for split_name, split in _rows(info):
-        for number, (name, run) in enumerate(split.runs.items()):
+        runs = {name: run for name, run in split.runs.items() if run.iterations is not None}
+        for number, (name, run) in enumerate(runs.items()):
             counts = _text(run.iterations), str(run.most_iterations or "")
             table.add_row("" if number else split_name, name, str(run.simulations), *counts)
     return table
@@ -301,7 +302,8 @@ def _iteration_table(info: DatasetInfo) -> Any:
 def _cost_table(info: DatasetInfo) -> Any:
     table = _table("cost", "split", "run", "s", "s a simulation")
     for split_name, split in _rows(info):
-        for number, (name, seconds) in enumerate(split.seconds.items()):
+        known = split.seconds if len(split.seconds) > 1 else {}  # not the total of nothing
+        for number, (name, seconds) in enumerate(known.items()):
             run = split.runs.get(name.removesuffix(" steps"))
             each = _text(seconds / (run.simulations if run else split.simulations))
             table.add_row("" if number else split_name, name, _text(seconds), each)

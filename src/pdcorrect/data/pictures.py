@@ -188,8 +188,14 @@ def _sample(path: Path, number: int) -> _Sample:
         cells=shard.cells.astype(np.int64),
     )
     label = f"{path.parent.name} {shard.attributes['number']}-{number}\n"
-    label += f"E = {1e-3 * shard.young.mean():.3g} kPa, ν = {shard.poisson.mean():.2f}"
+    label += f"E = {_kilo(shard.young.mean())} kPa, ν = {shard.poisson.mean():.2f}"
     return _Sample(label, run, int(distances.max(axis=1).argmax()), distances)
+
+
+def _kilo(value: float) -> str:
+    """In thousands, with three digits or all before the point."""
+    thousands = 1e-3 * value
+    return f"{thousands:.0f}" if thousands >= 100 else f"{thousands:.3g}"
 
 
 def _page(samples: Sequence[_Sample]) -> Image:

@@ -7,7 +7,7 @@ generated alone, in any order.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,9 +23,10 @@ from pdcorrect.data.config import (
     MaterialRange,
     Split,
 )
-from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
+from pdcorrect.data.families import PUBLISHED, Box, Design, count_bodies, draw, extreme
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
+from pdcorrect.toml_config import as_toml
 
 _DRAWS = 10_000
 """Bodies that are drawn for a mesh before giving up on one that is not there yet."""
@@ -88,6 +89,7 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     known: set[str] = set()
     splits: list[tuple[str, Split]] = [(TRAINING, config.training), (EVALUATION, config.evaluation)]
     splits += [(extra.name, extra) for extra in config.extra]
+    _check_counts(config, splits)
     for number, (name, split) in enumerate(splits):
         found = list(_split(config, name, split, number, known))
         if name == TRAINING:
@@ -96,12 +98,42 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     return plans
 
 
+def _check_counts(config: DatasetConfig, splits: Sequence[tuple[str, Split]]) -> None:
+    """Refuse to draw more bodies than there are."""
+    wanted: dict[FamilyName, dict[str, int]] = {}
+    for name, split in splits:
+        wanted.setdefault(_family(config, split), {})[name] = split.meshes
+    for family, meshes in wanted.items():
+        nodes = _nodes(config, family)
+        there, total = count_bodies(family, nodes), sum(meshes.values())
+        if there < total:
+            raise InputError(
+                f"{_too_few(family, nodes, there)}, the configuration asks for {total} meshes "
+                f"({', '.join(f'{name} {count}' for name, count in meshes.items())}). {_ADVICE}"
+            )
+
+
+_ADVICE = "Ask for fewer meshes or a wider range."
+
+
+def _too_few(family: FamilyName, nodes: tuple[int, int], there: int) -> str:
+    return f"coarse_nodes = {as_toml(nodes)}: family {family!r} has {there} bodies there"
+
+
+def _family(config: DatasetConfig, split: Split) -> FamilyName:
+    return (split.family if isinstance(split, ExtraSplit) else None) or config.family
+
+
+def _nodes(config: DatasetConfig, family: FamilyName) -> tuple[int, int]:
+    return config.coarse_nodes or PUBLISHED[family].coarse
+
+
 def _split(
     config: DatasetConfig, name: str, split: Split, number: int, known: set[str]
 ) -> Iterator[MeshPlan]:
     extra = split if isinstance(split, ExtraSplit) else ExtraSplit(name=name, **dict(split))
-    family = extra.family or config.family
-    nodes = config.coarse_nodes or PUBLISHED[family].coarse
+    family = _family(config, split)
+    nodes = _nodes(config, family)
     for i in range(split.meshes):
         stream = (config.seed, number, i)
         rng = np.random.default_rng(stream)
@@ -134,8 +166,8 @@ def _new_design(
             known.add(design.key())
             return design
     raise InputError(
-        f"family {family!r} with {nodes[0]} to {nodes[1]} nodes: expected more than the "
-        f"{len(known)} different bodies that were found. Ask for fewer meshes or a wider range."
+        f"{_too_few(family, nodes, count_bodies(family, nodes))}, and {_DRAWS} draws in a row gave "
+        f"one that another mesh has. {_ADVICE}"
     )
 
 

@@ -53,7 +53,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     ``velocities``                  (n, 3), (p_t - p_(t-1)) / h, zero in frame 0, m/s
     ``targets``                     (n, k, 3), the reference in frames t + 1 .. t + k, m
     ``predictions``                 (n, k, 3), one step of the base model from the reference
-                                    in frames t .. t + k - 1, m; without ``base`` absent
+                                    in frames t .. t + k - 1, not from its own last one, m;
+                                    without ``base`` absent
     ``forces``                      (n, k, 3), loads of these steps, N
     ``run_NAME``                    (n, k + 1, 3), the run's own rollout in frames t .. t + k, m
     ``rest``, ``free``, ``mass``    (n, 3), m; (n, 3) bool; (n,), kg
@@ -117,8 +118,10 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         skip_damaged: bool = False,
     ) -> None:
         super().__init__()
-        if window < 1:
-            raise InputError(f"window = {window}: expected 1 step or more.")
+        if not isinstance(window, (int, np.integer)) or window < 1:
+            raise InputError(f"window = {window}: expected 1 step or more, a whole number.")
+        if isinstance(runs, str):
+            raise InputError(f"runs = {runs!r}: expected a list of names, such as [{runs!r}].")
         self.folder, self.split = Path(folder), split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
@@ -252,6 +255,11 @@ class TrajectoryLoader(DataLoader[Any]):
     **options
         Of ``torch.utils.data.DataLoader``, such as ``num_workers``, ``persistent_workers``,
         ``multiprocessing_context`` and ``pin_memory``.
+
+    Raises
+    ------
+    InputError
+        If ``shuffle`` is among them: a `ShardShuffle` does that.
     """
 
     def __init__(
@@ -264,6 +272,11 @@ class TrajectoryLoader(DataLoader[Any]):
         assemble: Callable[[Sequence[int]], Any] | None = None,
         **options: Any,
     ) -> None:
+        if options.pop("shuffle", False):
+            raise InputError(
+                "shuffle = True: expected a sampler that reads file by file, such as "
+                "TrajectoryLoader(dataset, batch_size, ShardShuffle(dataset))."
+            )
         self.shuffle, self.windows = sampler, batch_size
         order = SequentialSampler(dataset) if sampler is None else sampler
         self._position = 0 if sampler is None else sampler.position

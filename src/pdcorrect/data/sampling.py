@@ -23,7 +23,8 @@ class ShardShuffle(Sampler[int]):
 
     Each epoch shuffles the files, gives every rank an equal share of their windows (the
     last few, fewer than ranks, are left out), and shuffles the windows within blocks of
-    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone.
+    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone:
+    without `set_epoch` every epoch has the same.
 
     Parameters
     ----------
@@ -57,6 +58,8 @@ class ShardShuffle(Sampler[int]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
+        if seed < 0:
+            raise InputError(f"seed = {seed}: expected 0 or more.")
         if not 0 <= rank < world_size:
             raise InputError(f"rank = {rank} of {world_size}: expected 0 to {world_size - 1}.")
         if block is not None and block < 1:
