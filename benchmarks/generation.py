@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from pdcorrect.data.config import DatasetConfig, Split
-from pdcorrect.data.generate import Workers, generate, local_cluster
+from pdcorrect.data.generate import generate
+from pdcorrect.data.workers import Workers, local_cluster
 from pdcorrect.environment import environment
 
 

@@ -27,10 +27,11 @@ from pathlib import Path
 from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.generate import Workers, generate, local_cluster
+from pdcorrect.data.generate import generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.statistics import compute_statistics
+from pdcorrect.data.workers import Workers, local_cluster
 from pdcorrect.progress import FileLines
 from pdcorrect.replacement import make_folder, write_text
 

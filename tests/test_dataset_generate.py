@@ -18,12 +18,14 @@ from dataset_configs import small
 from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
-from pdcorrect.data.generate import Workers, generate, make_engines
+from pdcorrect.data.generate import generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.data.produce import make_engines
 from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
+from pdcorrect.data.workers import Workers
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
 from pdcorrect.progress import FileBar, FileLines, progress_bar
 from pdcorrect.replacement import clear_parts, part_of_process
@@ -321,7 +323,7 @@ def test_the_program_says_which_splits_are_complete(program, tmp_path):
 
 def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, monkeypatch):
     from pdcorrect import cli
-    from pdcorrect.data import generate as module
+    from pdcorrect.data import workers as module
 
     real = module.produce
 
@@ -412,7 +414,7 @@ def test_impossible_numbers_of_workers_are_refused():
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch, address):
-    monkeypatch.setattr("pdcorrect.data.generate._ANSWER", 0.5)
+    monkeypatch.setattr("pdcorrect.data.workers._ANSWER", 0.5)
     with pytest.raises(
         InputError, match=f"--scheduler {address}: no scheduler answers there .*tcp://HOST:8786"
     ):
@@ -420,7 +422,7 @@ def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch, addres
 
 
 def test_a_scheduler_without_workers_is_bad_input(tmp_path, monkeypatch):
-    monkeypatch.setattr("pdcorrect.data.generate._PATIENCE", 0.2)
+    monkeypatch.setattr("pdcorrect.data.workers._PATIENCE", 0.2)
     options = {"n_workers": 0, "processes": False, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
@@ -476,7 +478,7 @@ SEEN, CLUSTERS = set(), []
 def test_workers_that_join_later_are_used(tmp_path, monkeypatch):
     config = small(frames=1, coarse_nodes=[72, 150], training={"meshes": 9, "simulations": 9})
     options = {"n_workers": 1, "threads_per_worker": 1, "processes": False}
-    monkeypatch.setattr("pdcorrect.data.generate._work", slow_work)
+    monkeypatch.setattr("pdcorrect.data.workers._work", slow_work)
     with distributed.LocalCluster(**options, dashboard_address=":0") as cluster:
         CLUSTERS.append(cluster)
         workers = Workers(scheduler=cluster.scheduler_address)

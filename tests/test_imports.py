@@ -152,6 +152,8 @@ ORDER = [
     "data.pictures",
     "data.card",
     "environment",
+    "data.produce",
+    "data.workers",
     "data.generate",
     "corrector",
     "corrector.rotations",

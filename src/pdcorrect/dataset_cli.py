@@ -58,8 +58,8 @@ def generate(
     are still missing.
     """
     from pdcorrect.data.config import DatasetConfig
-    from pdcorrect.data.generate import Workers
     from pdcorrect.data.generate import generate as run
+    from pdcorrect.data.workers import Workers
 
     with _simulations() as shown:
         found = run(

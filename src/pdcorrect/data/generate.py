@@ -6,54 +6,23 @@ is whole, so an interrupted generation is continued by starting it again.
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import hashlib
 import json
-import logging
-import re
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numba
 
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import (
-    CONFIG,
-    MANIFEST,
-    SUFFIX,
-    write_shard,
-)
+from pdcorrect.data.produce import shard_path
+from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_reader import stored_hashes
-from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.environment import code_digest, environment
-from pdcorrect.errors import (
-    FileFormatError,
-    FileVersionError,
-    InputError,
-    require_extra,
-)
+from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.replacement import clear_parts, make_folder, write_text
 
-LARGEST_BATCHED = 150_000
-"""Nodes of the largest mesh that is stepped in batches.
-
-A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.memory`), so a batch of 32
-such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
-"""
-_PATIENCE = 600
-"""Seconds to wait for the first worker of a scheduler."""
-_ANSWER = 10
-"""Seconds to wait for a scheduler's answer."""
 _MOST_DIFFERENCES = 5
 """Keys of another configuration that are told."""
 OnBegin = Callable[[int, int, Sequence[str]], None]
@@ -64,39 +33,6 @@ OnFile = Callable[[str, int, int, int], None]
 """Called with a finished file's name, how many simulations of how many are there now, and how
 many of them are new since the generation was started.
 """
-
-
-@dataclass(frozen=True)
-class Workers:
-    """Who computes.
-
-    Attributes
-    ----------
-    count : int
-        Processes on this machine, each with one thread.
-    scheduler : str or None
-        Address of a Dask scheduler whose workers are used instead.
-    device : str
-        "cpu": one simulation at a time.  "cuda": batches; with several workers on this
-        machine each takes a GPU of its own.
-    batch : int
-        Simulations that are computed together on a GPU.
-
-    Raises
-    ------
-    InputError
-        If ``count`` or ``batch`` is less than 1.
-    """
-
-    count: int = 1
-    scheduler: str | None = None
-    device: str = "cpu"
-    batch: int = 32
-
-    def __post_init__(self) -> None:
-        for name, value in (("count", self.count), ("batch", self.batch)):
-            if value < 1:
-                raise InputError(f"{name} = {value}: expected 1 or more.")
 
 
 @dataclass(frozen=True)
@@ -136,7 +72,7 @@ class Generated:
 def generate(
     config: DatasetConfig,
     folder: str | Path,
-    workers: Workers = Workers(),
+    workers: Workers = ONE_WORKER,
     *,
     splits: Sequence[str] | None = None,
     seconds: float | None = None,
@@ -188,10 +124,10 @@ def generate(
     missing = [plan for plan in chosen if hashes[plan.name] is None]
     total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
     if on_begin:
-        on_begin(total - left, total, [p.name for p in missing if _file(folder, p).exists()])
+        on_begin(total - left, total, [p.name for p in missing if shard_path(folder, p).exists()])
     deadline = None if seconds is None else time.monotonic() + seconds
     begun = left
-    for unit in _compute(config, folder, _units(missing, workers), workers, deadline):
+    for unit in computed(config, folder, _units(missing, workers), workers, deadline):
         for plan in unit:
             left -= plan.simulations
             if on_file:
@@ -222,7 +158,7 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     InputError
         If there is a whole file of something else.
     """
-    path = _file(folder, plan)
+    path = shard_path(folder, plan)
     if not path.exists():
         return None
     try:
@@ -234,10 +170,6 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     if config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
     return content_hash
-
-
-def _file(folder: Path, plan: MeshPlan) -> Path:
-    return folder / f"{plan.name}{SUFFIX}"
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:
@@ -306,199 +238,6 @@ def _units(plans: Sequence[MeshPlan], workers: Workers) -> list[list[MeshPlan]]:
         units[-1].append(plan)
         count += plan.simulations
     return units
-
-
-def produce(
-    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
-) -> list[MeshPlan]:
-    """Compute and write some meshes' files."""
-    engines = make_engines(config, device)
-    with one_thread():
-        shards = simulate(config, plans, engines)
-    provenance = _provenance(device)
-    for plan, shard in zip(plans, shards, strict=True):
-        path = _file(folder, plan)
-        write_shard(path, replace(shard, provenance=provenance), config.dtype, overwrite=True)
-    return plans
-
-
-def check_device(device: str) -> None:
-    """Refuse what is neither the CPU nor a CUDA device."""
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-        raise InputError(f"device {device!r}: expected cpu, cuda or cuda:N.")
-
-
-def make_engines(config: DatasetConfig, device: str) -> Engines:
-    """The engines for a device.
-
-    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, of which a batch might
-    not fit, step one problem after the other on the CPU.
-    """
-    alone = OneByOne("pd", config.tolerance)
-    newton = config.reference.solver == "newton"
-    truth = OneByOne("newton", config.tolerance) if newton else None
-    if device == "cpu":
-        return Engines(alone, truth or alone, truth or alone)
-    require_extra("torch", "learn")
-    from pdcorrect.data.batch_engine import Batched
-
-    batched = Batched(device, config.tolerance)
-    return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
-
-
-def _compute(
-    config: DatasetConfig,
-    folder: Path,
-    units: Sequence[list[MeshPlan]],
-    workers: Workers,
-    deadline: float | None,
-) -> Iterator[list[MeshPlan]]:
-    """Units in order of completion."""
-    if workers.scheduler is None and min(workers.count, len(units)) < 2:
-        for unit in units:
-            if _over(deadline):
-                return
-            yield produce(config, folder, unit, workers.device)
-        return
-    yield from _distributed(config, folder, units, workers, deadline)
-
-
-def _over(deadline: float | None) -> bool:
-    return deadline is not None and time.monotonic() > deadline
-
-
-def _distributed(
-    config: DatasetConfig,
-    folder: Path,
-    units: Sequence[list[MeshPlan]],
-    workers: Workers,
-    deadline: float | None,
-) -> Iterator[list[MeshPlan]]:
-    """The same on Dask workers: a unit is handed out when a worker is free."""
-    distributed = require_extra("distributed", "cluster")
-    folder = folder.resolve()
-    with _client(distributed, workers) as client, client.as_current():
-        _wait_for_worker(client)
-        waiting = iter(units)
-        running = distributed.as_completed(raise_errors=True)
-
-        def hand_out() -> None:
-            """Keep every worker busy, also those that have joined since."""
-            while running.count() < sum(client.nthreads().values()):
-                unit = None if _over(deadline) else next(waiting, None)
-                if unit is None:
-                    return
-                call = client.submit(_work, config, folder, unit, workers.device, pure=False)
-                running.add(call)
-
-        hand_out()
-        for future in running:
-            yield future.result()
-            hand_out()
-
-
-def _client(distributed: Any, workers: Workers) -> Any:
-    """A client of the given scheduler, or of new processes on this machine."""
-    if workers.scheduler is not None:
-        return _scheduler_client(distributed, workers.scheduler)
-    return distributed.Client(local_cluster(workers.count), set_as_default=False)
-
-
-def local_cluster(count: int) -> Any:
-    """A Dask cluster of ``count`` processes on this machine, each with one thread.
-
-    Its workers are named 0, 1, ..., by which each finds a GPU of its own.
-    """
-    distributed = require_extra("distributed", "cluster")
-    names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
-    quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
-    with _ctrl_c_ignored():
-        return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
-
-
-@contextlib.contextmanager
-def _ctrl_c_ignored() -> Iterator[None]:
-    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-
-
-def _scheduler_client(distributed: Any, address: str) -> Any:
-    """A client of a scheduler that was seen to answer: a failed one takes long to close."""
-    with ThreadPoolExecutor(1) as thread:  # this one may have a loop of its own
-        try:
-            thread.submit(asyncio.run, _greet(address)).result()
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--scheduler {address}: no scheduler answers there ({error}): expected the "
-                "address of one that is running, such as tcp://HOST:8786."
-            ) from None
-    return distributed.Client(address, set_as_default=False)
-
-
-async def _greet(address: str) -> None:
-    """Connect to a scheduler and leave."""
-    comm = await require_extra("distributed.comm", "cluster").connect(address, timeout=_ANSWER)
-    await comm.close()
-
-
-def _wait_for_worker(client: Any) -> None:
-    try:
-        client.wait_for_workers(1, timeout=_PATIENCE)
-    except TimeoutError:
-        raise InputError(
-            f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
-        ) from None
-
-
-def _work(
-    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
-) -> list[MeshPlan]:
-    """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
-    if device == "cuda":
-        import torch
-        from distributed import get_worker
-
-        name = str(get_worker().name)
-        if name.isdigit():
-            device = f"cuda:{int(name) % torch.cuda.device_count()}"
-    return produce(config, folder, plans, device)
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Kernels on one thread, so that the numbers do not depend on how many there are."""
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        yield
-    finally:
-        numba.set_num_threads(before)
-
-
-def _provenance(device: str) -> dict[str, str]:
-    date = time.strftime("%Y-%m-%d", time.gmtime())
-    return {
-        **environment(),
-        "code": code_digest(),
-        "threads": "1",
-        "device": _device_name(device),
-        "date": date,
-    }
-
-
-def _device_name(device: str) -> str:
-    if not device.startswith("cuda"):
-        return device
-    import torch
-
-    return str(torch.cuda.get_device_name(device))
 
 
 def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:

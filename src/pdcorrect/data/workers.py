@@ -1,0 +1,194 @@
+"""`Workers`: who computes a data set's files, in this process or by Dask in others."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import re
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.plan import MeshPlan
+from pdcorrect.data.produce import produce
+from pdcorrect.errors import InputError, require_extra
+
+_PATIENCE = 600
+"""Seconds to wait for the first worker of a scheduler."""
+_ANSWER = 10
+"""Seconds to wait for a scheduler's answer."""
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who computes.
+
+    Attributes
+    ----------
+    count : int
+        Processes on this machine, each with one thread.
+    scheduler : str or None
+        Address of a Dask scheduler whose workers are used instead.
+    device : str
+        "cpu": one simulation at a time.  "cuda": batches; with several workers on this
+        machine each takes a GPU of its own.
+    batch : int
+        Simulations that are computed together on a GPU.
+
+    Raises
+    ------
+    InputError
+        If ``count`` or ``batch`` is less than 1.
+    """
+
+    count: int = 1
+    scheduler: str | None = None
+    device: str = "cpu"
+    batch: int = 32
+
+    def __post_init__(self) -> None:
+        for name, value in (("count", self.count), ("batch", self.batch)):
+            if value < 1:
+                raise InputError(f"{name} = {value}: expected 1 or more.")
+
+
+ONE_WORKER = Workers()
+"""This process, on the CPU."""
+
+
+def check_device(device: str) -> None:
+    """Refuse what is neither the CPU nor a CUDA device."""
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+        raise InputError(f"device {device!r}: expected cpu, cuda or cuda:N.")
+
+
+def computed(
+    config: DatasetConfig,
+    folder: Path,
+    units: Sequence[list[MeshPlan]],
+    workers: Workers,
+    deadline: float | None,
+) -> Iterator[list[MeshPlan]]:
+    """Units in order of completion."""
+    if workers.scheduler is None and min(workers.count, len(units)) < 2:
+        for unit in units:
+            if _over(deadline):
+                return
+            yield produce(config, folder, unit, workers.device)
+        return
+    yield from _distributed(config, folder, units, workers, deadline)
+
+
+def _over(deadline: float | None) -> bool:
+    return deadline is not None and time.monotonic() > deadline
+
+
+def _distributed(
+    config: DatasetConfig,
+    folder: Path,
+    units: Sequence[list[MeshPlan]],
+    workers: Workers,
+    deadline: float | None,
+) -> Iterator[list[MeshPlan]]:
+    """The same on Dask workers: a unit is handed out when a worker is free."""
+    distributed = require_extra("distributed", "cluster")
+    folder = folder.resolve()
+    with _client(distributed, workers) as client, client.as_current():
+        _wait_for_worker(client)
+        waiting = iter(units)
+        running = distributed.as_completed(raise_errors=True)
+
+        def hand_out() -> None:
+            """Keep every worker busy, also those that have joined since."""
+            while running.count() < sum(client.nthreads().values()):
+                unit = None if _over(deadline) else next(waiting, None)
+                if unit is None:
+                    return
+                call = client.submit(_work, config, folder, unit, workers.device, pure=False)
+                running.add(call)
+
+        hand_out()
+        for future in running:
+            yield future.result()
+            hand_out()
+
+
+def _client(distributed: Any, workers: Workers) -> Any:
+    """A client of the given scheduler, or of new processes on this machine."""
+    if workers.scheduler is not None:
+        return _scheduler_client(distributed, workers.scheduler)
+    return distributed.Client(local_cluster(workers.count), set_as_default=False)
+
+
+def local_cluster(count: int) -> Any:
+    """A Dask cluster of ``count`` processes on this machine, each with one thread.
+
+    Its workers are named 0, 1, ..., by which each finds a GPU of its own.
+    """
+    distributed = require_extra("distributed", "cluster")
+    names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
+    quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
+    with _ctrl_c_ignored():
+        return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
+
+
+@contextlib.contextmanager
+def _ctrl_c_ignored() -> Iterator[None]:
+    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _scheduler_client(distributed: Any, address: str) -> Any:
+    """A client of a scheduler that was seen to answer: a failed one takes long to close."""
+    with ThreadPoolExecutor(1) as thread:  # this one may have a loop of its own
+        try:
+            thread.submit(asyncio.run, _greet(address)).result()
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"--scheduler {address}: no scheduler answers there ({error}): expected the "
+                "address of one that is running, such as tcp://HOST:8786."
+            ) from None
+    return distributed.Client(address, set_as_default=False)
+
+
+async def _greet(address: str) -> None:
+    """Connect to a scheduler and leave."""
+    comm = await require_extra("distributed.comm", "cluster").connect(address, timeout=_ANSWER)
+    await comm.close()
+
+
+def _wait_for_worker(client: Any) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_PATIENCE)
+    except TimeoutError:
+        raise InputError(
+            f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
+        ) from None
+
+
+def _work(
+    config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
+) -> list[MeshPlan]:
+    """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
+    if device == "cuda":
+        import torch
+        from distributed import get_worker
+
+        name = str(get_worker().name)
+        if name.isdigit():
+            device = f"cuda:{int(name) % torch.cuda.device_count()}"
+    return produce(config, folder, plans, device)
