@@ -5,7 +5,8 @@ python datasets/make_all.py FOLDER SUMMARIES [NAME ...] [--device cuda] [--worke
 
 FOLDER/NAME gets the data; SUMMARIES/NAME the card, all numbers of `pdcorrect dataset info`,
 the manifest with the files' hashes, the normalisation statistics, and one file of the
-evaluation split to draw.  A set that is not complete when time is up has no summary.
+evaluation split to draw.  A set that is not complete when time is up has no summary.  Exit
+status 1 if one is not complete, or its check finds something.
 
 Several workers are started once and compute all sets; a set is begun when too little is left
 of the one before to keep them busy, and summaries are written by processes of their own.
@@ -17,11 +18,12 @@ import argparse
 import contextlib
 import multiprocessing
 import shutil
+import sys
 import threading
 import time
 import traceback
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 
 from pdcorrect.data.card import dataset_card
@@ -32,6 +34,7 @@ from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.statistics import compute_statistics
 from pdcorrect.data.workers import Workers, local_cluster
+from pdcorrect.errors import InputError
 from pdcorrect.progress import FileLines
 from pdcorrect.replacement import make_folder, write_text
 
@@ -67,14 +70,20 @@ class Production(threading.Thread):
         self._options, self._workers, self._deadline = options, workers, deadline
         self._summaries = summaries
         self._lines = FileLines()
+        self._summary: Future[int] | None = None
         self.nearly = threading.Event()
 
     def run(self) -> None:
         try:
             for _ in range(ATTEMPTS):
-                with contextlib.suppress(_Failed):
+                try:
                     self._generate()
-                    break
+                    return
+                except InputError as error:
+                    print(f"{self.name}: {error}", flush=True)
+                    return
+                except Exception:
+                    traceback.print_exc()
         finally:
             self.nearly.set()
 
@@ -83,16 +92,23 @@ class Production(threading.Thread):
         config = DatasetConfig.load(HERE / self.name / CONFIG)
         left = None if self._deadline is None else max(self._deadline - started, 0.0)
         print(f"{self.name}: begun", flush=True)
+        found = generate(config, target, self._workers, seconds=left, on_file=self._note)
+        print(f"{self.name}: {time.monotonic() - started:.0f} s, {found}", flush=True)
+        if found:
+            self._summary = self._summaries.submit(
+                summarise, target, self._options.summaries / self.name
+            )
+
+    def succeeded(self) -> bool:
+        """Wait for the set and its summary; whether both are there and nothing was found."""
+        self.join()
+        if self._summary is None:
+            return False
         try:
-            complete = generate(config, target, self._workers, seconds=left, on_file=self._note)
-        except Exception as error:
+            return self._summary.result() == 0
+        except Exception:
             traceback.print_exc()
-            raise _Failed from error
-        seconds = time.monotonic() - started
-        what = "complete" if complete else "cut off"
-        print(f"{self.name}: {seconds:.0f} s, {what}", flush=True)
-        if complete:
-            self._summaries.submit(summarise, target, self._options.summaries / self.name)
+            return False
 
     def _note(self, name: str, done: int, total: int, new: int) -> None:
         self._lines(f"{self.name}/{name}", done, total, new)
@@ -100,11 +116,8 @@ class Production(threading.Thread):
             self.nearly.set()
 
 
-class _Failed(Exception):
-    """A generation that raised; its traceback has been printed."""
-
-
-def main() -> None:
+def main() -> int:
+    """1 if a set is not complete, or its check finds something."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("summaries", type=Path)
@@ -131,8 +144,8 @@ def main() -> None:
             if address is None:
                 begun[-1].join()
             begun[-1].nearly.wait()
-        for production in begun:
-            production.join()
+        good = [production.succeeded() for production in begun]
+    return 0 if sum(good) == len(options.names) else 1
 
 
 @contextlib.contextmanager
@@ -145,8 +158,8 @@ def _scheduler(workers: int) -> Iterator[str | None]:
         yield cluster.scheduler_address
 
 
-def summarise(data: Path, target: Path) -> None:
-    """Check a complete data set and write its summary."""
+def summarise(data: Path, target: Path) -> int:
+    """Check a complete data set and write its summary; how much the check found."""
     started = time.monotonic()
     findings = check_dataset(data)
     compute_statistics(data).save(data)
@@ -159,7 +172,8 @@ def summarise(data: Path, target: Path) -> None:
     shutil.copyfile(data / "evaluation" / "mesh-0000.h5", target / "sample.h5")
     lines = [f"{data.name}: {len(findings)} findings", *map(str, findings[:10])]
     print("\n  ".join(lines), f"({time.monotonic() - started:.0f} s)", flush=True)
+    return len(findings)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

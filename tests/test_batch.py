@@ -14,7 +14,7 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
-from pdcorrect.batch import decomposition, minimise
+from pdcorrect.batch import decomposition, minimise, recording
 from pdcorrect.batch.bodies import Bodies
 from pdcorrect.batch.cells import Sizes
 from pdcorrect.batch.memory import expected_bytes
@@ -824,3 +824,33 @@ def test_a_stepper_that_is_dropped_frees_its_memory_at_once(device):
         assert [ref() for ref in known] == [None, None]
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_points_do_not_depend_on_how_their_numbers_lie_in_memory(element):
+    problem = pc.discretise(unlike(0, element))
+    stepper = pc.BatchStepper([problem, problem])
+    cells, y = stepper.cells, stepper.cells.rest.clone()
+    y += 1e-3 * torch.as_tensor(np.random.default_rng(0).normal(size=y.shape))
+    H = cells.gradients(y - cells.rest)
+    apart = H.transpose(0, 1).contiguous().transpose(0, 1)  # as on a GPU
+    assert H.stride() != apart.stride()
+    for a, b in zip(
+        cells._points.stress(H, cells._weights), cells._points.stress(apart, cells._weights),
+        strict=True,
+    ):  # fmt: skip
+        assert torch.equal(a, b)
+    assert torch.equal(cells.gathered(H), cells.gathered(apart))
+
+
+def test_no_garbage_is_collected_while_work_is_recorded():
+    seen = []
+
+    def fail():
+        seen.append(gc.isenabled())
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), recording._no_collection():
+        fail()
+    assert seen == [False]
+    assert gc.isenabled()

@@ -139,6 +139,7 @@ ORDER = [
     "data.reader",
     "data.statistics",
     "data.rebuild",
+    "data.export_target",
     "data.export",
     "data.import_checks",
     "data.importing",

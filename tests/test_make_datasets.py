@@ -43,12 +43,12 @@ simulations = 1
 """
 
 
-def make(folder, *options):
+def make(folder, *options, status=0):
     script = folder / "datasets" / "make_all.py"
     command = [sys.executable, script, folder / "data", folder / "summaries", *options]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.returncode == status, done.stdout + done.stderr
     return done.stdout + done.stderr
 
 
@@ -77,11 +77,16 @@ def test_sets_are_made_by_the_same_workers_and_summarised(sets):
 def test_a_set_that_cannot_be_made_does_not_keep_the_next_from_it(sets):
     config = sets / "datasets" / "one" / "config.toml"
     config.write_text(config.read_text().replace("frames = 3", "frames = none"))
-    said = make(sets, "one", "two")
+    said = make(sets, "one", "two", status=1)
     assert "two: 0 findings" in said
     assert not (sets / "summaries" / "one").exists()
 
 
 def test_without_time_nothing_is_begun(sets):
-    assert "no time left" in make(sets, "one", "--seconds", "-1")
+    assert "no time left" in make(sets, "one", "--seconds", "-1", status=1)
     assert not (sets / "data").exists()
+
+
+def test_a_summary_that_cannot_be_written_is_a_failure(sets):
+    (sets / "summaries").write_text("in the way")
+    assert "summaries" in make(sets, "one", status=1)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import re
-import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.export_target import SIMULATOR, placed, staging_folder
 from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.graph import node_means, tetrahedra, velocities
 from pdcorrect.data.plan import make_plan
@@ -22,7 +20,7 @@ from pdcorrect.data.schema import CONFIG, PLAIN, REFERENCE, SUFFIX, Shard, Simul
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
-from pdcorrect.replacement import make_folder, replacing, write_text
+from pdcorrect.replacement import replacing, write_text
 from pdcorrect.state import Trajectory
 
 NORMAL, HANDLE = 0, 3
@@ -30,12 +28,6 @@ NORMAL, HANDLE = 0, 3
 
 _SPLITS = {TRAINING: "train", VALIDATION: "valid", EVALUATION: "test"}
 _DYNAMIC = ("world_pos", "base_pos", "forces")
-_SIMULATOR = "pdcorrect"
-"""In ``meta.json``."""
-_SERIES = re.compile(r".+-\d{4,}-\d+-.+(\.pvd|_\d{4,}\.vtu)")
-"""Names of the files of `export_vtu`."""
-_STAGING = "export.part"
-"""Folder in the target of what is not whole yet."""
 
 Array = NDArray[Any]
 
@@ -99,8 +91,8 @@ def export_meshgraphnet(
     if split is not None:
         shard_paths(folder, split)
         splits = [split]
-    with _staging(Path(target), overwrite) as staging:
-        return _placed(_write_splits(staging, folder, splits, base), Path(target))
+    with staging_folder(Path(target), overwrite) as staging:
+        return placed(_write_splits(staging, folder, splits, base), Path(target))
 
 
 def _write_splits(target: Path, folder: str | Path, splits: Sequence[str], base: str) -> list[Path]:
@@ -171,9 +163,9 @@ def export_vtu(
     for name in names:
         _positions(found, name)
     series = f"{split}-{mesh:04d}-{simulation}"
-    with _staging(Path(target), overwrite) as staging:
+    with staging_folder(Path(target), overwrite) as staging:
         written = [_write_series(shard, found, name, staging, series) for name in names]
-        return _placed(written, Path(target))
+        return placed(written, Path(target))
 
 
 def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
@@ -196,69 +188,6 @@ def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
     plans = make_plan(DatasetConfig.load(folder / CONFIG))
     paths = [folder / f"{p.name}{SUFFIX}" for p in plans if split in (None, p.split)]
     return [path for path in paths if not path.exists()]
-
-
-@contextlib.contextmanager
-def _staging(target: Path, overwrite: bool) -> Iterator[Path]:
-    """A new folder in ``target`` to write to, which is gone in the end.
-
-    If that fails, ``target`` is as it was before.
-    """
-    earlier = _exported(target)
-    if earlier and not overwrite:
-        raise OutputError(
-            f"{target}: holds files of an export already, as {earlier[0].name}; choose another "
-            "folder, or delete them with --overwrite (overwrite=True)."
-        )
-    existed = target.is_dir()
-    staging = target / _STAGING
-    shutil.rmtree(staging, ignore_errors=True)
-    make_folder(staging)
-    try:
-        yield staging
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-        if not existed:
-            with contextlib.suppress(OSError):  # not empty: it was filled
-                target.rmdir()
-
-
-def _placed(written: Sequence[Path], target: Path) -> list[Path]:
-    """Move all files of the staging folder to ``target``, instead of an earlier export's."""
-    try:
-        earlier, new = _exported(target), sorted((target / _STAGING).iterdir())
-        for place in (target / path.name for path in new):
-            if place.exists() and place not in earlier:
-                raise OutputError(f"{place}: exists already, not from an export; move it first.")
-        for path in earlier:
-            path.unlink()
-        for path in new:
-            path.replace(target / path.name)
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror or error}).") from None
-    return [target / path.name for path in written]
-
-
-def _exported(target: Path) -> list[Path]:
-    """Files of earlier exports in a folder; their content or name tells."""
-    if not target.is_dir():
-        return []
-    return [path for path in sorted(target.iterdir()) if path.is_file() and _is_exported(path)]
-
-
-def _is_exported(path: Path) -> bool:
-    if path.suffix == ".json":
-        with contextlib.suppress(OSError, ValueError, RecursionError):
-            meta = json.loads(path.read_text(encoding="utf-8"))
-            return isinstance(meta, dict) and meta.get("simulator") == _SIMULATOR
-        return False
-    if path.suffix == ".h5":
-        with contextlib.suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
-            return "0/world_pos" in file and "0/mesh_pos" in file
-        return False
-    return _SERIES.fullmatch(path.name) is not None
 
 
 def _chosen(simulation: Simulation, runs: Sequence[str] | None) -> Sequence[str]:
@@ -333,7 +262,7 @@ def _meta(fields: dict[str, Array], time_step: float) -> dict[str, Any]:
         for name, values in fields.items()
     }
     return {
-        "simulator": _SIMULATOR,
+        "simulator": SIMULATOR,
         "dt": time_step,
         "trajectory_length": frames,
         "field_names": list(fields),

@@ -41,6 +41,7 @@ def produce(
 
 
 def shard_path(folder: Path, plan: MeshPlan) -> Path:
+    """Where a mesh's file belongs."""
     return folder / f"{plan.name}{SUFFIX}"
 
 

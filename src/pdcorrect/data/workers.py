@@ -9,9 +9,10 @@ import re
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def computed(
                 return
             yield produce(config, folder, unit, workers.device)
         return
-    yield from _distributed(config, folder, units, workers, deadline)
+    yield from _distributed(partial(_work, config, folder.resolve()), units, workers, deadline)
 
 
 def _over(deadline: float | None) -> bool:
@@ -91,15 +92,13 @@ def _over(deadline: float | None) -> bool:
 
 
 def _distributed(
-    config: DatasetConfig,
-    folder: Path,
-    units: Sequence[list[MeshPlan]],
+    work: Callable[[list[MeshPlan], str], list[MeshPlan]],
+    units: Iterable[list[MeshPlan]],
     workers: Workers,
     deadline: float | None,
 ) -> Iterator[list[MeshPlan]]:
     """The same on Dask workers: a unit is handed out when a worker is free."""
     distributed = require_extra("distributed", "cluster")
-    folder = folder.resolve()
     with _client(distributed, workers) as client, client.as_current():
         _wait_for_worker(client)
         waiting = iter(units)
@@ -111,7 +110,7 @@ def _distributed(
                 unit = None if _over(deadline) else next(waiting, None)
                 if unit is None:
                     return
-                call = client.submit(_work, config, folder, unit, workers.device, pure=False)
+                call = client.submit(work, unit, workers.device, pure=False)
                 running.add(call)
 
         hand_out()
