@@ -10,10 +10,11 @@ A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  WORK 
     evaluations/DATASET          all recipes' best models side by side, by ``pdcorrect evaluate``
     logs/                        what these commands said
 
-Data are generated in the order of the recipes, each training begins as soon as its data are
-there, several at a time on each GPU, and a data set's models are evaluated when all its
-trainings have ended.  Trainings that are still running after ``--seconds`` are stopped; their
-best models so far are evaluated, and the next start goes on with them.
+Data are generated in the order of the recipes, unless ``--generators 0`` says that they are
+there.  Each training begins as soon as its data are there, several at a time on each GPU, and a
+data set's models are evaluated when all its trainings have ended.  Trainings that are still
+running after ``--seconds`` are stopped; their best models so far are evaluated, and the next
+start goes on with them.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Job:
     until: float | None = None
     status: int | None = None
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
-    gpu: int | None = None
+    gpu: str | None = None
 
 
 class Machine:
@@ -73,13 +74,13 @@ class Machine:
     Parameters
     ----------
     logs : path
-    gpus : int
-        0 for a machine whose CPU is used.
+    gpus : sequence of str
+        As CUDA_VISIBLE_DEVICES names them; none for a machine whose CPU is used.
     places : dict of str to int
         Of each queue; of "train" for each GPU.
     """
 
-    def __init__(self, logs: Path, gpus: int, places: dict[str, int]) -> None:
+    def __init__(self, logs: Path, gpus: Sequence[str], places: dict[str, int]) -> None:
         self._logs, self._gpus, self._places = logs, gpus, places
         logs.mkdir(parents=True, exist_ok=True)
 
@@ -114,7 +115,7 @@ class Machine:
             return False
         if any(j.status is None for j in job.after):
             return False
-        places = self._places[job.queue] * (max(1, self._gpus) if job.queue == "train" else 1)
+        places = self._places[job.queue] * (max(1, len(self._gpus)) if job.queue == "train" else 1)
         return sum(1 for _ in self._running(job.queue, jobs)) < places
 
     @staticmethod
@@ -125,8 +126,8 @@ class Machine:
         environment = dict(os.environ)
         if self._gpus and job.queue != "generate":
             busy = [j.gpu for j in jobs if j.process is not None and j.status is None]
-            job.gpu = min(range(self._gpus), key=busy.count)
-            environment["CUDA_VISIBLE_DEVICES"] = str(job.gpu)
+            job.gpu = min(self._gpus, key=busy.count)
+            environment["CUDA_VISIBLE_DEVICES"] = job.gpu
         limit = [] if job.until is None else ["--seconds", str(max(0.0, job.until - time.time()))]
         with (self._logs / f"{job.name}.log").open("ab") as log:
             job.process = subprocess.Popen(
@@ -144,9 +145,12 @@ def plan(work: Path, recipes: Sequence[Path], options: argparse.Namespace) -> li
     until = None if options.seconds is None else time.time() + options.seconds
     jobs: list[Job] = []
     names = list(dict.fromkeys(recipe.parent.name for recipe in recipes))
-    ready = {name: _generation(work, name, LEARNT, options) for name in names}
-    judged = {name: _generation(work, name, (EVALUATION,), options) for name in names}
-    jobs += [*ready.values(), *judged.values()]
+    ready, judged = (
+        {name: [_generation(work, name, splits, options)] if options.generators else []
+         for name in names}
+        for splits in (LEARNT, (EVALUATION,))
+    )  # fmt: skip
+    jobs += [job for made in (ready, judged) for name in names for job in made[name]]
     for name in names:
         own = [recipe for recipe in recipes if recipe.parent.name == name]
         trainings = [_training(work, recipe, ready[name], until, options) for recipe in own]
@@ -156,9 +160,9 @@ def plan(work: Path, recipes: Sequence[Path], options: argparse.Namespace) -> li
         evaluation = Job(
             f"evaluate-{name}",
             ["evaluate", *models, str(work / "data" / name), "--device", options.device,
-             "--batch", "50", "--workers", str(options.measurers), "-o", str(output),
+             "--batch", "100", "--workers", str(options.measurers), "-o", str(output),
              "--no-figures"],
-            [*trainings, judged[name]],
+            [*trainings, *judged[name]],
             "evaluate",
         )  # fmt: skip
         jobs += [*trainings, evaluation]
@@ -178,7 +182,7 @@ def _generation(work: Path, name: str, splits: Sequence[str], options: argparse.
 
 
 def _training(
-    work: Path, recipe: Path, data: Job, until: float | None, options: argparse.Namespace
+    work: Path, recipe: Path, data: Sequence[Job], until: float | None, options: argparse.Namespace
 ) -> Job:
     name = recipe.parent.name
     output = work / "trainings" / name / recipe.stem
@@ -186,7 +190,7 @@ def _training(
         "train", str(recipe), "--data", str(work / "data" / name), "-o", str(output),
         "--device", options.device, "--resume",
     ]  # fmt: skip
-    return Job(f"train-{name}-{recipe.stem}", arguments, [data], "train", until)
+    return Job(f"train-{name}-{recipe.stem}", arguments, data, "train", until)
 
 
 def main() -> None:
@@ -194,21 +198,27 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("recipes", nargs="*", type=Path, metavar="RECIPE")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--generators", type=int, default=1, help="processes that generate data")
+    parser.add_argument(
+        "--generators", type=int, default=1, help="processes that generate data; 0: it is there"
+    )
     parser.add_argument("--batch", type=int, default=60, help="simulations that each computes")
     parser.add_argument("--together", type=int, default=1, help="trainings at a time on a GPU")
     parser.add_argument("--measurers", type=int, default=1, help="processes that measure")
     parser.add_argument("--seconds", type=float, default=None, help="when trainings are stopped")
     options = parser.parse_args()
     recipes = options.recipes or sorted((HERE / "recipes").glob("*/*.toml"))
-    gpus = 0
-    if options.device == "cuda":
-        import torch
-
-        gpus = torch.cuda.device_count()
-    places = {"generate": 1, "train": options.together, "evaluate": max(1, gpus)}
+    gpus = _gpus() if options.device == "cuda" else []
+    places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
     machine = Machine(options.work / "logs", gpus, places)
     sys.exit(0 if machine.run(plan(options.work, recipes, options)) else 1)
+
+
+def _gpus() -> list[str]:
+    import torch
+
+    numbers = [str(number) for number in range(torch.cuda.device_count())]
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return named.split(",")[: len(numbers)] if named else numbers
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from hybrid_samples import (
     silent,
     soft_beam,
 )
+from pdcorrect.corrector import features
 from pdcorrect.corrector.batch_bodies import BatchBodies, external_forces
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts
@@ -83,6 +84,26 @@ def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
         assert torch.equal(state.velocities, plain.velocities)
 
 
+def test_network_and_gate_look_at_the_same_features(monkeypatch):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]), gate=Gate())
+    computed = []
+    for table in (features.NODE_FEATURES, features.EDGE_FEATURES):
+        for name, (count, function) in list(table.items()):
+            monkeypatch.setitem(table, name, (count, counted(computed, name, function)))
+    hybrid(problem.rest_state())
+    config = hybrid.corrector.config
+    assert sorted(computed) == sorted([*config.node_features, *config.edge_features])
+
+
+def counted(computed, name, function):
+    def call(view):
+        computed.append(name)
+        return function(view)
+
+    return call
+
+
 # --- one scene and many ----------------------------------------------------------------------
 
 
@@ -90,8 +111,8 @@ def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_scenes_of_a_batch_are_corrected_as_each_alone(placement, element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
-    features = (*preset("compact").node_features, "previous-correction")
-    corrector = fitted(scenes, placement=placement, node_features=features)
+    names = (*preset("compact").node_features, "previous-correction")
+    corrector = fitted(scenes, placement=placement, node_features=names)
     gate = Gate(margin=None)
     stepper = pc.BatchStepper(scenes, 1e-12)
     many = BatchHybrid(stepper, corrector, gate=gate)
@@ -536,8 +557,8 @@ def test_a_run_goes_on_from_its_file_with_the_correction_before(tmp_path):
 
 def test_only_networks_that_ask_for_the_correction_before_remember_it():
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    for features, expected in ((preset("compact").node_features, set()), (None, {MEMORY})):
-        changes = _TINY if features is None else {"node_features": features}
+    for names, expected in ((preset("compact").node_features, set()), (None, {MEMORY})):
+        changes = _TINY if names is None else {"node_features": names}
         stepper = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem], **changes))
         assert set(stepper(problem.rest_state()).state.memory) == expected
 
@@ -1107,8 +1128,8 @@ def test_loads_that_are_not_finite_fail_their_scene_alone(through_solver):
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_scene_whose_step_fails_has_no_part_in_the_derivatives(placement, through_solver, spoil):
     scenes = problems((3, 1, 1), (2, 1, 1))
-    features = (*preset("compact").node_features, "previous-correction")
-    corrector = fitted(scenes, placement=placement, node_features=features)
+    names = (*preset("compact").node_features, "previous-correction")
+    corrector = fitted(scenes, placement=placement, node_features=names)
     found = gradients_beside(scenes, corrector, through_solver, spoil)
     expected = gradients_beside(scenes[:1], corrector, through_solver)
     for one, other in zip(found, expected, strict=True):

@@ -739,10 +739,10 @@ def test_components_that_never_change_become_zero(constant):
 def test_what_never_changed_in_training_is_known_to_a_hundredth():
     one, zero = torch.full((9, 1), 2.5), torch.zeros(9, 1)
     normaliser = fitted(a=one.double(), b=zero.double())
-    assert normaliser.excess("a", tensor([[2.5], [2.55], [1.0]])).flatten().tolist() == (
+    assert normaliser.excess({"a": tensor([[2.5], [2.55], [1.0]])}).flatten().tolist() == (
         pytest.approx([0.0, 2.0, 60.0], abs=1e-12)
     )
-    assert normaliser.excess("b", tensor([[0.0], [1.0]])).flatten().tolist() == (
+    assert normaliser.excess({"b": tensor([[0.0], [1.0]])}).flatten().tolist() == (
         pytest.approx([0.0, 100.0], abs=1e-12)
     )
 
@@ -770,7 +770,7 @@ def test_node_types_are_not_normalised():
 
 def test_excess_counts_deviations_outside_the_range_seen():
     x = tensor([[0.0, -1.0], [4.0, 1.0]])  # deviations 2 and 1
-    found = fitted(a=x).excess("a", tensor([[2.0, 0.0], [-3.0, 1.0], [5.0, -1.5], [4.0, 3.0]]))
+    found = fitted(a=x).excess({"a": tensor([[2.0, 0.0], [-3.0, 1.0], [5.0, -1.5], [4.0, 3.0]])})
     assert torch.equal(found, tensor([[0.0, 0.0], [1.5, 0.0], [0.5, 0.5], [0.0, 2.0]]))
 
 

@@ -25,7 +25,7 @@ OPTIONS = Namespace(device="cpu", generators=1, batch=60, measurers=1, seconds=N
 
 
 def machine(folder, together=2):
-    return make.Machine(folder, 0, {"generate": 1, "train": together, "evaluate": 1})
+    return make.Machine(folder, [], {"generate": 1, "train": together, "evaluate": 1})
 
 
 def test_a_job_waits_for_those_it_needs(tmp_path, capsys):
@@ -67,7 +67,7 @@ def test_no_more_trainings_run_than_there_are_places(tmp_path):
             super()._start(job, jobs)
             seen.append(sum(1 for _ in self._running("train", jobs)))
 
-    assert Watched(tmp_path, 0, {"train": 2}).run(jobs)
+    assert Watched(tmp_path, [], {"train": 2}).run(jobs)
     assert max(seen) == 2
 
 
@@ -85,6 +85,20 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
         "generate-torsion-exact-training"
     ]
     assert str(tmp_path / "trainings/torsion-exact/force/model") in last.arguments
+
+
+def test_data_that_are_there_are_not_generated(tmp_path):
+    recipe = ROOT / "models/recipes/torsion-exact/force.toml"
+    jobs = make.plan(tmp_path, [recipe], Namespace(**{**vars(OPTIONS), "generators": 0}))
+    assert [job.name for job in jobs] == ["train-torsion-exact-force", "evaluate-torsion-exact"]
+    assert list(jobs[0].after) == []
+    assert jobs[1].after == [jobs[0]]
+
+
+def test_trainings_are_spread_over_the_gpus_that_are_visible(tmp_path):
+    jobs = [make.Job(f"job {k}", FINE, [], "train") for k in range(4)]
+    assert make.Machine(tmp_path, ["2", "5"], {"train": 2}).run(jobs)
+    assert sorted(job.gpu for job in jobs) == ["2", "2", "5", "5"]
 
 
 @pytest.mark.slow

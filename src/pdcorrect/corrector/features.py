@@ -53,10 +53,17 @@ class Snapshot:
 
 
 class View:
-    """A snapshot of bodies, and what features need of it, computed when first asked for."""
+    """A snapshot of bodies, and what features need of it, computed when first asked for.
+
+    Attributes
+    ----------
+    known : dict of str to tensor
+        Features by name (see `values`), which network and gate both look at.
+    """
 
     def __init__(self, bodies: BodyGraph, snapshot: Snapshot) -> None:
         self.bodies, self.snapshot = bodies, snapshot
+        self.known: dict[str, Tensor] = {}
         self.size = bodies.by_node(bodies.cell_size)[:, None]
         self.step = bodies.by_node(bodies.time_step)[:, None]
         self.receiver, self.sender = bodies.edge_index
@@ -251,5 +258,8 @@ def width(features: dict[str, Feature], names: Sequence[str]) -> int:
 
 
 def values(features: dict[str, Feature], names: Sequence[str], view: View) -> dict[str, Tensor]:
-    """Some features of a view by name."""
-    return {name: features[name][1](view) for name in names}
+    """Some features of a view by name, each computed once."""
+    for name in names:
+        if name not in view.known:
+            view.known[name] = features[name][1](view)
+    return {name: view.known[name] for name in names}

@@ -6,7 +6,7 @@ not finite, and those of steps that the coarse solver failed, are refused withou
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated
@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Feature, View, values
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import NonNegative, Number, Strict
 
@@ -101,15 +101,12 @@ class Gate(Strict):
         if margin is None:
             return torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
 
-        def outside(name: str, values: Tensor) -> Tensor:
-            return ~(corrector.normaliser.excess(name, values) <= margin).all(dim=1)
+        def outside(table: dict[str, Feature], names: Sequence[str]) -> Tensor:
+            excess = corrector.normaliser.excess(values(table, names, view))
+            return ~(excess <= margin).all(dim=1)
 
-        nodes = torch.zeros_like(bodies.graph, dtype=torch.bool)
-        for name in config.node_features:
-            nodes |= outside(name, NODE_FEATURES[name][1](view))
-        edges = torch.zeros_like(view.receiver, dtype=torch.bool)
-        for name in config.edge_features:
-            edges |= outside(name, EDGE_FEATURES[name][1](view))
+        nodes = outside(NODE_FEATURES, config.node_features)
+        edges = outside(EDGE_FEATURES, config.edge_features)
         counts = torch.zeros_like(bodies.mass).index_add(0, view.receiver, edges.to(bodies.mass))
         nodes |= counts > 0.0
         return bodies.body_means(nodes.to(bodies.mass)) > self.share

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -127,23 +127,25 @@ class Normaliser(nn.Module):
 
     def joined(self, values: Mapping[str, Tensor], clip: float | None) -> Tensor:
         """Normalised features (m, k1 + k2 + ...), bent towards -clip and clip."""
-        parts = [
-            (x - self._part(name, "mean").to(x)) / self._part(name, "deviation").to(x)
-            for name, x in values.items()
-        ]
-        out = torch.cat(parts, dim=1)
+        x = torch.cat(list(values.values()), dim=1)
+        out = (x - self._row(values, "mean", x)) / self._row(values, "deviation", x)
         return out if clip is None else clip * torch.tanh(out / clip)
 
-    def excess(self, name: str, x: Tensor) -> Tensor:
-        """How far components (m, k) lie outside the range seen, in deviations, at least 0.
+    def excess(self, values: Mapping[str, Tensor]) -> Tensor:
+        """How far components (m, k1 + k2 + ...) lie outside the range seen, at least 0.
 
-        In hundredths of the value, or of one, where a component was constant.
+        In deviations, or where a component was constant in hundredths of its value, or of one.
         """
-        low, high, deviation = (self._part(name, p).to(x) for p in ("low", "high", "deviation"))
+        x = torch.cat(list(values.values()), dim=1)
+        low, high, deviation = (self._row(values, p, x) for p in ("low", "high", "deviation"))
         size = torch.maximum(low.abs(), high.abs())
         constant = high - low <= _LEAST_DEVIATION * size
         unit = torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
         return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
+
+    def _row(self, names: Iterable[str], part: str, like: Tensor) -> Tensor:
+        """A part of some features side by side, (k1 + k2 + ...,)."""
+        return torch.cat([self._part(name, part) for name in names]).to(like)
 
     def _part(self, name: str, part: str) -> Tensor:
         found: Tensor = getattr(self, _key(name, part))

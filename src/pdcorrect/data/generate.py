@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards
@@ -19,12 +20,15 @@ from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_reader import stored_hashes
+from pdcorrect.data.simulate import work_per_node
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.replacement import clear_parts, make_folder, write_text
 
 _MOST_DIFFERENCES = 5
 """Keys of another configuration that are told."""
+_LONGEST = 4
+"""Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
 OnBegin = Callable[[int, int, Sequence[str]], None]
 """Called once before anything is computed with how many simulations of how many are there, and
 with the names of files that are damaged and will be computed again.
@@ -127,7 +131,7 @@ def generate(
         on_begin(total - left, total, [p.name for p in missing if shard_path(folder, p).exists()])
     deadline = None if seconds is None else time.monotonic() + seconds
     begun = left
-    for unit in computed(config, folder, _units(missing, workers), workers, deadline):
+    for unit in computed(config, folder, _units(config, missing, workers), workers, deadline):
         for plan in unit:
             left -= plan.simulations
             if on_file:
@@ -219,25 +223,35 @@ def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[Mes
     return [plan for plan in plans if plan.split in splits]
 
 
-def _units(plans: Sequence[MeshPlan], workers: Workers) -> list[list[MeshPlan]]:
+def _units(
+    config: DatasetConfig, plans: Sequence[MeshPlan], workers: Workers
+) -> list[list[MeshPlan]]:
     """What is computed together: a mesh on a CPU, some meshes of one split on a GPU.
 
-    There meshes of like size, since a batch is padded to its largest.
+    There meshes of like size, since a batch is padded to its largest, and the longest units
+    first, so that none is left over when all others are done.
     """
     if workers.device == "cpu":
         return [[plan] for plan in plans]
     splits = list(dict.fromkeys(plan.split for plan in plans))
     plans = sorted(plans, key=lambda plan: (splits.index(plan.split), plan.design.nodes))
+    usual = median([work_per_node(config, plan) for plan in plans] or [0.0])
+    most = _LONGEST * workers.batch * usual
     units: list[list[MeshPlan]] = []
-    count = 0
+    count, work = 0, 0.0
     for plan in plans:
-        fits = count + plan.simulations <= workers.batch
+        own = plan.simulations * work_per_node(config, plan)
+        fits = count + plan.simulations <= workers.batch and work + own <= most
         if not units or units[-1][0].split != plan.split or not fits:
             units.append([])
-            count = 0
+            count, work = 0, 0.0
         units[-1].append(plan)
-        count += plan.simulations
-    return units
+        count, work = count + plan.simulations, work + own
+    return sorted(units, key=lambda unit: -sum(_work(config, plan) for plan in unit))
+
+
+def _work(config: DatasetConfig, plan: MeshPlan) -> float:
+    return plan.simulations * plan.design.nodes * work_per_node(config, plan)
 
 
 def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:

@@ -100,6 +100,12 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     return found
 
 
+def work_per_node(config: DatasetConfig, mesh: MeshPlan) -> float:
+    """About how much a simulation takes for each coarse node: steps of refined nodes."""
+    runs = (m for m in models(config, mesh).values() if not m.sample)
+    return float(mesh.frames * sum((1 + m.predict) * m.refine**3 * m.divisor for m in runs))
+
+
 @dataclass(eq=False)
 class _Meshed:
     """A mesh plan with its discretisations, one for each model."""

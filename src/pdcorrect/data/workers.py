@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import re
 import signal
 import threading
@@ -184,10 +185,29 @@ def _work(
 ) -> list[MeshPlan]:
     """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
     if device == "cuda":
-        import torch
         from distributed import get_worker
 
         name = str(get_worker().name)
         if name.isdigit():
-            device = f"cuda:{int(name) % torch.cuda.device_count()}"
+            device = _own_gpu(int(name))
     return produce(config, folder, plans, device)
+
+
+def _own_gpu(worker: int) -> str:
+    """The device of a worker, by its number.
+
+    Where CUDA has not started yet the process sees no other: kernels that are compiled for the
+    first GPU are then found in the caches by the workers of all others.
+    """
+    import torch
+
+    count = torch.cuda.device_count()
+    if count < 2:
+        return "cuda"
+    if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+        named = os.environ.get("CUDA_VISIBLE_DEVICES")
+        names = named.split(",")[:count] if named else [str(k) for k in range(count)]
+        os.environ["CUDA_VISIBLE_DEVICES"] = names[worker % count]
+        if torch.cuda.device_count() == 1:
+            return "cuda"
+    return f"cuda:{worker % count}"

@@ -1,0 +1,315 @@
+"""Error against run time of every model and solver, for a scene of each data set."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+import common
+
+import pdcorrect as pc
+from pdcorrect.data.config import EVALUATION, DatasetConfig
+from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.home import home_folder
+
+MOTIONS, SETTINGS = ("impulse", "stretch", "torsion"), ("as-published", "exact")
+FRAMES = 30
+FINEST = {"as-published": 4, "exact": 8}
+"""Cut of the reference's cells: that of the thesis, and one finer than the data set's."""
+TOLERANCES = (1e-2, 1e-3, 1e-6)
+"""Of the coarse cell size, beside the scene's own."""
+MODELS: Mapping[tuple[str, str], Sequence[str]] = {("torsion", "exact"): ("tiny",)}
+"""Released correctors that were trained on such scenes, by motion and setting."""
+OTHERS = ("plain", "best", "hybrid, tiny", "plain 2×2×2", "hex27")
+"""Named in figures, besides those on the front."""
+FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
+            "other tolerance", "Newton", "hybrid")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to compute the scene.
+
+    Attributes
+    ----------
+    family : str
+        One of `FAMILIES`.
+    stepper : callable
+        Makes what steps.
+    every : float
+        Frames from one step to the next: 2 where the step is twice as long.
+    """
+
+    family: str
+    stepper: Callable[[], Any]
+    every: float = 1.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a method reached: nodes, ms a frame, RMS error in m on the coarse nodes."""
+
+    name: str
+    family: str
+    nodes: int
+    milliseconds: float
+    error: float
+
+
+class Comparison:
+    """The methods for one scene, and their errors.
+
+    Parameters
+    ----------
+    motion, setting : str
+    quick : bool
+        Fewer frames, and the data set's reference.
+    """
+
+    def __init__(self, motion: str, setting: str, quick: bool) -> None:
+        self.motion, self.setting, self.quick = motion, setting, quick
+        self.frames = 5 if quick else FRAMES
+        self.finest = 4 if quick else FINEST[setting]
+        self.scene = smallest_scene(motion, setting)
+        self.points = pc.discretise(self.scene)
+
+    @cached_property
+    def truth(self) -> pc.Trajectory:
+        """The reference on the coarse nodes."""
+        scene = self.best if self.setting == "exact" else self.scene
+        run = self.run(pc.ProjectiveDynamics(pc.discretise(scene, refine=self.finest)))
+        self.reference = run
+        return pc.restrict(run, to=self.points)
+
+    @cached_property
+    def best(self) -> pc.Scene:
+        """The scene with the better element."""
+        return pc.best_coarse(self.scene)
+
+    def run(self, stepper: Any, every: float = 1.0) -> pc.Trajectory:
+        """All frames."""
+        return pc.rollout(stepper, round(self.frames / every))
+
+    def row(self, name: str, method: Method) -> Row:
+        """Run a method, once more if it is quick, and measure it."""
+        run = self.run(method.stepper(), method.every)
+        seconds = median_step(run)
+        if seconds < 0.1:
+            seconds = min(seconds, median_step(self.run(method.stepper(), method.every)))
+        error = self.error(run, method.every)
+        nodes = len(run.problem.positions)
+        return Row(name, method.family, nodes, 1e3 * seconds / method.every, error)
+
+    def error(self, run: pc.Trajectory, every: float = 1.0) -> float:
+        """RMS distance from the reference, m, at the frames that both have."""
+        found = pc.restrict(run, to=self.points).positions
+        truth = self.truth.positions
+        if every < 1.0:
+            found = found[:: round(1.0 / every)]
+        return pc.metrics.rms_error(found, truth[:: max(1, round(every))])
+
+    def methods(self) -> Iterator[tuple[str, Method]]:
+        """All of them, by name."""
+        coarse, other, finer, tolerance, newton, _ = FAMILIES
+        plain = partial(pc.discretise, self.scene)
+        yield "plain", Method(coarse, lambda: pc.ProjectiveDynamics(plain()))
+        yield "right mass", Method(coarse, self._right_mass)
+        yield "fitted stiffness", Method(coarse, self._fitted)
+        elements = ("hex8-mean", "hex8-bubble", "hex27")
+        for element in elements[:1] if self.quick else elements:
+            yield element, Method(other, self._pd(plain, element=element))
+        best = partial(pc.discretise, self.best)
+        yield "best", Method(other, self._pd(best))
+        yield "plain 2×2×2", Method(finer, self._pd(plain, refine=2))
+        if self.quick:
+            return
+        yield "best 2×2×2", Method(finer, self._pd(best, refine=2))
+        if self.setting == "exact":  # the other's reference
+            yield "plain 4×4×4", Method(finer, self._pd(plain, refine=4))
+            yield "best 4×4×4", Method(finer, self._pd(best, refine=4))
+        for name, make in (("plain", plain), ("best", best)):
+            for size in TOLERANCES:
+                label = f"{name}, {size:.0e}"
+                yield label, Method(tolerance, lambda m=make, s=size: pc.ProjectiveDynamics(m(), s))
+            yield f"{name}, Newton", Method(newton, lambda m=make: pc.Newton(m()))
+        for every in (2.0, 0.5):
+            step = every * self.points.time_step
+            make = partial(self._newton, best, step)
+            yield f"best, Newton, {every:g} h", Method(newton, make, every)
+        for name in MODELS.get((self.motion, self.setting), ()):
+            yield f"hybrid, {name}", Method("hybrid", partial(self._hybrid, name))
+
+    def _pd(self, make: Callable[..., pc.Problem], **options: Any) -> Callable[[], Any]:
+        return lambda: pc.ProjectiveDynamics(make(**options))
+
+    def _newton(self, make: Callable[..., pc.Problem], step: float) -> pc.Newton:
+        return pc.Newton(make(), time_step=step)
+
+    def _hybrid(self, name: str) -> Any:
+        corrector = pc.load_model(home_folder("models") / name).corrector
+        coarse = pc.ProjectiveDynamics(pc.discretise(self.best))
+        return pc.HybridStepper(coarse, corrector, gate=pc.Gate())
+
+    def _right_mass(self) -> pc.ProjectiveDynamics:
+        problem = self.points
+        ratio = self.reference.problem.mass.sum() / problem.mass.sum()
+        density = ratio * problem.materials.density
+        return pc.ProjectiveDynamics(problem.with_material(density=density))
+
+    def _fitted(self) -> pc.ProjectiveDynamics:
+        """With the modulus that suits this very scene best: more than one can have elsewhere."""
+        known = self.points.materials
+
+        def stepper(logarithm: float) -> pc.ProjectiveDynamics:
+            problem = self.points.with_material(np.exp(logarithm) * known.young, known.poisson)
+            return pc.ProjectiveDynamics(problem)
+
+        def error(logarithm: float) -> float:
+            return self.error(self.run(stepper(logarithm)))
+
+        found = minimize_scalar(
+            error, bounds=(-2.0, 1.0), method="bounded", options={"xatol": 0.02, "maxiter": 12}
+        )
+        return stepper(float(found.x))
+
+
+def median_step(run: pc.Trajectory) -> float:
+    """Wall-clock seconds of a step."""
+    return float(np.median(run.stats["seconds"]))
+
+
+def smallest_scene(motion: str, setting: str) -> pc.Scene:
+    """The first simulation on the smallest mesh of a data set's evaluation split."""
+    config = DatasetConfig.load(home_folder("datasets") / f"{motion}-{setting}" / "config.toml")
+    plans = [plan for plan in make_plan(config) if plan.split == EVALUATION]
+    return draw_scene(config, min(plans, key=lambda plan: plan.design.nodes), 0)
+
+
+def front(rows: Sequence[Row]) -> list[Row]:
+    """Those that no other is quicker and nearer than, quickest first."""
+    out: list[Row] = []
+    for row in sorted(rows, key=lambda r: (r.milliseconds, r.error)):
+        if not out or row.error < out[-1].error:
+            out.append(row)
+    return out
+
+
+def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
+    """Error, per cent of the largest displacement, against time, with the Pareto front."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axis = figure.subplots()
+    best = front(rows)
+    points = [(r.milliseconds, 100.0 * r.error / scale) for r in best]
+    axis.plot(*zip(*points, strict=True), color="0.6", linewidth=1.5, label="Pareto front")
+    for k, family in enumerate(FAMILIES):
+        some = [r for r in rows if r.family == family]
+        if some:
+            x, y = zip(*((r.milliseconds, 100.0 * r.error / scale) for r in some), strict=True)
+            marker = "osD^vP"[k]
+            axis.scatter(x, y, 42, common.COLOURS[k], marker, label=family, zorder=3)
+    axis.set(
+        xscale="log", yscale="log", xlabel="ms a frame",
+        ylabel="RMS error, per cent of the largest displacement",
+    )  # fmt: skip
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+    axis.grid(alpha=0.3, which="both")
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.margins(x=0.12)
+    figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=9)
+    last = [row for row in rows if row not in best and row.name in OTHERS]
+    write_names(axis, [(r.name, r.milliseconds, 100.0 * r.error / scale) for r in [*best, *last]])
+    figure.savefig(path, dpi=150)
+
+
+def write_names(axis: Any, points: Sequence[tuple[str, float, float]]) -> None:
+    """Names beside points, those that come first where there is no room for all."""
+    axis.figure.canvas.draw()  # for the sizes of texts
+    taken: list[Any] = []
+    for name, x, y in points:
+        for dx, dy in ((6, 5), (6, -12), (-6, 5), (-6, -12)):
+            side = "left" if dx > 0 else "right"
+            text = axis.annotate(
+                name, (x, y), (dx, dy), textcoords="offset points", fontsize=8, ha=side
+            )
+            box = text.get_window_extent()
+            if not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                break
+            text.remove()
+
+
+def outcome(motion: str, setting: str, quick: bool) -> common.Outcome:
+    """One scene."""
+    comparison = Comparison(motion, setting, quick)
+    scale = pc.metrics.largest_displacement(comparison.truth)
+    rows = [comparison.row(name, method) for name, method in comparison.methods()]
+    by_name = {row.name: row for row in rows}
+    plain, middle = by_name["plain"], by_name["plain 2×2×2"]
+    label = f"{motion}, {setting}"
+    as_near = min((r for r in rows if r.error <= middle.error), key=lambda r: r.milliseconds)
+    as_quick = min((r for r in rows if r.milliseconds <= 1.1 * middle.milliseconds),
+                   key=lambda r: r.error)  # fmt: skip
+    figures: dict[str, float] = {
+        f"{label}, largest displacement, mm": 1e3 * scale,
+        f"{label}, plain, error, per cent": 100.0 * plain.error / scale,
+        f"{label}, best, error over plain's": by_name["best"].error / plain.error,
+        f"{label}, intermediate mesh, omega": 100.0 * (1.0 - (middle.error / plain.error) ** 2),
+    }
+    if not quick:  # times of a few frames say nothing
+        speed_up = middle.milliseconds / as_near.milliseconds
+        figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
+        figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
+    for name in ("plain", "best"):
+        if f"{name}, 1e-06" in by_name:
+            tight, newton = by_name[f"{name}, 1e-06"], by_name[f"{name}, Newton"]
+            figures[f"{label}, {name}, PD's error over Newton's"] = tight.error / newton.error
+    reference = comparison.reference
+    last = Row("reference", FAMILIES[2], len(reference.problem.positions),
+               1e3 * median_step(reference), 0.0)  # fmt: skip
+    heads = ("method", "kind", "nodes", "ms a frame", "RMS error, mm", "per cent", "front")
+    on_front = {row.name for row in front(rows)}
+    body = tuple(
+        (r.name, r.family, float(r.nodes), r.milliseconds, 1e3 * r.error, 100.0 * r.error / scale,
+         "yes" if r.name in on_front else "")
+        for r in sorted([*rows, last], key=lambda r: r.milliseconds)
+    )  # fmt: skip
+    caption = (
+        f"{label}: error against time for {comparison.frames} frames; distances from "
+        f"{comparison.finest}×{comparison.finest}×{comparison.finest} cells a cell."
+    )
+    return common.Outcome(
+        figures,
+        (common.Table(label, heads, body), winners(label, as_near, as_quick)),
+        (common.Picture(f"{motion}-{setting}", caption, lambda path: draw(path, rows, scale)),),
+    )
+
+
+def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
+    """Who is as near as the intermediate mesh in the least time, and nearest in its time."""
+    heads = ("scene", "as near, quickest", "ms a frame", "as quick, nearest", "RMS error, mm")
+    row = (label, as_near.name, as_near.milliseconds, as_quick.name, 1e3 * as_quick.error)
+    return common.Table("Beside the intermediate mesh (plain 2×2×2)", heads, (row,))
+
+
+def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
+    """A part for each scene; quick runs have one."""
+    pairs = [("torsion", "exact")] if quick else [(m, s) for m in MOTIONS for s in SETTINGS]
+    return {f"{m}, {s}": partial(outcome, m, s, quick) for m, s in pairs}
+
+
+if __name__ == "__main__":
+    sys.exit(common.main(__file__))
