@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -12,6 +11,7 @@ from pydantic import ValidationError
 
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import Strict
+from pdcorrect.toml_text import parse_toml
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -41,9 +41,11 @@ class TomlConfig(Strict):
     def from_toml(cls, text: str, source: str = "configuration") -> Self:
         """Read a configuration from TOML text; ``source`` names it in messages."""
         try:
-            return cls(**tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
+            data = parse_toml(text)
+        except ValueError as error:
             raise InputError(f"{source}: not valid TOML: {error}.") from None
+        try:
+            return cls(**data)
         except ValidationError as error:
             raise InputError(f"{source}: {_explain(error)}") from None
 

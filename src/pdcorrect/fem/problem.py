@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError, SceneError
+from pdcorrect.errors import InputError, MeshError, SceneError
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
@@ -244,7 +244,15 @@ def _coarse_mesh(scene: Scene) -> HexMesh:
         from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
 
         return read_hex_mesh(body.path, body.scale)
-    return voxel_mesh(*body.occupancy(), body.cell_size, body.origin)
+    solid, origin_index = body.occupancy()
+    try:
+        return voxel_mesh(solid, origin_index, body.cell_size, body.origin)
+    except MeshError:  # a grid's cells can only lose their volume to rounding
+        raise SceneError(
+            f"body.cell_size = {body.cell_size:g} with body.origin = {list(body.origin)}: cells "
+            "have no volume in double precision: expected a size of about that of the body's "
+            "coordinates, in metres."
+        ) from None
 
 
 def _freeze(*arrays: NDArray[np.generic]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -18,6 +17,7 @@ from pdcorrect.scene.clamps import Clamp
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
 from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
+from pdcorrect.toml_text import parse_toml
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
@@ -145,8 +145,8 @@ class Scene(Strict):
     def from_toml(cls, text: str, source: str = "scene") -> Scene:
         """Read a scene from TOML text; ``source`` names it in messages."""
         try:
-            data = tomllib.loads(text)
-        except tomllib.TOMLDecodeError as error:
+            data = parse_toml(text)
+        except ValueError as error:
             raise SceneError(f"{source}: not valid TOML: {error}.") from None
         try:
             return cls(**data)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.rollout import run_attributes
 from pdcorrect.state import State, Stepper, Trajectory
+from pdcorrect.toml_text import parse_toml
 
 _SHOWN = 4
 _NONE = "nothing"
@@ -73,8 +73,8 @@ def differences(stepper: Stepper, run: Trajectory) -> list[str]:
 def _settings(scene_toml: str) -> dict[str, str]:
     """A scene's keys, dotted, and values as text, without the number of frames."""
     try:
-        scene = tomllib.loads(scene_toml)
-    except tomllib.TOMLDecodeError:
+        scene = parse_toml(scene_toml)
+    except ValueError:
         return {"scene": "unreadable"}
     settings = dict(_flat("", scene))
     settings.pop("time.frames", None)
