@@ -6,6 +6,7 @@ import re
 import resource
 import signal
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -18,6 +19,13 @@ MEMORY = 3 * 2**30
 
 class HangError(BaseException):
     """An input took too long; not an `Exception`, which readers of files may catch."""
+
+
+def counts(fast, slow):
+    """Numbers of inputs of the two modes, for a test's argument ``count``."""
+    slow = int(slow * float(__import__("os").environ.get("FZ", "1")))
+    slow = pytest.param(slow, marks=pytest.mark.slow)
+    return pytest.mark.parametrize("count", [fast, slow], ids=["fast", "slow"])
 
 
 def for_all(strategy, check, count):

@@ -193,7 +193,7 @@ def load_statistics(folder: str | Path) -> Statistics:
         raise FileFormatError(
             f"{path}: there is no such file: expected compute_statistics(folder).save(folder)."
         ) from None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise FileFormatError(f"{path}: damaged or something else ({error}).") from None
     config_hash, shards = _identity([read_header(p) for p in shard_paths(folder, TRAINING)])
     if (config_hash, shards) == (found.config_hash, dict(found.shards)):

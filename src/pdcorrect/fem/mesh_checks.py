@@ -18,6 +18,9 @@ from pdcorrect.fem.hexahedron import (
 TOLERANCE = 1e-4
 """Of a cell's shortest edge: places nearer than this are the same place."""
 
+_FARTHEST = 1e30
+"""Largest coordinate, m, as of the numbers in a scene; their products stay finite."""
+
 _CHECKED_POINTS = np.concatenate([VTK_CORNERS, gauss_points(2), gauss_points(3)])
 """Where the Jacobian must be positive: the corners and both Gauss rules, (43, 3)."""
 
@@ -41,9 +44,13 @@ def check_arrays(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> No
         )
     if not len(cells):
         raise MeshError("the mesh has no cells: expected at least one hexahedron.")
-    if not np.isfinite(positions).all():
-        node = int(np.argmin(np.isfinite(positions).all(axis=1)))
-        raise MeshError(f"node {node} is at {positions[node]}: expected finite coordinates.")
+    usable = (np.abs(positions) <= _FARTHEST).all(axis=1)
+    if not usable.all():
+        node = int(np.argmin(usable))
+        raise MeshError(
+            f"node {node} is at {positions[node]}: expected finite coordinates, at most "
+            f"{_FARTHEST:g} m from the origin."
+        )
     if cells.min() < 0 or cells.max() >= len(positions):
         raise MeshError(
             f"cells refer to nodes {cells.min()} to {cells.max()}: expected 0 to "

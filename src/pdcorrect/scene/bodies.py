@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal, Union
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pdcorrect import shapes
 from pdcorrect.scene.regions import Cells, Count, Positive, PositiveCount, Strict, Vector
@@ -91,6 +91,13 @@ class MeshFile(Strict):
     shape: Literal["file"]
     path: Path
     scale: Positive = 1.0
+
+    @field_validator("path")
+    @classmethod
+    def _possible(cls, path: Path) -> Path:
+        if "\0" in str(path):
+            raise ValueError("expected a path without the character NUL")
+        return path
 
 
 Body = Annotated[Union[Beam, Cross, Weight, Voxels, MeshFile], Field(discriminator="shape")]

@@ -1,0 +1,318 @@
+"""Random damage to files of data sets, settings and models: read as they were, or refused."""
+
+import hashlib
+import json
+import pickle
+import shutil
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tomli_w
+from hypothesis import strategies as st
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+pytest.importorskip("safetensors")
+
+from fuzzing import altered, counts, damaged, for_all, renumbered  # noqa: E402
+from pdcorrect.corrector import model_io  # noqa: E402
+from pdcorrect.corrector.model_io import DESCRIPTION, WEIGHTS, load_model  # noqa: E402
+from pdcorrect.data.check import check_dataset  # noqa: E402
+from pdcorrect.data.config import DatasetConfig  # noqa: E402
+from pdcorrect.data.shard_arrays import read_arrays, read_header  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
+from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
+from pdcorrect.training.config import TrainingConfig  # noqa: E402
+from test_corrector_model import assert_same_corrector  # noqa: E402
+from test_dataset_files import assert_same, edited  # noqa: E402
+
+ROOT = Path(__file__).parent.parent
+DATASET, MODEL = ROOT / "datasets" / "tiny", ROOT / "models" / "tiny"
+SHARD = DATASET / "training" / "mesh-0000.h5"
+
+value = (
+    st.none()
+    | st.booleans()
+    | st.integers(-3, 9)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.sampled_from(
+        [10**9, -(10**30), 1e308, "float32", "\ud800", "a\0b", [], {}, [[[1]]], [0.5, 0.5, 0.5]]
+    )
+)
+
+LEVELS = "[" * 100_000
+SNIPPETS = (b'"', b"{", b"}", b"[", b"]", b":", b",", b"NaN", b"1e999", b"\xff", LEVELS.encode())
+
+
+# --- files of data sets ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def shard():
+    return read_shard(SHARD)
+
+
+def assert_same_content(found, expected):
+    """All but provenance and cost, which the hash of the content leaves out."""
+    one, other = (
+        replace(
+            shard,
+            provenance={},
+            simulations=tuple(replace(each, seconds={}) for each in shard.simulations),
+        )
+        for shard in (found, expected)
+    )
+    assert_same(one, other, one.simulations[0].forces.dtype)
+
+
+@counts(100, 1000)
+def test_damaged_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
+    path, whole = tmp_path / "shard.h5", SHARD.read_bytes()
+
+    def check(data):
+        path.write_bytes(data)
+        try:
+            found = read_shard(path)
+        except FileFormatError as error:
+            assert str(error).startswith(f"{path}: ")
+        else:
+            assert_same_content(found, shard)
+
+    heads = damaged(whole[:512]).map(lambda head: head + whole[512:])
+    for_all(damaged(whole) | heads, check, count)
+
+
+def places(path):
+    """Places of all groups, datasets and attributes of an HDF5 file."""
+    members, attributes = [], []
+    with h5py.File(path) as file:
+        file.visit(members.append)
+        for place in ["/", *members]:
+            attributes += [(place, name) for name in file[place].attrs]
+    return members, attributes
+
+
+@st.composite
+def edits(draw, path):
+    """One to three changes of a file's content, each a function of the open file."""
+    members, attributes = places(path)
+    changes = []
+    for _ in range(draw(st.integers(1, 3))):
+        kind = draw(st.sampled_from(list(KINDS)))
+        place, other = draw(st.sampled_from(members)), draw(st.sampled_from(members))
+        attribute = draw(st.sampled_from(attributes))
+        new = draw(st.sampled_from([0, -1, 7, 1.5, np.nan, "text", "", np.zeros(3), b"\xff", 2**60]))
+        changes.append((kind, place, other, attribute, new))
+    return changes
+
+
+def exchange(file, place, change):
+    if isinstance(file[place], h5py.Dataset):
+        values = file[place][()]
+        del file[place]
+        file[place] = change(values)
+
+
+def poked(values, new):
+    out = values.copy().ravel()
+    if out.size and np.isscalar(new) and not isinstance(new, (str, bytes)):
+        with np.errstate(all="ignore"):
+            out[out.size // 2] = np.asarray(new).astype(out.dtype)
+    return out.reshape(values.shape)
+
+
+KINDS = {
+    "delete": lambda file, place, other, attribute, new: file.__delitem__(place),
+    "rename": lambda file, place, other, attribute, new: file.move(place, place + "x"),
+    "move": lambda file, place, other, attribute, new: file.move(place, other + "/x"),
+    "link": lambda file, place, other, attribute, new: file.__setitem__(place + "x", file[other]),
+    "swap": lambda file, place, other, attribute, new: exchange(file, place, lambda v: file[other]),
+    "shape": lambda file, place, *_: exchange(file, place, lambda v: v[..., None]),
+    "shorter": lambda file, place, *_: exchange(file, place, lambda v: v[:-1]),
+    "type": lambda file, place, *_: exchange(file, place, lambda v: v.astype("f2")),
+    "order": lambda file, place, *_: exchange(file, place, lambda v: v.astype(v.dtype.newbyteorder())),
+    "value": lambda f, place, other, a, new: exchange(f, place, lambda v: poked(v, new)),
+    "scalar": lambda file, place, other, attribute, new: exchange(file, place, lambda v: new),
+    "forget": lambda file, place, other, attribute, new: file[attribute[0]].attrs.pop(attribute[1]),
+    "attribute": lambda f, p, o, attribute, new: f[attribute[0]].attrs.create(attribute[1], new),
+}
+
+
+@counts(50, 700)
+def test_edited_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
+    path = tmp_path / "shard.h5"
+
+    def edit(file, changes):
+        for kind, *arguments in changes:
+            try:
+                KINDS[kind](file, *arguments)
+            except (KeyError, ValueError, TypeError, OSError, RuntimeError, IndexError):
+                continue  # what another change took away, or HDF5 does not store
+
+    def check(changes):
+        path.unlink(missing_ok=True)
+        edited(SHARD, path, lambda file: edit(file, changes))
+        for read in (read_shard, loose, read_header, read_arrays):
+            try:
+                found = read(path)
+            except FileFormatError as error:
+                assert str(error).startswith(f"{path}: ")
+            else:
+                if read is read_shard:
+                    assert_same_content(found, shard)
+
+    for_all(edits(SHARD), check, count)
+
+
+def loose(path):
+    return read_shard(path, verify=False)
+
+
+# --- settings ----------------------------------------------------------------------------
+
+
+@counts(60, 1000)
+def test_settings_are_read_or_refused_by_name(tmp_path, count):
+    files = [(DatasetConfig, p) for p in sorted((ROOT / "examples" / "datasets").glob("*.toml"))]
+    files += [(TrainingConfig, p) for p in sorted((ROOT / "examples" / "training").glob("*.toml"))]
+    path = tmp_path / "settings.toml"
+
+    def changed(file):
+        kind, text = file[0], file[1].read_bytes()
+        tree = tomllib.loads(text.decode())
+        texts = damaged(text, (*SNIPPETS, b"9" * 5000, b"a." * 5000)) | renumbered(text)
+        texts |= altered(tree, value.filter(lambda v: v is not None)).map(as_toml)
+        return st.tuples(st.just(kind), texts)
+
+    def check(one):
+        path.write_bytes(one[1])
+        try:
+            one[0].load(path)
+        except InputError as error:
+            assert str(path) in str(error)
+
+    for_all(st.sampled_from(files).flatmap(changed), check, count)
+
+
+def as_toml(tree):
+    return tomli_w.dumps(tree).encode("utf-8", errors="replace")
+
+
+@counts(10, 100)
+def test_other_files_of_data_sets_are_read_or_refused_by_name(tmp_path, count):
+    folder = tmp_path / "tiny"
+    shutil.copytree(DATASET, folder)
+    compute_statistics(folder).save(folder)
+    names = ("manifest.json", "statistics.json", "config.toml")
+    whole = {name: (folder / name).read_bytes() for name in names}
+
+    def changed(name):
+        texts = damaged(whole[name], SNIPPETS) | renumbered(whole[name])
+        if name.endswith("json"):
+            tree = json.loads(whole[name])
+            texts |= altered(tree, value).map(lambda tree: json.dumps(tree).encode())
+        return st.tuples(st.just(name), texts)
+
+    def check(one):
+        name, data = one
+        (folder / name).write_bytes(data)
+        try:
+            if name == "statistics.json":
+                load_statistics(folder)
+            else:
+                found = check_dataset(folder)
+                assert not found.errors or name in str(found.errors)
+        except InputError as error:
+            assert str(folder) in str(error)
+        (folder / name).write_bytes(whole[name])
+
+    for_all(st.sampled_from(names).flatmap(changed), check, count)
+
+
+# --- models ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """A copy of the model, and no way to unpickle anything."""
+
+    def refuse(*_, **__):
+        raise AssertionError("something was unpickled")
+
+    for place, name in ((pickle, "load"), (pickle, "loads"), (pickle, "Unpickler"), (torch, "load")):
+        monkeypatch.setattr(place, name, refuse)
+    return Path(shutil.copytree(MODEL, tmp_path / "model"))
+
+
+def check_model(folder, original=None):
+    try:
+        found = load_model(folder)
+    except FileFormatError as error:
+        assert str(folder) in str(error)
+    else:
+        if original is not None:
+            assert_same_corrector(found.corrector, original.corrector)
+            assert found.record == original.record
+
+
+@counts(60, 800)
+def test_damaged_models_are_refused_by_name(model, count):
+    original = load_model(model)
+    whole = {name: (model / name).read_bytes() for name in (WEIGHTS, DESCRIPTION)}
+
+    def check(one):
+        name, data = one
+        (model / name).write_bytes(data)
+        check_model(model, original)
+        (model / name).write_bytes(whole[name])
+
+    inputs = st.sampled_from(list(whole)).flatmap(
+        lambda name: st.tuples(st.just(name), damaged(whole[name], SNIPPETS))
+    )
+    for_all(inputs, check, count)
+
+
+@counts(60, 800)
+def test_models_with_altered_descriptions_are_refused_by_name(model, count):
+    tree = json.loads((model / DESCRIPTION).read_text())
+    del tree["checksum"]
+
+    def check(content):
+        try:
+            checksum = model_io._digest(content)
+        except ValueError:  # NaN and infinite numbers have none
+            checksum = ""
+        (model / DESCRIPTION).write_text(json.dumps({**content, "checksum": checksum}))
+        check_model(model)
+
+    for_all(altered(tree, value), check, count)
+
+
+@counts(60, 800)
+def test_models_with_altered_weights_are_refused_by_name(model, count):
+    """Also where the checksums are those of the damaged file."""
+    tree, whole = json.loads((model / DESCRIPTION).read_text()), (model / WEIGHTS).read_bytes()
+    del tree["checksum"]
+    end = 8 + int.from_bytes(whole[:8], "little")
+    header = json.loads(whole[8:end])
+
+    def with_header(tree):
+        text = json.dumps(tree).encode()
+        return len(text).to_bytes(8, "little") + text + whole[end:]
+
+    def check(data):
+        (model / WEIGHTS).write_bytes(data)
+        content = {**tree, "weights_sha256": hashlib.sha256(data).hexdigest()}
+        text = json.dumps({**content, "checksum": model_io._digest(content)})
+        (model / DESCRIPTION).write_text(text)
+        check_model(model)
+
+    heads = damaged(whole[:end], SNIPPETS).map(lambda head: head + whole[end:])
+    types = value | st.sampled_from(["F64", "BF16", "F8_E4M3", "I64", "BOOL", "F16", "U8"])
+    for_all(heads | damaged(whole) | altered(header, types).map(with_header), check, count)
