@@ -14,8 +14,18 @@ from hypothesis import strategies as st
 
 import pdcorrect as pc
 from conftest import beam, box_mesh
-from fuzzing import altered, counts, damaged, for_all, places, renumbered
-from pdcorrect.errors import ConvergenceError, MeshError, PdcorrectError, SceneError
+from fuzzing import (
+    altered,
+    counts,
+    damaged,
+    for_all,
+    places,
+    renumbered,
+    within_memory,
+    within_seconds,
+)
+from pdcorrect import cli
+from pdcorrect.errors import MeshError, PdcorrectError, SceneError
 from pdcorrect.fem.mesh import corner_jacobians
 from pdcorrect.fem.mesh_files import read_hex_mesh
 from test_mesh_files import ABAQUS, FORMATS
@@ -270,3 +280,49 @@ def test_paths_of_meshes_in_scenes_are_read_or_refused_by_name(tmp_path, mesh_fi
         check_scene(tmp_path / "scene.toml", as_toml(scene), found)
 
     for_all(st.tuples(names | st.text(max_size=9), number), check, count)
+
+
+# --- sizes and the command line ----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("cells", "refine", "element"),
+    [([400, 500, 500], 1, "hex8"), ([4, 1, 1], 1000, "hex8"), ([90, 90, 90], 10, "hex27")],
+)
+def test_bodies_that_no_memory_holds_are_refused_at_once(cells, refine, element):
+    scene = beam(cells, solver={"element": element})
+    with within_seconds(60), within_memory(2**30), pytest.raises(SceneError, match="memory"):
+        pc.discretise(scene, refine)
+
+
+@counts(25, 300)
+def test_damaged_scenes_leave_no_traceback_and_no_partial_output(program, tmp_path, count):
+    path, output = tmp_path / "scene.toml", tmp_path / "run.h5"
+    text, tree = SMALL.to_toml().encode(), tomllib.loads(SMALL.to_toml())
+
+    def check(content):
+        path.write_bytes(content)
+        if is_large(path):
+            return
+        status, out, err = program("simulate", path, "-o", output, "--frames", 1)
+        assert "Traceback" not in out + err
+        assert status in (0, cli.FAILED, cli.BAD_INPUT)
+        if status:
+            assert err.startswith("error: ")
+        if status == cli.BAD_INPUT:
+            assert not output.exists()
+        elif output.exists():
+            pc.load_trajectory(output)
+        assert not list(tmp_path.glob("*.part"))
+        output.unlink(missing_ok=True)
+
+    texts = damaged(text, SNIPPETS) | renumbered(text) | altered(tree, value, most=1).map(as_toml)
+    for_all(texts, check, count)
+
+
+def is_large(path):
+    """Whether a body is read that has more cells than a test has time for."""
+    try:
+        return cells(pc.Scene.load(path)) > 100
+    except PdcorrectError:
+        return False

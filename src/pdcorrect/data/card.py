@@ -12,7 +12,7 @@ from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import DatasetInfo, SplitInfo
 from pdcorrect.data.schema import CONFIG, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.errors import InputError
+from pdcorrect.errors import FileFormatError, InputError
 
 _BODIES = {
     "beam": "beams of 2 x 2 cells' section, held at x = 0",
@@ -68,7 +68,12 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
         )
     config = DatasetConfig.load(folder / CONFIG)
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        content_hash = str(content["content_hash"])
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise FileFormatError(
+            f"{folder / MANIFEST}: damaged: expected JSON with a content_hash ({error})."
+        ) from None
     except OSError:
         raise InputError(
             f"{folder}: no {MANIFEST}: expected a complete data set. Start generate again, which "
@@ -80,7 +85,7 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
         _what(config),
         "## Sizes\n\n" + _sizes(config, info),
         "## Errors of the models\n\n" + _errors(info),
-        "## Generation\n\n" + _generation(config, info, made_with, manifest["content_hash"]),
+        "## Generation\n\n" + _generation(config, info, made_with, content_hash),
         "## Evaluation\n\n" + _evaluation(config),
         "## Known limits\n\n" + _limits(config),
     ]

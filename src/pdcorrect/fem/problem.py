@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +26,9 @@ from pdcorrect.scene import Load, MeshFile, Scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+_LEAST_BYTES = 4000
+"""Of memory that a cell takes, less than half of what was measured; eight times it as "hex27"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +216,8 @@ def discretise(
             "resists the element's modes, for the volume term sees the mean deformation only. "
             "Use hex8-bubble, or an energy with a corotated part."
         )
-    coarse = _coarse_mesh(scene)
+    coarse = _coarse_mesh(scene, refine)
+    _check_size(scene, len(coarse.cells), refine)
     mesh = refine_mesh(coarse, refine)
     space = Space(mesh, scene.solver.element)
     cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
@@ -238,13 +243,14 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     )  # fmt: skip
 
 
-def _coarse_mesh(scene: Scene) -> HexMesh:
+def _coarse_mesh(scene: Scene, refine: int) -> HexMesh:
     body = scene.body
     if isinstance(body, MeshFile):
         from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
 
         return read_hex_mesh(body.path, body.scale)
     solid, origin_index = body.occupancy()
+    _check_size(scene, int(np.count_nonzero(solid)), refine)
     try:
         return voxel_mesh(solid, origin_index, body.cell_size, body.origin)
     except MeshError:  # a grid's cells can only lose their volume to rounding
@@ -253,6 +259,21 @@ def _coarse_mesh(scene: Scene) -> HexMesh:
             "have no volume in double precision: expected a size of about that of the body's "
             "coordinates, in metres."
         ) from None
+
+
+def _check_size(scene: Scene, cells: int, refine: int) -> None:
+    """Refuse meshes that cannot fit into the memory of the machine, before it is filled."""
+    try:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # not on every system
+        return
+    most = memory // (_LEAST_BYTES * (8 if scene.solver.element == "hex27" else 1))
+    if memory > 0 and cells * refine**3 > most:
+        raise SceneError(
+            f"body: {cells} cells, {cells * refine**3} with refine = {refine}: expected at most "
+            f"{most} in the {memory / 1e9:.3g} GB of this machine's memory. Use larger cells or "
+            "a smaller refine."
+        )
 
 
 def _freeze(*arrays: NDArray[np.generic]) -> None:
