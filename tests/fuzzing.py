@@ -23,7 +23,6 @@ class HangError(BaseException):
 
 def counts(fast, slow):
     """Numbers of inputs of the two modes, for a test's argument ``count``."""
-    slow = int(slow * float(__import__("os").environ.get("FZ", "1")))
     slow = pytest.param(slow, marks=pytest.mark.slow)
     return pytest.mark.parametrize("count", [fast, slow], ids=["fast", "slow"])
 
@@ -133,12 +132,12 @@ def renumbered(draw, data, numbers=ODD_NUMBERS):
 @st.composite
 def altered(draw, tree, values, most=3):
     """A tree of dicts and lists in which one to ``most`` places are changed."""
-    out = {"tree": copy.deepcopy(tree)}
+    out = copy.deepcopy(tree)
     for _ in range(draw(st.integers(1, most))):
-        found = list(places(out["tree"]))
+        found = list(places(out))
         if found:
             _alter(draw, *draw(st.sampled_from(found)), values)
-    return out["tree"]
+    return out
 
 
 def places(tree):
@@ -150,8 +149,11 @@ def places(tree):
 
 
 def _alter(draw, parent, key, values):
-    kinds = ["replace"] * 4 + ["remove", "double", "rename", "wrap"]
-    kind = draw(st.sampled_from(kinds))
+    if isinstance(parent[key], (int, float)) and draw(st.booleans()):
+        factor = draw(st.sampled_from([-1, 0, 2, 3, 1000, 1e-9, 0.1, 0.5, 1.1, 1e6, 1e20]))
+        parent[key] = type(parent[key])(parent[key] * factor)
+        return
+    kind = draw(st.sampled_from(["replace"] * 4 + ["remove", "double", "rename", "wrap"]))
     if kind == "remove":
         del parent[key]
     elif kind == "double" and isinstance(parent, list):

@@ -1,4 +1,9 @@
-"""Random scene files, mesh files and calls of the program: done, or refused by name."""
+"""Random scene files, mesh files and calls of the program: done, or refused by name.
+
+Slow tests take 8300 inputs here and 5500 in test_fuzz_learning.py (data sets, settings, models),
+together 13 800; the others take 565 and 415.  Each input has bounds of time and memory, and all
+are the same ones at every run, see `fuzzing`.
+"""
 
 import datetime
 import os
@@ -62,20 +67,23 @@ EXTREMES = (
 
 number = st.sampled_from(EXTREMES) | st.floats(-10, 10) | st.integers(-3, 30)
 
+TEXTS = (
+    "x", "z", "min", "max", "file", "weight", "hex27", "consistent", "a\0b", "\n", "/", "..",
+    "." * 999,
+)  # fmt: skip
+
+OTHERS = (
+    [], {}, [[[]]], [0, 0], [1.0, 2.0, 3.0], {"everywhere": True}, {"plane": "x", "at": "max"},
+    {"nodes": [0, 1, 2]}, 10**4000, datetime.date(1979, 5, 27), datetime.time(7, 32),
+)  # fmt: skip
+
 value = (
     number
     | st.booleans()
     | st.text(max_size=8)
-    | st.sampled_from(
-        [
-            "x", "z", "min", "max", "file", "weight", "hex27", "consistent", "a\0b", "\n", "." * 999,
-            "/", "..", [], {}, [[[]]], [1.0, 2.0, 3.0], [0, 0], {"everywhere": True},
-            {"plane": "x", "at": "max"}, {"nodes": [0, 1, 2]}, 10**4000,
-            datetime.date(1979, 5, 27), datetime.time(7, 32),
-        ]  # fmt: skip
-    )
+    | st.sampled_from(TEXTS + OTHERS)
     | st.lists(number, max_size=4)
-)  # fmt: skip
+)
 
 
 def check_scene(path, content, *others):
@@ -182,7 +190,7 @@ def check_step(path, content, method):
         assert np.isfinite(run.positions).all()
 
 
-@counts(15, 300)
+@counts(15, 200)
 def test_numbers_of_any_magnitude_end_in_a_step_or_in_a_refusal(tmp_path, count):
     for_all(extreme(), lambda one: check_step(tmp_path / "scene.toml", *one), count)
 

@@ -181,6 +181,9 @@ def test_bad_meshes_are_refused_with_the_place():
     broken[7, 1] = np.nan
     with pytest.raises(MeshError, match="node 7 "):
         HexMesh.create(broken, mesh.cells)
+    broken[7, 1] = 1e160
+    with pytest.raises(MeshError, match=r"node 7 .* at most 1e\+30 m from the origin"):
+        HexMesh.create(broken, mesh.cells)
     with pytest.raises(MeshError, match="belongs to no cell"):
         HexMesh.create(np.vstack([mesh.positions, [9.0, 9, 9]]), mesh.cells)
     with pytest.raises(MeshError, match="expected 0 to"):

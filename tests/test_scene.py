@@ -130,6 +130,14 @@ def changed(old, new):
             ["loads[0].kind = 'gravty': expected one of 'gravity',"],
         ),
         (changed('kind = "gravity"\n', ""), ["loads[0].kind: missing"]),
+        (changed("24", "9" * 5000), ["not valid TOML", "digits"]),
+        (changed("24", "0x" + "f" * 5000), ["not valid TOML", "integer of more than 1024 bits"]),
+        (changed("24", "[" * 3000), ["not valid TOML", "nested more than 100 deep"]),
+        (changed("[body]", "a." * 3000 + "a = 1\n[body]"), ["nested more than 100 deep"]),
+        (
+            changed('"beam"\ncells = [24, 2, 2]\ncell_size = 0.02', '"file"\npath = "a\\u0000b"'),
+            ["body.path", "NUL"],
+        ),
     ],
 )
 def test_wrong_scenes_are_refused_in_one_paragraph(text, words):
@@ -179,6 +187,12 @@ def test_absurd_grids_are_refused_by_name():
     for cells in ([10**20, 1, 1], [10**6, 10**6, 1]):
         with pytest.raises(SceneError, match="cells"):
             pc.discretise(beam(cells))
+
+
+@pytest.mark.parametrize("change", [{"origin": [1e20, 0.0, 0.0]}, {"cell_size": 1e-150}])
+def test_cells_that_rounding_leaves_no_volume_are_refused_by_the_keys(change):
+    with pytest.raises(SceneError, match=r"body.cell_size = .* with body.origin = .*no volume"):
+        pc.discretise(beam().with_changes(body=change))
 
 
 def test_changes_keep_the_rest():
