@@ -5,6 +5,7 @@ import copy
 import re
 import resource
 import signal
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -64,11 +65,16 @@ def within_seconds(seconds):
 
 @contextlib.contextmanager
 def within_memory(most):
-    """Make allocations fail in the body once the process has grown by ``most`` bytes."""
-    with open("/proc/self/statm") as file:
-        used = int(file.read().split()[0]) * resource.getpagesize()
+    """Make allocations fail in the body once the process has grown by ``most`` bytes (Linux)."""
+    status = Path("/proc/self/statm")
+    if not status.exists():
+        yield
+        return
+    limit = int(status.read_text().split()[0]) * resource.getpagesize() + most
     before = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (used + most, before[1]))
+    if before[1] != resource.RLIM_INFINITY:
+        limit = min(limit, before[1])
+    resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
     try:
         yield
     finally:
