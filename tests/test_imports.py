@@ -12,6 +12,7 @@ SOURCE = Path(__file__).parent.parent / "src" / "pdcorrect"
 ORDER = [
     "pdcorrect",
     "errors",
+    "toml_text",
     "home",
     "interruption",
     "replacement",
