@@ -31,6 +31,7 @@ from pathlib import Path
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
+from pdcorrect.data.workers import visible_gpus
 from pdcorrect.training.training import MODEL
 
 HERE = Path(__file__).parent
@@ -207,18 +208,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=None, help="when trainings are stopped")
     options = parser.parse_args()
     recipes = options.recipes or sorted((HERE / "recipes").glob("*/*.toml"))
-    gpus = _gpus() if options.device == "cuda" else []
+    gpus = visible_gpus() if options.device == "cuda" else []
     places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
     machine = Machine(options.work / "logs", gpus, places)
     sys.exit(0 if machine.run(plan(options.work, recipes, options)) else 1)
-
-
-def _gpus() -> list[str]:
-    import torch
-
-    numbers = [str(number) for number in range(torch.cuda.device_count())]
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return named.split(",")[: len(numbers)] if named else numbers
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ from pdcorrect.state import State, StepResult
 MOST_ITERATIONS = 300
 """Of projective dynamics in a step, without fallbacks; a load that takes more is rejected.
 
-Steps take 3 to 10, the hardest of those that end well 100; where a body folds, some hundreds of
-iterations lead to a state with inverted cells, and in a batch all others wait for them.
+In `impulse-as-published` a step takes 3 to 6 on average and 91 at most.  A body that folds takes
+far more, for which all others in its batch would wait.
 """
 
 Array = NDArray[np.float64]
@@ -83,6 +83,7 @@ class OneByOne:
     Parameters
     ----------
     solver : {"pd", "newton"}
+        "pd" without fallbacks and with at most `MOST_ITERATIONS`.
     tolerance : float
         Of the coarse cell size.
     """

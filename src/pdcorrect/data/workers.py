@@ -193,6 +193,15 @@ def _work(
     return produce(config, folder, plans, device)
 
 
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them."""
+    import torch
+
+    count = torch.cuda.device_count()
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return named.split(",")[:count] if named else [str(k) for k in range(count)]
+
+
 def _own_gpu(worker: int) -> str:
     """The device of a worker, by its number.
 
@@ -205,9 +214,7 @@ def _own_gpu(worker: int) -> str:
     if count < 2:
         return "cuda"
     if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
-        named = os.environ.get("CUDA_VISIBLE_DEVICES")
-        names = named.split(",")[:count] if named else [str(k) for k in range(count)]
-        os.environ["CUDA_VISIBLE_DEVICES"] = names[worker % count]
+        os.environ["CUDA_VISIBLE_DEVICES"] = visible_gpus()[worker % count]
         if torch.cuda.device_count() == 1:
             return "cuda"
     return f"cuda:{worker % count}"

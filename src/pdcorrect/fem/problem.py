@@ -217,7 +217,6 @@ def discretise(
             "Use hex8-bubble, or an energy with a corotated part."
         )
     coarse = _coarse_mesh(scene, refine)
-    _check_size(scene, len(coarse.cells), refine)
     mesh = refine_mesh(coarse, refine)
     space = Space(mesh, scene.solver.element)
     cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
@@ -248,7 +247,9 @@ def _coarse_mesh(scene: Scene, refine: int) -> HexMesh:
     if isinstance(body, MeshFile):
         from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
 
-        return read_hex_mesh(body.path, body.scale)
+        mesh = read_hex_mesh(body.path, body.scale)
+        _check_size(scene, len(mesh.cells), refine)
+        return mesh
     solid, origin_index = body.occupancy()
     _check_size(scene, int(np.count_nonzero(solid)), refine)
     try:
