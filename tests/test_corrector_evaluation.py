@@ -39,7 +39,7 @@ from pdcorrect.evaluation.measures import (  # noqa: E402
 from pdcorrect.evaluation.resampling import mean_interval, over_seeds, summarise  # noqa: E402
 from pdcorrect.evaluation.rollouts import roll_out, single_steps  # noqa: E402
 from pdcorrect.evaluation.speed import _loosest, measure_speed  # noqa: E402
-from pdcorrect.figures.learning import plot_omega  # noqa: E402
+from pdcorrect.figures.learning import plot_omega, plot_validations  # noqa: E402
 from pdcorrect.metrics import error_corrected, mean_squared_error  # noqa: E402
 from pdcorrect.state import State, Status  # noqa: E402
 
@@ -566,6 +566,17 @@ def test_histograms_are_drawn_and_nothing_is_refused(tmp_path):
     for values in ({}, {"a": []}):
         with pytest.raises(InputError, match="expected one model or more"):
             plot_omega(values, tmp_path / "none.png")
+
+
+def test_validations_are_drawn_over_time(tmp_path):
+    pytest.importorskip("matplotlib")
+    path = plot_validations(
+        {"a": ([1.0, 2.0], [5.0, 9.0]), "b": ([3.0], [-7.0])}, tmp_path / "v.png"
+    )
+    assert path.read_bytes().startswith(b"\x89PNG")
+    for wrong in ({}, {"a": ([], [])}, {"a": ([1.0], [1.0, 2.0])}):
+        with pytest.raises(InputError, match="each with times and values"):
+            plot_validations(wrong, tmp_path / "none.png")
 
 
 # --- rebuilt problems ------------------------------------------------------------------

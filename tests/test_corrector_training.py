@@ -89,6 +89,7 @@ pytestmark = pytest.mark.usefixtures("few_threads")
         (BASIC.replace("one-step", "unrolled") + "steps = 0\n", "stages.0.steps"),
         (BASIC.replace("one-step", "unrolled") + "[stages.noise]\ntau = 0.1\n", "noise has no"),
         (BASIC.replace("one-step", "two-step"), 'stages.0.kind = "two-step"'),
+        (BASIC + "[stages.loss]\nkind = 'absolute'\nbend = 1.0\n", "loss .*bend has no meaning"),
         ("stages = []\n", "stages"),
         ('[corrector]\npreset = "huge"\n' + BASIC, "corrector .*preset 'huge'"),
         ("[corrector]\nchanges = {widths = 3}\n" + BASIC, "corrector .*widths"),
@@ -165,6 +166,7 @@ ERRORS = torch.tensor([[0.003, 0.0, 0.004], [0.0, 0.0, 0.0], [0.0, 0.012, 0.005]
     ("loss", "expected"),
     [
         (Loss(kind="relative"), [25e-6 / (2 * 1e-5), 169e-6 / 4e-5]),
+        (Loss(kind="relative", bend=0.5), [0.5 * np.log(3.5), 0.5 * np.log(9.45)]),
         (Loss(kind="absolute", power=1), [5.0, 13.0]),
         (Loss(kind="absolute", power=2), [25.0, 169.0]),
         (Loss(kind="absolute", power=2, scale=1.0), [25e-6, 169e-6]),
@@ -571,7 +573,7 @@ def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
 
 def test_a_pool_goes_on_where_it_was(folder):
     recordings = load_recordings(folder, "training", "plain")
-    stage = samples.unrolled(start="pool", restart=0.0, steps=2)
+    stage = samples.unrolled(start="pool", restart=0.0, lost=1e9, steps=2)
     corrector = samples.fitted(folder, samples.config(stage), silent=True)
     batches = UnrolledBatches(SceneGroups(recordings, "plain"), stage)
     ages = []
@@ -588,6 +590,30 @@ def test_a_pool_goes_on_where_it_was(folder):
     for iteration in range(2):
         always.loss(corrector, iteration, 2)
         assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
+
+
+def test_rollouts_that_are_lost_go_back_to_the_reference(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(start="pool", restart=0.0, steps=2)
+    corrector = samples.fitted(folder, samples.config(stage), silent=True)
+    for lost, expected in ((1e9, [False] * 3), (1e-9, [True] * 3)):
+        chosen = stage.model_copy(update={"lost": lost})
+        batches = UnrolledBatches(SceneGroups(recordings, "plain"), chosen)
+        batches.loss(corrector, 0, 2)
+        ages = batches.state_dict()[0]["pool"]["0"]["ages"]
+        assert [age < 0 for age in ages] == expected
+
+
+def test_a_scene_is_lost_by_its_squared_distance_over_the_base_models(group):
+    frames = np.array([5, 6, 7])
+    truth = group.truth(frames)
+    rollout = torch.maximum(group.errors.rollout, group.errors.one_step)
+    away = torch.tensor([0.9, 1.1, 1.9]).double()
+    moved = truth.clone()
+    moved[..., 0] += (away * rollout).sqrt()[:, None]
+    assert group.lost(moved, frames, 1.0).tolist() == [False, True, True]
+    assert group.lost(moved, frames, 2.0).tolist() == [False, False, False]
+    assert group.lost(moved * torch.nan, frames, 2.0).all()
 
 
 def test_scenes_that_failed_count_once_after_several_processes_resume(folder):

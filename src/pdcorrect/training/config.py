@@ -57,11 +57,21 @@ class Loss(Strict):
         trajectory.  "absolute": positions in units of 1 / ``scale`` metres (thesis: 1000).
     power
         Of "absolute": 1 sums distances over nodes, 2 their squares.
+    bend
+        Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``), so that those
+        far above ``bend`` do not outweigh all others.  None: as x.
     """
 
     kind: Literal["relative", "absolute"] = "relative"
     power: Literal[1, 2] = 2
     scale: Positive = 1000.0
+    bend: Positive | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Loss:
+        if self.kind == "absolute" and self.bend is not None:
+            raise ValueError("bend has no meaning in a loss of kind 'absolute'")
+        return self
 
 
 class Noise(Strict):
@@ -125,7 +135,9 @@ class Stage(Strict):
         Of "unrolled": whether derivatives go through the coarse solver.
     start
         Of "unrolled": states of the reference, or of a pool of the model's own rollouts,
-        each of which goes back to the reference with probability ``restart`` after it was used.
+        each of which goes back to the reference with probability ``restart`` after it was used,
+        and in any case where its mean squared distance from it is more than ``lost`` times that
+        of the base model's rollout: nothing is to be learned there.
     seconds, iterations, epochs
         Exactly one; epochs only of "one-step".
     batch
@@ -146,6 +158,7 @@ class Stage(Strict):
     through_solver: bool = False
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
+    lost: Positive = 1.0
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
     epochs: PositiveCount | None = None

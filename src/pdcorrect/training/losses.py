@@ -10,7 +10,8 @@ reference is the mean over the body's nodes of the squared distance over
 The factor is how far j equal one-step errors carry: each of them is an error e of the
 positions and so e / h of the velocities, and j of them in the same direction add up to
 e (1 + 2 + ... + j) where nothing holds the body back.  The base model itself has a loss of
-about one, whether a trajectory moves by metres or trembles by micrometres.
+about one, whether a trajectory moves by metres or trembles by micrometres.  With a bend b
+a loss x counts as b log(1 + x / b).
 
 The "absolute" loss (thesis, eq. 5-3) sums over a body's nodes distances, or their squares,
 of positions in units of 1 / 1000 m.
@@ -69,7 +70,8 @@ def body_losses(
         d(j), m2.
     """
     if loss.kind == "relative":
-        return total(errors.square().sum(dim=-1)) / (counts * scale)
+        ratios = total(errors.square().sum(dim=-1)) / (counts * scale)
+        return ratios if loss.bend is None else loss.bend * torch.log1p(ratios / loss.bend)
     errors = loss.scale * errors
     if loss.power == 1:
         return total(torch.linalg.vector_norm(errors, dim=-1))

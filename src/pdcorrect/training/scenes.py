@@ -20,8 +20,6 @@ from pdcorrect.training.recordings import Base, Recording, base_errors, make_pro
 
 Frames = NDArray[np.int64]
 
-_LOST = 100.0
-"""Squared distance from the reference over that of the base model's rollout."""
 _LEAST_FREE = 0.2
 """Of a GPU's memory, when a group is set up."""
 
@@ -117,10 +115,10 @@ class SceneGroup:
         """Sums (B,) over the nodes of each scene of values (B, N)."""
         return torch.where(self.mask, values, 0.0).sum(dim=1)
 
-    def lost(self, positions: Tensor, frames: Frames) -> NDArray[np.bool_]:
-        """Which scenes are so far from the reference that nothing is to be learned there, (B,)."""
+    def lost(self, positions: Tensor, frames: Frames, most: float) -> NDArray[np.bool_]:
+        """Which scenes are off by more than ``most`` times the base model's D, squared, (B,)."""
         squares = self.sums((positions - self.truth(frames)).square().sum(dim=2)) / self.counts
-        far = ~(squares <= _LOST * torch.maximum(self.errors.rollout, self.errors.one_step))
+        far = ~(squares <= most * torch.maximum(self.errors.rollout, self.errors.one_step))
         found: NDArray[np.bool_] = far.cpu().numpy()
         return found
 

@@ -111,7 +111,8 @@ class UnrolledBatches:
         found = unroll(group, corrector, start, steps, self._stage, self._velocity)
         self.failed += int((~found.alive).sum())
         if self._stage.start == "pool":
-            found.end.ages[~found.alive | group.lost(found.end.positions, found.end.frames)] = -1
+            lost = group.lost(found.end.positions, found.end.frames, self._stage.lost)
+            found.end.ages[~found.alive | lost] = -1
             self._pool[number] = found.end
         return mean_of(found.losses, group.on_device(found.alive))
 
