@@ -77,6 +77,10 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 # --- configuration -----------------------------------------------------------------------
 
 
+UNROLLED = BASIC.replace("one-step", "unrolled")
+FORCED = '[corrector]\nchanges = {placement = "force"}\n'
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -90,6 +94,9 @@ pytestmark = pytest.mark.usefixtures("few_threads")
         (BASIC.replace("one-step", "unrolled") + "[stages.noise]\ntau = 0.1\n", "noise has no"),
         (BASIC.replace("one-step", "two-step"), 'stages.0.kind = "two-step"'),
         (BASIC + "[stages.loss]\nkind = 'absolute'\nbend = 1.0\n", "loss .*bend has no meaning"),
+        (BASIC + "teacher = 'tiny'\n", "stages.0 .*teacher has no meaning"),
+        (UNROLLED + "teacher = 'tiny'\nthrough_solver = true\n", "teacher: .*step by step"),
+        (FORCED + UNROLLED + "teacher = 'tiny'\n", "stages.0: a teacher teaches"),
         ("stages = []\n", "stages"),
         ('[corrector]\npreset = "huge"\n' + BASIC, "corrector .*preset 'huge'"),
         ("[corrector]\nchanges = {widths = 3}\n" + BASIC, "corrector .*widths"),
@@ -614,6 +621,57 @@ def test_a_scene_is_lost_by_its_squared_distance_over_the_base_models(group):
     assert group.lost(moved, frames, 1.0).tolist() == [False, True, True]
     assert group.lost(moved, frames, 2.0).tolist() == [False, False, False]
     assert group.lost(moved * torch.nan, frames, 2.0).all()
+
+
+def test_a_teacher_is_asked_about_the_states_that_the_learner_meets(group, folder):
+    settings = samples.config(samples.unrolled(batch=3))
+    learner, teacher = (samples.fitted(folder, settings) for _ in range(2))
+    with torch.no_grad():
+        for weight in teacher.network.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+    stage, frames = settings.stages[0], np.array([5, 6, 7])
+    same = unroll(group, learner, started(group, frames), 2, stage, teacher=learner)
+    assert same.losses.tolist() == [0.0, 0.0, 0.0]
+    found = unroll(group, learner, started(group, frames), 1, stage, teacher=teacher)
+    layer = group.layer(learner, False, "recomputed")
+    before = started(group, frames)
+    _, _, own = layer(before.positions, before.velocities, group.times(frames), before.correction)
+    apart = layer.padded(own - teacher.of_view(layer.seen)).square().sum(dim=2)
+    expected = group.sums(apart) / (group.counts * group.errors.one_step)
+    torch.testing.assert_close(found.losses, expected)
+    assert (found.losses > 0).all()
+
+
+def test_what_a_teacher_knows_is_learned(folder, tmp_path):
+    settings = samples.config(samples.one_step(iterations=40, rate=Rate(peak=3e-3)))
+    Training(settings, folder, tmp_path / "teacher").run()
+    stage = samples.unrolled(
+        iterations=30, start="pool", teacher=str(tmp_path / "teacher" / "model"),
+        rate=Rate(peak=3e-3),
+    )  # fmt: skip
+    told = []
+    training = Training(
+        samples.config(stage, report_every=10, seed=1), folder, tmp_path / "learner",
+        on_report=lambda _, row: told.append(row),
+    )  # fmt: skip
+    training.run()
+    losses = [row["loss"] for row in told if "loss" in row]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_a_teacher_of_another_kind_is_refused(folder, tmp_path):
+    samples_of = samples.config(samples.one_step(iterations=1), base="best")
+    Training(samples_of, folder, tmp_path / "best").run()
+    teacher = str(tmp_path / "best" / "model")
+    stage = samples.unrolled(teacher=teacher)
+    with pytest.raises(InputError, match="its base is 'best': expected 'plain'"):
+        Training(samples.config(stage), folder, tmp_path / "out")
+    with pytest.raises(InputError, match="velocity is 'recomputed': expected 'kept'"):
+        Training(samples.config(stage, base="best", velocity="kept"), folder, tmp_path / "out")
+    missing = samples.unrolled(teacher=str(tmp_path / "nowhere"))
+    with pytest.raises(InputError, match="nowhere"):
+        Training(samples.config(missing), folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_scenes_that_failed_count_once_after_several_processes_resume(folder):

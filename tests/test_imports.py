@@ -198,6 +198,7 @@ ORDER = [
     "training.unrolled",
     "training.world",
     "training.sources",
+    "training.teachers",
     "training.optimisation",
     "training.validation",
     "training.history",

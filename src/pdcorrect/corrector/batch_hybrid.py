@@ -20,6 +20,7 @@ from pdcorrect.batch.threads import one_thread
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts, WithNodes
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.decision import corrected_step
+from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.torch_layer import OnFailure, PDLayer
@@ -138,6 +139,8 @@ class HybridLayer(WithNodes, nn.Module):
     ----------
     steps : PDLayer
         The coarse step; its ``statuses`` are those of the last call.
+    seen : View
+        What the network was shown in the last call; scenes that failed as at rest.
 
     Raises
     ------
@@ -153,6 +156,8 @@ class HybridLayer(WithNodes, nn.Module):
     correction does.  Derivatives by forces of the same step, for placement "force", go through
     the solver in any case.
     """
+
+    seen: View
 
     def __init__(
         self,
@@ -216,8 +221,8 @@ class HybridLayer(WithNodes, nn.Module):
         seen, known = self._at_rest_unless(ok, before, previous)
         guess, ok = hybrid.placement == "guess", by_scene(ok)
         proposed = None if guess else torch.where(ok, after.positions, seen.positions)
-        correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
-        correction = torch.where(at_nodes, correction, 0.0)
+        self.seen = hybrid.view(seen, proposed, known)
+        correction = torch.where(at_nodes, self.corrector.of_view(self.seen), 0.0)
         if guess:
             return after, correction
         moved = hybrid.moved(before, after, correction)
@@ -238,11 +243,13 @@ class HybridLayer(WithNodes, nn.Module):
         known = known if previous is None else [*known, previous]
         sound = self.bodies.sound(torch.cat(known, dim=1))
         seen, given = self._at_rest_unless(sound, before, previous)
-        correction = self.corrector.of_view(hybrid.view(seen, None, given))
+        self.seen = hybrid.view(seen, None, given)
+        correction = self.corrector.of_view(self.seen)
         answered = sound & self.bodies.sound(correction)
         if not torch.equal(answered, sound):
             seen, given = self._at_rest_unless(answered, before, previous)
-            correction = self.corrector.of_view(hybrid.view(seen, None, given))
+            self.seen = hybrid.view(seen, None, given)
+            correction = self.corrector.of_view(self.seen)
         at_nodes = self.bodies.by_node(answered)[:, None]
         after = self._step(before, nodes.forces(torch.where(at_nodes, correction, torch.nan)))
         ok = self._converged()

@@ -138,6 +138,10 @@ class Stage(Strict):
         each of which goes back to the reference with probability ``restart`` after it was used,
         and in any case where its mean squared distance from it is more than ``lost`` times that
         of the base model's rollout: nothing is to be learned there.
+    teacher
+        Of "unrolled", without derivatives through the solver: a model, by folder or name
+        (`pdcorrect.load_model`), whose corrections of the states that this one meets are to be
+        learned; the reference then only says which rollouts are lost.
     seconds, iterations, epochs
         Exactly one; epochs only of "one-step".
     batch
@@ -159,6 +163,7 @@ class Stage(Strict):
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
     lost: Positive = 1.0
+    teacher: Annotated[str, Field(min_length=1)] | None = None
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
     epochs: PositiveCount | None = None
@@ -177,13 +182,20 @@ class Stage(Strict):
         if sum(b is not None for b in budgets) != 1:
             raise ValueError("expected exactly one of seconds, iterations, epochs")
         if self.kind == "one-step":
-            told = {"steps": self.steps != (1,), "through_solver": self.through_solver,
-                    "start": self.start != "reference"}  # fmt: skip
+            told = {
+                "steps": self.steps != (1,), "through_solver": self.through_solver,
+                "start": self.start != "reference", "teacher": self.teacher is not None,
+            }  # fmt: skip
         else:
             told = {"epochs": self.epochs is not None, "noise": self.noise.tau > 0.0}
         for name, given in told.items():
             if given:
                 raise ValueError(f"{name} has no meaning in a stage of kind {self.kind!r}")
+        if self.teacher is not None and (self.through_solver or self.loss.kind != "relative"):
+            raise ValueError(
+                "teacher: its corrections are learned step by step, over the base model's error: "
+                "expected through_solver = false and a loss of kind 'relative'"
+            )
         return self
 
     def horizon(self, progress: float) -> int:
@@ -233,6 +245,8 @@ class TrainingConfig(TomlConfig):
     def _placed(self) -> TrainingConfig:
         placement = self.corrector.config().placement
         for k, stage in enumerate(self.stages):
+            if placement != "state" and stage.teacher is not None:
+                raise ValueError(f"stages.{k}: a teacher teaches corrections of states only")
             if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
                 raise ValueError(
                     f"stages.{k}: a correction of forces is only learned through the solver: "

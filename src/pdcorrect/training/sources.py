@@ -95,12 +95,13 @@ def make_source(
     windows: StepWindows,
     groups: SceneGroups,
     world: World,
+    teacher: Corrector | None = None,
 ) -> Source:
     """The source of stage ``number`` of a training."""
     seed = _seed(config.seed, number)
     if stage.kind == "one-step":
         return OneStepBatches(windows, stage, seed, world)
-    return UnrolledBatches(groups, stage, velocity=config.velocity, seed=seed)
+    return UnrolledBatches(groups, stage, velocity=config.velocity, seed=seed, teacher=teacher)
 
 
 def share_done(stage: Stage, epoch: int, iteration: int, seconds: float) -> float:

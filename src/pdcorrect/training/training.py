@@ -30,6 +30,7 @@ from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recordings import data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
+from pdcorrect.training.teachers import load_teachers
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 from pdcorrect.training.world import World
@@ -91,6 +92,7 @@ class Training:
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
         )
+        self._teachers = load_teachers(config, self.device)
         found = self._checkpoint(resume)
         self._recordings = load_recordings(data, TRAINING, config.base)
         self._windows = StepWindows(
@@ -143,7 +145,10 @@ class Training:
     def _run_stage(self, stage: Stage) -> bool:
         """One stage, or what is left of it; whether it came to its end."""
         at = self.progress
-        source = make_source(stage, at.stage, self.config, self._windows, self._groups, self.world)
+        source = make_source(
+            stage, at.stage, self.config, self._windows, self._groups, self.world,
+            self._teachers.get(stage.teacher or ""),
+        )  # fmt: skip
         optimiser = self._optimiser(stage, source)
         shown = self.corrector if stage.ema is None else self._averaged
         while (share := share_done(stage, len(source), at.iteration, at.stage_seconds)) < 1.0:

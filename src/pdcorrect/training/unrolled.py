@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.states import in_one
+from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.training.config import Stage
@@ -71,6 +72,8 @@ class UnrolledBatches:
     stage : Stage
     velocity : {"recomputed", "kept"}
     seed : int
+    teacher : Corrector, optional
+        Whose corrections of the same states are to be learned.
 
     Attributes
     ----------
@@ -90,7 +93,9 @@ class UnrolledBatches:
         *,
         velocity: Velocity = "recomputed",
         seed: int = 0,
+        teacher: Corrector | None = None,
     ) -> None:
+        self._teacher = teacher
         self._groups = groups
         self._chosen = groups.of(stage.batch, max(stage.steps))
         self._stage, self._velocity = stage, velocity
@@ -108,7 +113,7 @@ class UnrolledBatches:
         number = self._turn(iteration)
         group = self._groups(self._chosen[number])
         start = self._start(number, group, steps, rng)
-        found = unroll(group, corrector, start, steps, self._stage, self._velocity)
+        found = unroll(group, corrector, start, steps, self._stage, self._velocity, self._teacher)
         self.failed += int((~found.alive).sum())
         if self._stage.start == "pool":
             lost = group.lost(found.end.positions, found.end.frames, self._stage.lost)
@@ -169,8 +174,12 @@ def unroll(
     steps: int,
     stage: Stage,
     velocity: Velocity = "recomputed",
+    teacher: Corrector | None = None,
 ) -> Unrolled:
-    """Step a group and compare each frame with the reference."""
+    """Step a group and compare each frame with the reference.
+
+    With a teacher its correction of each step is compared with that of the teacher, over d(1).
+    """
     layer = group.layer(corrector, stage.through_solver, velocity)
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
@@ -188,10 +197,21 @@ def unroll(
         # Not a number times zero is not zero: it must not reach what all scenes share.
         positions = torch.where(at, positions, truth)
         velocities = torch.where(at, velocities, 0.0)
-        scale = group.errors.after(group.on_device(ages))
-        total = total + body_losses(stage.loss, positions - truth, group.sums, group.counts, scale)
+        if teacher is None:
+            errors, scale = positions - truth, group.errors.after(group.on_device(ages))
+        else:
+            errors = torch.where(at, layer.padded(correction - _taught(teacher, layer, stage)), 0.0)
+            scale = group.errors.after(1)
+        total = total + body_losses(stage.loss, errors, group.sums, group.counts, scale)
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
+
+
+@torch.no_grad()
+def _taught(teacher: Corrector, layer: HybridLayer, stage: Stage) -> Tensor:
+    """The teacher's corrections (n, 3) of the layer's last step, m."""
+    with network_precision(teacher, stage.amp):
+        return teacher.of_view(layer.seen)
 
 
 def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:
