@@ -121,8 +121,13 @@ def test_a_configuration_comes_back_from_its_toml():
     assert again.stages[0].clip == 1.0
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples" / "training").glob("*.toml")), ids=str)
-def test_the_examples_can_be_read(path):
+TRAININGS = [*(ROOT / "examples" / "training").glob("*.toml"), *(ROOT / "models").rglob("*/*.toml")]
+
+
+@pytest.mark.parametrize(
+    "path", sorted(TRAININGS), ids=lambda path: f"{path.parent.name}-{path.stem}"
+)
+def test_the_examples_and_recipes_can_be_read(path):
     TrainingConfig.load(path)
 
 
