@@ -129,7 +129,7 @@ def test_ones_own_body_is_recorded_learned_judged_and_drawn(own, monkeypatch, tm
     table = Path("judged/table.md").read_text()
     assert all(name in table for name in ("torsion-exact", "| model", "best"))
     own("show").main(Path("hook_evaluation.toml"), Path("hook_model/model"), Path(), frames=2)
-    assert {path.name for path in Path("hook_vtu").iterdir()} >= {"hook.pvd"}
+    assert {path.name for path in Path("hook_vtu").iterdir()} >= {"run.pvd"}
     assert Path("hook.png").stat().st_size > 10_000
 
 

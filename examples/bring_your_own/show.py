@@ -34,7 +34,8 @@ def main(
         print(f"{name}: RMS {error:.2f} mm from the fine run")
     print(f"{refused} of {len(runs['hybrid'])} corrections refused")
     labels = [f"{name}, RMS {error:.1f} mm" for name, error in errors.items()]
-    pc.render([*runs.values(), fine], folder / "hook.png", labels=[*labels, "fine"])
+    picture = folder / "hook.png"
+    pc.render([*runs.values()], picture, labels=labels, colour="error", reference=truth)
     pc.save_trajectory(folder / "hook_hybrid.h5", runs["hybrid"], overwrite=True)
     pc.write_vtu_series(runs["hybrid"], folder / "hook_vtu")
     return errors
