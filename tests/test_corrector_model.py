@@ -404,6 +404,14 @@ def test_presets_of_the_thesis_survive_with_all_their_settings(tmp_path):
     assert_same_corrector(load_model(tmp_path / "model").corrector, original)
 
 
+def test_a_network_that_the_configuration_does_not_describe_is_not_saved(tmp_path):
+    corrector = made()
+    corrector.network.decoder = torch.nn.Sequential(torch.nn.Linear(8, 3))
+    with pytest.raises(InputError, match="MeshGraphNetwork with other weights"):
+        save_model(corrector, tmp_path / "model", record=RECORD)
+    assert not (tmp_path / "model").exists()
+
+
 def sample():
     bodies = samples.body()
     return bodies, samples.moving(bodies)

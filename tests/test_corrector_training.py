@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 import time
@@ -19,7 +20,8 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
-from pdcorrect.corrector.model_io import load_model  # noqa: E402
+from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
+from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
     ConvergenceError,
@@ -103,6 +105,8 @@ FORCED = '[corrector]\nchanges = {placement = "force"}\n'
         ('[corrector]\nchanges = {placement = "force"}\n' + BASIC, "through the solver"),
         ("[validate_every]\nseconds = 1.0\niterations = 2\n" + BASIC, "validate_every"),
         ("base = 'plain", "not valid TOML"),
+        ("start_from = 3\n" + BASIC, "start_from = 3: expected a string"),
+        ("start_from = ''\n" + BASIC, "start_from"),
     ],
 )
 def test_a_wrong_configuration_is_refused_by_its_key(text, told):
@@ -1056,3 +1060,82 @@ def test_a_batch_without_a_scene_that_stepped_has_no_loss():
     assert torch.isnan(mean_of(values, none))
     values = torch.tensor([1.0, torch.nan])
     assert mean_of(values, ~torch.isnan(values)) == 1.0
+
+
+# --- starting from a model ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def earlier(short, tmp_path_factory):
+    """A model that was trained for a moment."""
+    output = tmp_path_factory.mktemp("earlier")
+    trained(samples.config(samples.one_step()), short, output)
+    return output / "model"
+
+
+def test_a_training_starts_from_a_models_weights_and_normalisation(earlier, tmp_path):
+    data = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
+    settings = samples.config(samples.one_step(), start_from=str(earlier))
+    before = load_model(earlier).corrector
+    training = Training(settings, data, tmp_path / "out")
+    assert torch.equal(weights(training.corrector), weights(before))
+    mine, theirs = training.corrector.normaliser, before.normaliser
+    assert mine.output_scale == theirs.output_scale
+    for name, known in theirs.named_buffers():
+        found = mine.get_buffer(name)
+        if name.endswith("__low"):
+            assert (found <= known).all()
+        elif name.endswith("__high"):
+            assert (found >= known).all()
+        else:
+            assert torch.equal(found, known), name
+    training.run()
+    assert not torch.equal(weights(training.corrector), weights(before))
+    found = load_model(tmp_path / "out" / "model").record
+    assert found.training["config"]["start_from"] == str(earlier)
+
+
+def test_the_ranges_of_a_start_grow_by_the_new_data(short, earlier, tmp_path):
+    settings = samples.config(samples.one_step(), start_from=str(earlier))
+    training = Training(settings, short, tmp_path / "same")
+    known = training.corrector.normaliser
+    fitted = known.get_buffer("deformation__high").clone()
+    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
+    further = {name: Moments() for name in known.names}
+    for name, moments in further.items():
+        width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
+        moments.add(torch.full((1, width), 1e3))
+    known.widen(further)
+    assert known.get_buffer("deformation__high") == 1e3
+    assert known.get_buffer("deformation__low") < fitted
+
+
+def test_a_start_that_training_only_worsens_is_what_is_kept(short, earlier, tmp_path):
+    ruin = samples.one_step(iterations=3, rate={"peak": 1.0, "last": 1.0, "warmup": 0.0})
+    settings = samples.config(ruin, start_from=str(earlier))
+    trained(settings, short, tmp_path / "out")
+    kept = load_model(tmp_path / "out" / "model").corrector
+    assert torch.equal(weights(kept), weights(load_model(earlier).corrector))
+
+
+def test_a_start_of_another_architecture_is_refused_with_the_difference(short, earlier, tmp_path):
+    other = {"preset": "compact", "changes": {"layers": 2, "width": 8}}
+    settings = samples.config(samples.one_step(), start_from=str(earlier), corrector=other)
+    with pytest.raises(InputError, match=r"that model has layers = 1, unlike corrector"):
+        Training(settings, short, tmp_path / "out")
+    settings = samples.config(samples.one_step(), start_from=str(tmp_path / "nothing"))
+    with pytest.raises(InputError, match="expected a folder with a model"):
+        Training(settings, short, tmp_path / "out")
+
+
+def test_a_training_does_not_go_on_from_another_start(short, earlier, tmp_path):
+    start = tmp_path / "start"
+    shutil.copytree(earlier, start)
+    settings = samples.config(samples.one_step(), start_from=str(start))
+    trained(settings, short, tmp_path / "out")
+    assert Training(settings, short, tmp_path / "out", resume=True).progress.stage == 1
+    altered = load_model(start).corrector
+    altered.network.decoder[0].bias.data += 1.0
+    save_model(altered, start, record=load_model(earlier).record)
+    with pytest.raises(InputError, match="was begun with start = "):
+        Training(settings, short, tmp_path / "out", resume=True)

@@ -763,6 +763,53 @@ def test_the_coarse_runs_scene_is_the_coarse_models(runs):
     assert np.abs(expected - coarse.positions[1]).max() > 1e-6
 
 
+def test_the_best_coarse_models_run_is_computed_if_wanted(runs):
+    fine, coarse = runs
+    shard = shard_from_trajectories(fine, coarse, best=True)
+    (found,) = shard.simulations
+    scene = pc.best_coarse(pc.Scene.from_toml(coarse.scene_toml))
+    stepper = pc.ProjectiveDynamics(pc.discretise(scene))
+    run = found.runs["best"]
+    np.testing.assert_allclose(run.positions, pc.rollout(stepper).positions, atol=1e-12)
+    np.testing.assert_allclose(run.predictions[0], run.positions[1], atol=1e-7)
+    assert np.abs(run.positions - found.runs["plain"].positions).max() > 1e-6
+    better = rerun(coarse, solver={"element": "hex8-bubble", "mass": "averaged"})
+    with pytest.raises(InputError, match="the best coarse model's element 'hex8-bubble' already"):
+        shard_from_trajectories(fine, better, best=True)
+    with pytest.raises(InputError, match="without a scene"):
+        shard_from_arrays(**arguments(), best=True)
+
+
+def test_models_of_the_best_coarse_model_are_trained_and_judged_on_an_import(runs, tmp_path):
+    pytest.importorskip("torch")
+    from pdcorrect.evaluation.evaluation import evaluate
+    from pdcorrect.training.recordings import load_recordings, make_problems
+
+    path = tmp_path / "evaluation" / "mesh-0000.h5"
+    write_shard(path, shard_from_trajectories(*runs, split="evaluation", best=True))
+    (recording,) = load_recordings(tmp_path, "evaluation", "best")
+    (problem,) = make_problems([recording], "best")
+    assert problem.element == "hex8-bubble"
+    values, _ = evaluate([], tmp_path).runs["best"].values("omega")
+    assert np.isfinite(values).all()
+
+
+def test_an_imported_mesh_in_two_splits_is_a_warning(runs, tmp_path):
+    fine, coarse = runs
+    write_shard(tmp_path / "training" / "mesh-0000.h5", shard_from_trajectories(fine, coarse))
+    stronger = [
+        rerun(run, loads=[{"kind": "gravity", "acceleration": [0.0, 0.0, -4.0]}]) for run in runs
+    ]
+    path = tmp_path / "evaluation" / "mesh-0000.h5"
+    write_shard(path, shard_from_trajectories(*stronger, split="evaluation"))
+    (found,) = check_dataset(tmp_path)
+    assert found.severity == "warning"
+    assert "of one body under other loads, not of unseen bodies" in found.message
+    path.unlink()
+    write_shard(path, shard_from_trajectories(fine, coarse, split="evaluation"))
+    assert "error" in {finding.severity for finding in check_dataset(tmp_path)}
+
+
 def test_a_moving_clamp_is_refused():
     motion = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]}
     clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": motion}]
@@ -780,8 +827,9 @@ def test_the_program_imports_and_exports(program, runs, tmp_path):
         pc.save_trajectory(tmp_path / f"{name}.h5", run)
     root = tmp_path / "set"
     status, out, err = program(
-        "dataset", "import", tmp_path / "fine.h5", "--coarse", tmp_path / "coarse.h5", "-o", root
-    )
+        "dataset", "import", tmp_path / "fine.h5", "--coarse", tmp_path / "coarse.h5", "-o", root,
+        "--best",
+    )  # fmt: skip
     assert (status, err) == (0, "")
     assert "mesh-0000.h5" in out.replace("\n", "")
     status, out, _ = program("dataset", "export", root, tmp_path / "mgn")

@@ -1,5 +1,6 @@
 """Every scene and script in examples/ and every command and snippet of the documentation runs."""
 
+import importlib
 import importlib.util
 import re
 import shlex
@@ -12,6 +13,7 @@ import pytest
 
 import pdcorrect as pc
 from pdcorrect import scene as scene_module
+from pdcorrect.fem.mesh_files import read_hex_mesh
 
 ROOT = Path(__file__).parent.parent
 SCENES = sorted((ROOT / "examples").glob("*.toml"))
@@ -60,6 +62,75 @@ def test_the_network_learns_to_reach_targets(tmp_path):
     pytest.importorskip("torch")
     summary = run_script("train_with_layer", tmp_path)
     assert summary["factor"] > 20.0
+
+
+OWN = ROOT / "examples" / "bring_your_own"
+
+
+@pytest.fixture
+def own(monkeypatch):
+    """The scripts of examples/bring_your_own by name."""
+    monkeypatch.syspath_prepend(str(OWN))
+
+    def load(name):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+        return importlib.import_module(name)
+
+    return load
+
+
+def test_the_mesh_of_ones_own_body_is_what_its_script_makes(own, tmp_path):
+    pytest.importorskip("gmsh")
+    own("make_mesh").main(tmp_path / "hook.msh")
+    found, kept = (read_hex_mesh(folder / "hook.msh", 1e-3) for folder in (tmp_path, OWN))
+    np.testing.assert_allclose(found.positions, kept.positions, atol=1e-9)
+    np.testing.assert_array_equal(found.cells, kept.cells)
+
+
+def test_the_cells_of_ones_own_body_number_their_corners_alike():
+    """As node frames at rest suppose: neighbours' axes are at most a bend apart."""
+    mesh = read_hex_mesh(OWN / "hook.msh", 1e-3)
+    corners = mesh.positions[mesh.cells]
+    axes = np.stack([corners[:, k] - corners[:, 0] for k in (1, 3, 4)], axis=1)
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    for node in range(len(mesh.positions)):
+        own = axes[(mesh.cells == node).any(axis=1)]
+        assert (np.einsum("nai,ai->na", own, own[0]) > 0.8).all()
+
+
+def test_the_material_of_ones_own_body_is_that_of_its_test(own):
+    young, poisson = own("material").fit(OWN / "tensile_test.csv")
+    scene = pc.Scene.load(OWN / "hook.toml")
+    assert scene.material.young == pytest.approx(young, rel=0.005)
+    assert scene.material.poisson == pytest.approx(poisson, abs=0.005)
+
+
+def test_ones_own_body_is_recorded_learned_judged_and_drawn(own, monkeypatch, tmp_path, capsys):
+    """The walk-through of docs/bring_your_own.md with fewer and shorter simulations."""
+    pytest.importorskip("torch")
+    from pdcorrect import cli
+
+    monkeypatch.chdir(tmp_path)
+    splits = dict.fromkeys(("training", "validation", "evaluation"), 1)
+    own("record").main(Path("hook"), splits, frames=3, refine=2)
+    text = (OWN / "finetune.toml").read_text()
+    text, count = re.subn(r"^iterations = \d+$", "iterations = 2", text, flags=re.M)
+    assert count == 2
+    Path("finetune.toml").write_text(text.replace("batch = 8", "batch = 1"))
+    for line in (
+        "train finetune.toml --data hook -o hook_model",
+        "evaluate torsion-exact hook_model/model hook -o judged",
+    ):
+        monkeypatch.setattr(sys, "argv", ["pdcorrect", *line.split()])
+        try:
+            cli.main()
+        except SystemExit as end:
+            assert not end.code, (line, capsys.readouterr().err)
+    table = Path("judged/table.md").read_text()
+    assert all(name in table for name in ("torsion-exact", "| model", "best"))
+    own("show").main(Path("hook_evaluation.toml"), Path("hook_model/model"), Path(), frames=2)
+    assert {path.name for path in Path("hook_vtu").iterdir()} >= {"run.pvd"}
+    assert Path("hook.png").stat().st_size > 10_000
 
 
 def blocks(language):

@@ -205,13 +205,18 @@ def import_(
     ] = None,
     split: Annotated[str, typer.Option(help="Split.")] = "training",
     number: Annotated[int, typer.Option(help="Number of the mesh in the split.", min=0)] = 0,
+    best: Annotated[
+        bool, typer.Option("--best", help="Also compute the best coarse model's run.")
+    ] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
     from pdcorrect.data.import_files import import_trajectories
 
     if "/" in split or split in ("", ".", ".."):
         raise InputError(f"--split {split!r}: expected a name.")
-    path = import_trajectories(sources, output, coarse=coarse or (), split=split, number=number)
+    path = import_trajectories(
+        sources, output, coarse=coarse or (), split=split, number=number, best=best
+    )
     typer.echo(f"wrote {path}")
 
 

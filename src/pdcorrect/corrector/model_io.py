@@ -105,13 +105,15 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
     Raises
     ------
     InputError
-        If the normaliser is not fitted, weights are not float32 or not finite, or the record
-        has numbers that are not finite.
+        If the normaliser is not fitted, weights are not float32 or not finite, the network is
+        another one than the corrector's configuration describes, or the record has numbers
+        that are not finite.
     OutputError
         If it cannot be written.
     """
     folder = Path(folder)
     state = {name: t.detach().to("cpu").contiguous() for name, t in corrector.state_dict().items()}
+    _check_layout(f"model for {folder}", corrector, state)
     _check_values(f"model for {folder}", state, InputError)
     weights = safetensors.save(state)
     description = _Description(
@@ -136,6 +138,18 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
     return folder
+
+
+def _check_layout(where: str, corrector: Corrector, state: dict[str, Tensor]) -> None:
+    """Refuse a network that could not be loaded again, for the configuration tells of another."""
+    with torch.device("meta"):
+        wanted = Corrector(corrector.config).state_dict()
+    if {n: x.shape for n, x in state.items()} != {n: x.shape for n, x in wanted.items()}:
+        raise InputError(
+            f"{where}: its network is a {type(corrector.network).__name__} with other weights than "
+            "its configuration describes, and could not be loaded: expected the configuration's "
+            "own; keep state_dict() of others."
+        )
 
 
 def _normalisation(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -216,6 +230,11 @@ def model_folder(path_or_name: str | Path) -> Path:
         f"model {path_or_name!r}: not in {models_folder()}: expected one of "
         f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}."
     )
+
+
+def weights_digest(path_or_name: str | Path) -> str:
+    """SHA-256 of a model's file of weights."""
+    return hashlib.sha256(_read(model_folder(path_or_name) / WEIGHTS)).hexdigest()
 
 
 def models_folder() -> Path:

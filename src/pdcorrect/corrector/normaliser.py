@@ -125,6 +125,14 @@ class Normaliser(nn.Module):
             self._part(name, "high").copy_(moments.high)
         self.output_scale.copy_(target.square.mean().sqrt())
 
+    def widen(self, features: Mapping[str, Moments]) -> None:
+        """Widen the ranges by those of further values; nothing else changes."""
+        for name in self.names:
+            moments = features[name]
+            for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
+                own = self._part(name, part)
+                own.copy_(of_both(own.cpu(), getattr(moments, part)))
+
     def joined(self, values: Mapping[str, Tensor], clip: float | None) -> Tensor:
         """Normalised features (m, k1 + k2 + ...), bent towards -clip and clip."""
         x = torch.cat(list(values.values()), dim=1)

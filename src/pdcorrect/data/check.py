@@ -257,7 +257,13 @@ class _Check:
         """Meshes, materials and loads that came before."""
         shape, body = _digests(shard)
         first, twin = self.meshes.setdefault(shape, path), self.bodies.setdefault(body, path)
-        if first.parent != path.parent:
+        if first.parent != path.parent and self.plans is None:
+            self.warn(
+                path,
+                f"its mesh is that of {self._short(first)}: figures of this split are of one body "
+                "under other loads, not of unseen bodies",
+            )
+        elif first.parent != path.parent:
             self.error(path, f"leakage: its mesh is that of {self._short(first)}, in another split")
         elif twin != path:
             self.error(path, f"its mesh and material are those of {self._short(twin)}")

@@ -32,6 +32,7 @@ def shard_from_trajectories(
     dataset: str = "imported",
     split: str = "training",
     number: int = 0,
+    best: bool = False,
 ) -> Shard:
     """A file of a data set from runs of ``pdcorrect simulate`` on one mesh, checked.
 
@@ -46,7 +47,7 @@ def shard_from_trajectories(
         Of refined meshes, with their scenes.
     coarse : Trajectory or sequence of Trajectory, optional
         Rollouts of the coarse model, as many.
-    dataset, split, number
+    dataset, split, number, best
         See `shard_from_arrays`.
 
     Raises
@@ -65,7 +66,7 @@ def shard_from_trajectories(
             f"{len(references)} references and {len(rollouts)} coarse runs: expected as many."
         )
     shards = [
-        _shard_of_run(run, rollouts[k] if rollouts else None, dataset, split, number)
+        _shard_of_run(run, rollouts[k] if rollouts else None, dataset, split, number, best)
         for k, run in enumerate(references)
     ]
     for k, shard in enumerate(shards[1:], start=1):
@@ -81,6 +82,7 @@ def import_trajectories(
     dataset: str | None = None,
     split: str = "training",
     number: int = 0,
+    best: bool = False,
 ) -> Path:
     """Write a file of a data set from trajectory files or from an ``.npz`` file.
 
@@ -96,8 +98,8 @@ def import_trajectories(
         Trajectories of the coarse model, as many as sources.
     dataset : str, optional
         Its name; the folder's by default.
-    split, number
-        See `shard_from_arrays`.
+    split, number, best
+        See `shard_from_arrays`; ``best`` of trajectories only.
 
     Returns
     -------
@@ -125,10 +127,16 @@ def import_trajectories(
             raise InputError(
                 f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
             )
+        if best:
+            raise InputError(
+                f"{files[0]}: has no scene: the best coarse model is computed of trajectories only."
+            )
         shard = _shard_of_npz(files[0], name, split, number)
     else:
         runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
-        shard = shard_from_trajectories(runs, others, dataset=name, split=split, number=number)
+        shard = shard_from_trajectories(
+            runs, others, dataset=name, split=split, number=number, best=best
+        )
     write_shard(path, replace(shard, provenance={"sources": ", ".join(map(str, files))}))
     return path
 
@@ -211,7 +219,12 @@ def _advice(name: str, count: int, known: set[str]) -> str:
 
 
 def _shard_of_run(
-    run: Trajectory, coarse: Trajectory | None, dataset: str, split: str, number: int
+    run: Trajectory,
+    coarse: Trajectory | None,
+    dataset: str,
+    split: str,
+    number: int,
+    best: bool,
 ) -> Shard:
     scene = _scene("the reference", run)
     if coarse is not None:
@@ -225,7 +238,7 @@ def _shard_of_run(
         problem.mesh.positions, problem.mesh.cells, [motion],
         free=problem.free[: len(problem.mesh.positions)], young=materials.young,
         poisson=materials.poisson, density=materials.density, time_step=step,
-        dataset=dataset, split=split, number=number, scene=scene,
+        dataset=dataset, split=split, number=number, scene=scene, best=best,
     )  # fmt: skip
 
 

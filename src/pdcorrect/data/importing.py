@@ -32,13 +32,16 @@ from pdcorrect.fem.hexahedron import (
 )
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.problem import Problem, discretise
-from pdcorrect.scene import Scene
+from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.state import State
+from pdcorrect.solvers.rollout import rollout
+from pdcorrect.state import State, Status
 
 Array = NDArray[Any]
 
 SETTING = "imported"
+BEST = "best"
+"""The run of the best coarse model."""
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
 
@@ -80,6 +83,7 @@ def shard_from_arrays(
     number: int = 0,
     mass: ArrayLike | None = None,
     scene: Scene | None = None,
+    best: bool = False,
 ) -> Shard:
     """A file of a data set from the arrays of any solver, checked.
 
@@ -105,6 +109,9 @@ def shard_from_arrays(
         Of the coarse model, by backward Euler, whose mesh, material and clamps must be these.
         With it, missing forces are its loads and missing predictions are computed with
         `ProjectiveDynamics`.  Its time step is replaced by this one.
+    best : bool
+        Also compute the run "best": rollout and predictions of `pdcorrect.best_coarse` of the
+        scene, so that models which correct it can be trained and evaluated on this file.
 
     Returns
     -------
@@ -117,8 +124,9 @@ def shard_from_arrays(
         If the mesh has a cell that is inverted, collapsed or not connected.
     InputError
         If an array has a wrong type or shape or is not finite, frame 0 or a held node has
-        moved, a cell of the reference is inverted, or the scene is another; names simulation,
-        frame and cell or node.
+        moved, a cell of the reference is inverted, the scene is another, or ``best`` is wanted
+        without a scene or of one that is its own best coarse model; names simulation, frame and
+        cell or node.
     """
     motions = [motions] if isinstance(motions, Motion) else list(motions)
     mesh = HexMesh.create(real_array("points", points), integer_array("cells", cells))
@@ -136,6 +144,7 @@ def shard_from_arrays(
     if scene is not None:
         scene, time_step = _in_step(scene, time_step)
         stepper = _stepper(scene, mesh, {"free": movable, **moduli})
+    better = _best_stepper(scene) if best else None
     if mass is not None:
         masses = finite_array("mass", mass, (nodes,))
     else:
@@ -143,7 +152,7 @@ def shard_from_arrays(
     if (masses <= 0).any():
         raise InputError("mass: expected more than 0 kg at every node.")
     simulations = tuple(
-        _simulation(f"simulation {k}", motion, mesh, movable, stepper, time_step)
+        _simulation(f"simulation {k}", motion, mesh, movable, stepper, time_step, better)
         for k, motion in enumerate(motions)
     )
     _check_alike(simulations)
@@ -167,6 +176,7 @@ def _simulation(
     free: Array,
     stepper: ProjectiveDynamics | None,
     time_step: float,
+    better: ProjectiveDynamics | None,
 ) -> Simulation:
     if not isinstance(motion, Motion):
         raise InputError(f"{where}: {type(motion).__name__}: expected Motion.")
@@ -193,6 +203,12 @@ def _simulation(
     runs = {REFERENCE: Run(reference, attributes={"solver": "imported", "time_step": time_step})}
     if coarse is not None or predictions is not None:
         runs[PLAIN] = Run(coarse, predictions, attributes={"time_step": time_step})
+    if better is not None:
+        rolled = _roll_out(better, where, frames - 1)
+        single = with_held_nodes(
+            f"{where}, best", _predict(better, reference, time_step), mesh, free
+        )
+        runs[BEST] = Run(rolled, single, attributes={"time_step": time_step})
     return Simulation(np.zeros(steps) if forces is None else forces, runs)
 
 
@@ -246,6 +262,28 @@ def _stepper(scene: Scene, mesh: HexMesh, body: dict[str, Array]) -> ProjectiveD
         if not np.allclose(values, body[name], rtol=1e-9, atol=0):
             raise InputError(f"scene: its {name} is not the one given: expected equal values.")
     return ProjectiveDynamics(problem)
+
+
+def _best_stepper(scene: Scene | None) -> ProjectiveDynamics:
+    """Of the best coarse model of a scene."""
+    if scene is None:
+        raise InputError('the run "best" without a scene: expected the scene of the coarse model.')
+    better = best_coarse(scene)
+    if better.solver == scene.solver:
+        raise InputError(
+            f"the scene has the best coarse model's element {scene.solver.element!r} already: "
+            "expected the plain coarse model's, which Omega is against."
+        )
+    return ProjectiveDynamics(discretise(better))
+
+
+def _roll_out(stepper: ProjectiveDynamics, where: str, steps: int) -> Array:
+    """Positions from rest, (T+1, N, 3), m."""
+    run = rollout(stepper, steps)
+    for step, name in enumerate(run.stats["status"], start=1):
+        if not Status[name].ok:
+            raise InputError(f"{where}: step {step} of the best coarse model {Status[name].value}.")
+    return run.positions
 
 
 def _predict(stepper: ProjectiveDynamics, reference: Array, time_step: float) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.corrector.model_io import WEIGHTS, LoadedModel, load_model, model_folder
+from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
@@ -126,8 +126,7 @@ def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandida
 
     base = _configured(model, "base", PLAIN)
     candidate = Candidate(name, base, hybrid, _group(model, base))
-    weights = hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()
-    return SavedCandidate(candidate, folder, model, weights)
+    return SavedCandidate(candidate, folder, model, weights_digest(folder))
 
 
 def _configuration(model: LoadedModel) -> dict[str, Any]:

@@ -214,6 +214,10 @@ class TrainingConfig(TomlConfig):
 
     Attributes
     ----------
+    start_from
+        Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
+        training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
+        architecture.  A folder's path starts where the program does.
     base
         Whose steps are corrected: "plain", or `pdcorrect.best_coarse`'s ("best").
     velocity
@@ -229,6 +233,7 @@ class TrainingConfig(TomlConfig):
     """
 
     corrector: Architecture = Architecture()
+    start_from: Annotated[str, Field(min_length=1)] | None = None
     base: Literal["plain", "best"] = "plain"
     velocity: Literal["recomputed", "kept"] = "recomputed"
     seed: Count = 0

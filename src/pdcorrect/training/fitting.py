@@ -30,6 +30,23 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     most : int
         Windows; if there are more, so many are drawn without replacement by ``seed``.
     """
+    corrector.normaliser.fit(*_moments(corrector, windows, most, seed))
+
+
+@torch.no_grad()
+def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: int = 0) -> None:
+    """Widen the ranges of a fitted normalisation to what these windows hold, too.
+
+    Means, deviations and the output's scale stay, for the weights belong to them; a gate then
+    takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
+    """
+    corrector.normaliser.widen(_moments(corrector, windows, most, seed)[0])
+
+
+def _moments(
+    corrector: Corrector, windows: StepWindows, most: int, seed: int
+) -> tuple[dict[str, Moments], Moments]:
+    """Of features by name, and of targets (m, 1)."""
     count = len(windows.dataset)
     chosen = np.arange(count)
     if count > most:
@@ -46,4 +63,4 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
             moments[name].add(values)
         wanted = corrector.target(view, batch.target)
         target.add(wanted[batch.bodies.free.all(dim=1)].reshape(-1, 1))
-    corrector.normaliser.fit(moments, target)
+    return moments, target

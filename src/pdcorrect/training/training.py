@@ -16,14 +16,21 @@ from torch import Tensor
 
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_io import ModelRecord, save_model
+from pdcorrect.corrector.model_io import (
+    LoadedModel,
+    ModelRecord,
+    load_model,
+    save_model,
+    weights_digest,
+)
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import splits_of
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
+from pdcorrect.toml_config import as_toml
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.config import Stage, TrainingConfig
-from pdcorrect.training.fitting import fit_normaliser
+from pdcorrect.training.fitting import fit_normaliser, widen_ranges
 from pdcorrect.training.history import History
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
@@ -69,9 +76,10 @@ class Training:
     ------
     InputError
         If the folder holds a training and ``resume`` is not set, or it was another one; if
-        the data do not have what the configuration wants.
+        the data do not have what the configuration wants, or the model to start from is
+        missing or of another architecture.
     FileFormatError
-        If the checkpoint, or a file of the data set, is damaged.
+        If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
 
     def __init__(
@@ -92,7 +100,11 @@ class Training:
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
         )
-        self._teachers = load_teachers(config, self.device)
+        start, self._teachers = self._start(), load_teachers(config, self.device)
+        if start is not None:
+            self._identity["start"] = weights_digest(str(config.start_from))
+        if self._teachers:
+            self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
         self._recordings = load_recordings(data, TRAINING, config.base)
         self._windows = StepWindows(
@@ -103,7 +115,7 @@ class Training:
             self._recordings, config.base, self.device, seed=config.seed, rank=self.world.rank,
             world_size=self.world.size,
         )  # fmt: skip
-        self.corrector = self._new_corrector(fit=found is None)
+        self.corrector = self._new_corrector(start, fit=found is None)
         self._averaged = copy.deepcopy(self.corrector)
         self._best: dict[str, Tensor] = {}
         self._validation: Validation | None = None
@@ -134,6 +146,8 @@ class Training:
         self._limit = math.inf if seconds is None else self.progress.seconds + seconds
         self._ticked = time.perf_counter()
         try:
+            if self.config.start_from is not None and self.progress.total == 0:
+                self._validate(self.corrector)  # nothing worse than it is kept
             while self.progress.stage < len(self.config.stages):
                 if not self._run_stage(self.config.stages[self.progress.stage]):
                     return False
@@ -246,8 +260,29 @@ class Training:
 
     # --- states -----------------------------------------------------------------------------
 
-    def _new_corrector(self, fit: bool) -> Corrector:
+    def _start(self) -> LoadedModel | None:
+        """The model to start from, if there is one, of the configuration's architecture."""
+        if self.config.start_from is None:
+            return None
+        model = load_model(self.config.start_from, self.device)
+        own, wanted = (c.model_dump() for c in (model.corrector.config, self.config.architecture()))
+        unlike = [name for name in own if own[name] != wanted[name]]
+        if unlike:
+            told = ", ".join(f"{name} = {as_toml(own[name])}" for name in unlike)
+            raise InputError(
+                f"start_from = {self.config.start_from!r}: that model has {told}, unlike "
+                "corrector: expected the same there, in corrector.changes."
+            )
+        return model
+
+    def _new_corrector(self, start: LoadedModel | None, fit: bool) -> Corrector:
         config = self.config
+        if start is not None:
+            corrector = start.corrector.train()
+            if fit:
+                widen_ranges(corrector, self._windows, config.fitting.windows, config.seed)
+                self.world.same(list(corrector.state_dict().values()))
+            return corrector
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             corrector = Corrector(config.architecture()).to(self.device)
