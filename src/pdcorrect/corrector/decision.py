@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Answers
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, Measured, Reason
 
@@ -74,7 +74,7 @@ class Decision:
     factors: Tensor
 
     @classmethod
-    def of(cls, corrector: Corrector, view: View, gate: Gate | None) -> Decision:
+    def of(cls, corrector: Answers, view: View, gate: Gate | None) -> Decision:
         """Ask the network."""
         bodies, asked = view.bodies, corrector.of_view(view)
         sound = bodies.sound(asked)
@@ -120,7 +120,7 @@ class Decision:
 
 
 def corrected_step(
-    step: CoarseStep[Answer], corrector: Corrector, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     """The answer of a corrected step, the coarse solver's, and the decision.
 
@@ -141,7 +141,7 @@ def corrected_step(
 
 
 def _state(
-    step: CoarseStep[Answer], corrector: Corrector, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     coarse = step.solved()
     decision = Decision.of(corrector, step.view(coarse), gate)
