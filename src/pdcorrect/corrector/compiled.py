@@ -43,6 +43,9 @@ class CompiledCorrector:
     Attributes
     ----------
     config : CorrectorConfig
+    features : CompiledFeatures
+    network : CompiledNetwork
+        What the features are written to.
     """
 
     config: CorrectorConfig
@@ -58,35 +61,37 @@ class CompiledCorrector:
         corrector = self._corrector
         self.config = corrector.config
         self._copied = list(_contents(corrector))
-        self._network = CompiledNetwork(corrector.network, self._groups)
-        self._features = CompiledFeatures(
-            corrector, self._bodies, self._groups, self._network.x, self._network.e
+        self.network = CompiledNetwork(corrector.network, self._groups)
+        self.features = CompiledFeatures(
+            corrector, self._bodies, self._groups, self.network.x, self.network.e
         )
         self._output_scale = float(corrector.normaliser.output_scale)
         self._view: View | None = None
 
     def of_view(self, view: View) -> Tensor:
         """The correction (n, 3), m."""
+        if self._changed():
+            self.refresh()
         features = self._seen(view)
         answer = np.empty_like(features.frames[:, 0])
         size = float(self._bodies.cell_size) * features.deformation
-        _in_metres(self._network(), self._output_scale, size, features.frames, self._free, answer)
+        _in_metres(self.network(), self._output_scale, size, features.frames, self._free, answer)
         found = torch.from_numpy(answer)
         return without_momentum(view, found) if self.config.momentum_neutral else found
 
     def outside(self, view: View, margin: float) -> Tensor:
         """See `Corrector.outside`."""
+        if view is not self._view and self._changed():
+            self.refresh()
         beyond = ~(self._seen(view).excess <= margin)
         return torch.tensor([np.count_nonzero(beyond) / len(beyond)], dtype=torch.float64)
 
     def _seen(self, view: View) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""
-        if self._changed():
-            self.refresh()
         if view is not self._view:
-            self._features(view.snapshot)
+            self.features(view.snapshot)
             self._view = view
-        return self._features
+        return self.features
 
     def _changed(self) -> bool:
         return self._corrector.config is not self.config or any(

@@ -74,15 +74,17 @@ class ElasticBody:
             return nodal
         return np.concatenate([nodal, np.zeros((self.space.internal, 3))])
 
-    def relaxed(self, positions: Array, steps: int = 50) -> Array:
+    def relaxed(self, positions: Array, steps: int = 50, modes: Array | None = None) -> Array:
         """The configuration (N + B, 3) in which the internal modes are in equilibrium.
 
-        ``steps`` Newton steps in each cell at most.
+        ``steps`` Newton steps in each cell at most, from ``modes`` (B, 3), m, by default from 0.
         """
         self._check(positions, len(self.positions))
         if not self.space.internal:
             return positions
         x = self.extended(positions - self.positions)
+        if modes is not None:
+            x[len(positions) :] = modes
         internal_modes.relax(
             self.materials.model, x, self.space.local, self.cells.shape[1],
             self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
@@ -91,9 +93,9 @@ class ElasticBody:
         x[: len(positions)] = positions
         return x
 
-    def energy(self, positions: Array) -> float:
-        """Elastic energy, J, with internal modes in equilibrium."""
-        return self.energy_and_forces(self.relaxed(positions))[0]
+    def energy(self, positions: Array, modes: Array | None = None) -> float:
+        """Elastic energy, J, with internal modes in equilibrium, which is sought from ``modes``."""
+        return self.energy_and_forces(self.relaxed(positions, modes=modes))[0]
 
     def forces(self, positions: Array) -> Array:
         """Elastic nodal forces -dW/dp, (N, 3), N."""
