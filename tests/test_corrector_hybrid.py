@@ -116,6 +116,15 @@ def test_energies_from_near_modes_are_those_from_none(size):
     assert problem.energy(near, state.modes) == pytest.approx(expected, rel=1e-12)
 
 
+def test_corrected_steps_do_not_pass_on_the_coarse_modes():
+    problem = pc.discretise(soft_beam(solver={"element": "hex8-bubble"}, loads=[TORSION]))
+    coarse = pc.ProjectiveDynamics(problem)
+    result = HybridStepper(coarse, fitted([problem]))(problem.rest_state())
+    assert result.stats["correction"] > 0.0
+    assert result.modes is None
+    assert coarse(problem.rest_state()).modes.any()
+
+
 def test_corrected_answers_are_measured_once(monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]), gate=Gate())

@@ -110,7 +110,8 @@ class StepResult:
     stats : mapping of str to float
         Energies (J) after the step and solver counters.
     modes : (B, 3) or None
-        Internal modes at the end of the step, m, of elements that have some.
+        Internal modes at the end of the step, m, of elements that have some; None too where a
+        network has moved the nodes.
     """
 
     state: State

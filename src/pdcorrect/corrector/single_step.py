@@ -109,7 +109,8 @@ class SingleCoarseStep:
             "external_work": work,
             "smallest_volume_ratio": ratio,
         }
-        return replace(answer, state=state, status=_status(answer.status, ratio), stats=stats)
+        status = _status(answer.status, ratio)
+        return replace(answer, state=state, status=status, stats=stats, modes=None)
 
     def measured(self, answer: StepResult) -> Measured:
         """See `CoarseStep`."""
