@@ -86,7 +86,9 @@ def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
 
 def test_network_and_gate_look_at_the_same_features(monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]), gate=Gate())
+    names = (*preset("compact").node_features, "velocity")  # not compiled
+    corrector = fitted([problem], node_features=names)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=Gate())
     computed = []
     for table in (features.NODE_FEATURES, features.EDGE_FEATURES):
         for name, (count, function) in list(table.items()):
@@ -102,6 +104,42 @@ def counted(computed, name, function):
         return function(view)
 
     return call
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-4, 1e-2])
+def test_energies_from_near_modes_are_those_from_none(size):
+    problem = pc.discretise(soft_beam(solver={"element": "hex8-bubble"}))
+    state = pc.ProjectiveDynamics(problem)(shaken(problem))
+    near = state.state.positions + bumped(problem, size, 3)
+    assert state.modes.shape == (problem.space.internal, 3)
+    expected = problem.energy(near)
+    assert problem.energy(near, state.modes) == pytest.approx(expected, rel=1e-12)
+
+
+def test_corrected_steps_do_not_pass_on_the_coarse_modes():
+    problem = pc.discretise(soft_beam(solver={"element": "hex8-bubble"}, loads=[TORSION]))
+    coarse = pc.ProjectiveDynamics(problem)
+    result = HybridStepper(coarse, fitted([problem]))(problem.rest_state())
+    assert result.stats["correction"] > 0.0
+    assert result.modes is None
+    assert coarse(problem.rest_state()).modes.any()
+
+
+def test_corrected_answers_are_measured_once(monkeypatch):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]), gate=Gate())
+    hybrid(problem.rest_state())
+    energies, ratios = [], []
+    body, kernel = type(problem).energy, type(problem).volume_ratios
+    monkeypatch.setattr(
+        type(problem), "energy", lambda self, *a: energies.append(a) or body(self, *a)
+    )
+    monkeypatch.setattr(
+        type(problem), "volume_ratios", lambda self, *a: ratios.append(a) or kernel(self, *a)
+    )
+    assert hybrid(problem.rest_state()).stats["correction"] > 0.0
+    assert len(energies) == 1
+    assert len(ratios) == 3  # coarse step, coarse answer by cells, corrected one
 
 
 # --- one scene and many ----------------------------------------------------------------------

@@ -109,6 +109,9 @@ class StepResult:
         Estimated largest distance of a node from the step's exact solution, m.
     stats : mapping of str to float
         Energies (J) after the step and solver counters.
+    modes : (B, 3) or None
+        Internal modes at the end of the step, m, of elements that have some; None too where a
+        network has moved the nodes.
     """
 
     state: State
@@ -117,6 +120,7 @@ class StepResult:
     residual: float
     error_estimate: float
     stats: Mapping[str, float] = field(default_factory=dict)
+    modes: NDArray[np.float64] | None = None
 
     def __repr__(self) -> str:
         return (

@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
+from pdcorrect.corrector.features import (
+    EDGE_FEATURES,
+    NODE_FEATURES,
+    Feature,
+    Snapshot,
+    View,
+)
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.normaliser import Normaliser
+
+
+class Answers(Protocol):
+    """What gives corrections: a `Corrector`, or the same in other code."""
+
+    @property
+    def config(self) -> CorrectorConfig:
+        """Of the corrector."""
+
+    def of_view(self, view: View) -> Tensor:
+        """Corrections (n, 3), m."""
+
+    def outside(self, view: View, margin: float) -> Tensor:
+        """Share of each body's nodes with inputs beyond a margin, (B,)."""
 
 
 class Corrector(nn.Module):
@@ -61,6 +83,23 @@ class Corrector(nn.Module):
         edges = features.values(EDGE_FEATURES, config.edge_features, view)
         joined = self.normaliser.joined
         return joined(nodes, config.clip), joined(edges, config.clip)
+
+    def outside(self, view: View, margin: float) -> Tensor:
+        """Share of each body's nodes with inputs, or an edge with inputs, beyond a margin, (B,).
+
+        The margin is in deviations outside the range of the training data.
+        """
+        bodies, config = view.bodies, self.config
+
+        def beyond(table: dict[str, Feature], names: tuple[str, ...]) -> Tensor:
+            excess = self.normaliser.excess(features.values(table, names, view))
+            return ~(excess <= margin).all(dim=1)
+
+        nodes = beyond(NODE_FEATURES, config.node_features)
+        edges = beyond(EDGE_FEATURES, config.edge_features)
+        counts = torch.zeros_like(bodies.mass).index_add(0, view.receiver, edges.to(bodies.mass))
+        nodes |= counts > 0.0
+        return bodies.body_means(nodes.to(bodies.mass))
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

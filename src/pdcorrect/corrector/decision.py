@@ -5,7 +5,6 @@ The same for one scene and for many: what a step is made of is a `CoarseStep`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
@@ -14,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Answers
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, Measured, Reason
 
@@ -74,7 +73,7 @@ class Decision:
     factors: Tensor
 
     @classmethod
-    def of(cls, corrector: Corrector, view: View, gate: Gate | None) -> Decision:
+    def of(cls, corrector: Answers, view: View, gate: Gate | None) -> Decision:
         """Ask the network."""
         bodies, asked = view.bodies, corrector.of_view(view)
         sound = bodies.sound(asked)
@@ -105,22 +104,27 @@ class Decision:
         return replace(self, reasons=torch.where(self.counts, reasons, self.reasons))
 
     def judged(
-        self, gate: Gate, coarse: Measured, measured: Callable[[Tensor], Measured]
-    ) -> Decision:
-        """Refused, or limited, by what answers with corrections (n, 3) are beside coarse ones."""
-        factors = self.factors
-        reasons = gate.reasons(measured(self.scaled(factors)), coarse, gate.energy)
+        self, gate: Gate, step: CoarseStep[Answer], coarse: Answer
+    ) -> tuple[Decision, Answer]:
+        """Refused, or limited, by what corrected answers are beside the coarse one.
+
+        Second: the answer with all corrections that are left, and others that do not count.
+        """
+        factors, beside = self.factors, step.measured(coarse)
+        moved = step.moved(coarse, self.scaled(factors))
+        reasons = gate.reasons(step.measured(moved), beside, gate.energy)
         for _ in range(_HALVINGS if gate.limit else 0):
             failed = self.counts & (reasons > 0)
             if not failed.any():
                 break
             factors = torch.where(failed, 0.5 * factors, factors)
-            reasons = gate.reasons(measured(self.scaled(factors)), coarse, gate.energy)
-        return replace(self.refused(reasons), factors=factors)
+            moved = step.moved(coarse, self.scaled(factors))
+            reasons = gate.reasons(step.measured(moved), beside, gate.energy)
+        return replace(self.refused(reasons), factors=factors), moved
 
 
 def corrected_step(
-    step: CoarseStep[Answer], corrector: Corrector, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     """The answer of a corrected step, the coarse solver's, and the decision.
 
@@ -141,19 +145,18 @@ def corrected_step(
 
 
 def _state(
-    step: CoarseStep[Answer], corrector: Corrector, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     coarse = step.solved()
     decision = Decision.of(corrector, step.view(coarse), gate)
     reasons = torch.where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
     decision = replace(decision, reasons=reasons)
-    if gate is not None and gate.judges and decision.counts.any():
-        decision = decision.judged(
-            gate, step.measured(coarse), lambda x: step.measured(step.moved(coarse, x))
-        )
     if not decision.counts.any():
         return coarse, coarse, decision
-    moved = step.moved(coarse, decision.correction)
+    if gate is not None and gate.judges:
+        decision, moved = decision.judged(gate, step, coarse)
+    else:
+        moved = step.moved(coarse, decision.correction)
     return step.chosen(decision.counts, moved, coarse), coarse, decision
 
 

@@ -17,6 +17,9 @@ from torch import Tensor
 
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
+EDGE_MEANS = (2.0 * VTK_CORNERS - 1.0) / 4.0
+"""What a cell's corners count in its axes, (8, 3)."""
+
 
 def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
     """Axes of cells as columns, (c, 3, 3), m, for positions (n, 3) and cells (c, 8)."""
@@ -26,9 +29,8 @@ def cell_axes(positions: Tensor, cells: Tensor) -> Tensor:
 
 @cache
 def _edge_means(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """What a cell's corners count in its axes, (8, 3)."""
     with torch.inference_mode(False):
-        return torch.as_tensor((2.0 * VTK_CORNERS - 1.0) / 4.0, dtype=dtype, device=device)
+        return torch.as_tensor(EDGE_MEANS, dtype=dtype, device=device)
 
 
 def node_axes(positions: Tensor, cells: Tensor, counts: Tensor) -> Tensor:

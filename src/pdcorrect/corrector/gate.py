@@ -6,7 +6,7 @@ not finite, and those of steps that the coarse solver failed, are refused withou
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated
@@ -15,8 +15,8 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Feature, View, values
+from pdcorrect.corrector.corrector import Answers, Corrector
+from pdcorrect.corrector.features import View
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import NonNegative, Number, Strict
 
@@ -94,22 +94,12 @@ class Gate(Strict):
     energy: NonNegative | None = 1.0
     limit: bool = False
 
-    def unknown(self, corrector: Corrector, view: View) -> Tensor:
+    def unknown(self, corrector: Answers, view: View) -> Tensor:
         """Whether the network's inputs are too far from its training data, (B,) bool."""
-        bodies, config = view.bodies, corrector.config
-        margin = self.margin
-        if margin is None:
+        bodies = view.bodies
+        if self.margin is None:
             return torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
-
-        def outside(table: dict[str, Feature], names: Sequence[str]) -> Tensor:
-            excess = corrector.normaliser.excess(values(table, names, view))
-            return ~(excess <= margin).all(dim=1)
-
-        nodes = outside(NODE_FEATURES, config.node_features)
-        edges = outside(EDGE_FEATURES, config.edge_features)
-        counts = torch.zeros_like(bodies.mass).index_add(0, view.receiver, edges.to(bodies.mass))
-        nodes |= counts > 0.0
-        return bodies.body_means(nodes.to(bodies.mass)) > self.share
+        return corrector.outside(view, self.margin) > self.share
 
     def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Tensor:
         """Reasons (B,) to refuse an answer beside another one, which is the coarse one.

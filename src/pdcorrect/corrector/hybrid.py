@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from pdcorrect.batch.threads import one_thread
 from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.compiled import CompiledCorrector, compilable
+from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.decision import Decision, corrected_step
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.placements import Velocity, check_velocity
@@ -53,6 +54,12 @@ class HybridStepper:
     gate : Gate, optional
         What else is refused than corrections that are not finite, and those of steps that
         the coarse solver fails.
+
+    Attributes
+    ----------
+    compiled : bool
+        Whether a `CompiledCorrector` answers, which is the same to rounding; `prepare` copies
+        the weights that it has then.
 
     Raises
     ------
@@ -96,6 +103,10 @@ class HybridStepper:
         self.placement = corrector.config.placement
         h = coarse_stepper.time_step
         self.bodies = BodyGraph.of([self.problem], h, dtype=torch.float64)
+        self.compiled = compilable(self.corrector, self.bodies)
+        self._answers: Answers = self.corrector
+        if self.compiled:
+            self._answers = CompiledCorrector(self.corrector, self.bodies)
         self._remembers = "previous-correction" in corrector.config.node_features
 
     def __repr__(self) -> str:
@@ -105,7 +116,9 @@ class HybridStepper:
         """Factorise and load everything now, so that the first step is like the others."""
         self.coarse.prepare()
         with torch.no_grad(), one_thread(torch.device("cpu")):
-            Decision.of(self.corrector, self._step(self.problem.rest_state()).view(None), self.gate)
+            if isinstance(self._answers, CompiledCorrector):
+                self._answers.refresh()
+            Decision.of(self._answers, self._step(self.problem.rest_state()).view(None), self.gate)
         return self
 
     def describe(self) -> dict[str, str]:
@@ -115,6 +128,7 @@ class HybridStepper:
             **self.coarse.describe(),
             "corrector": digest(self.corrector),
             "corrector_size": f"{config.layers} rounds of width {config.width}",
+            "corrector_code": "compiled" if self.compiled else "torch",
             "placement": self.placement,
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
@@ -140,7 +154,7 @@ class HybridStepper:
         step = self._step(before, forces, previous)
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):
-            result, _, decision = corrected_step(step, self.corrector, self.gate)
+            result, _, decision = corrected_step(step, self._answers, self.gate)
         correction: Array = decision.correction.numpy()
         reason = float(decision.reasons)
         after = result.state

@@ -86,6 +86,11 @@ class MeshGraphNetwork(nn.Module):
         LayerNorm on the output of each network but the decoder, also of the decoder, or of none.
     shared : bool
         Whether all rounds have the same weights.
+
+    Attributes
+    ----------
+    count : int
+        Rounds of message passing.
     """
 
     def __init__(
@@ -107,7 +112,7 @@ class MeshGraphNetwork(nn.Module):
         count = 1 if shared else layers
         self.rounds = nn.ModuleList(MessageLayer(width, mlp_layers, hidden) for _ in range(count))
         self.decoder = MLP(width, width, outputs, mlp_layers, norm == "all")
-        self._layers = layers
+        self.count = layers
 
     def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> Tensor:
         """Outputs (n, k) for features (n, a) of nodes and (E, b) of edges.
@@ -115,7 +120,7 @@ class MeshGraphNetwork(nn.Module):
         The first row of ``edge_index`` (2, E) is the receiver.
         """
         x, e = self.node_encoder(x), self.edge_encoder(e)
-        for i in range(self._layers):
+        for i in range(self.count):
             x, e = self.rounds[i % len(self.rounds)](x, e, edge_index)
         out: Tensor = self.decoder(x)
         return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -66,6 +67,16 @@ class Moments:
     def deviation(self) -> Tensor:
         """Root mean squared distance from the mean, (k,)."""
         return self.variance.sqrt()
+
+
+class Scale(NamedTuple):
+    """Of the components of a feature, (k,) each: ``unit`` is that of its excess."""
+
+    mean: Tensor
+    deviation: Tensor
+    low: Tensor
+    high: Tensor
+    unit: Tensor
 
 
 class Normaliser(nn.Module):
@@ -146,10 +157,15 @@ class Normaliser(nn.Module):
         """
         x = torch.cat(list(values.values()), dim=1)
         low, high, deviation = (self._row(values, p, x) for p in ("low", "high", "deviation"))
-        size = torch.maximum(low.abs(), high.abs())
-        constant = high - low <= _LEAST_DEVIATION * size
-        unit = torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
+        unit = _unit(low, high, deviation)
         return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
+
+    def scale(self, name: str) -> Scale:
+        """What is known of one feature."""
+        mean, deviation, low, high = (
+            self._part(name, part) for part in ("mean", "deviation", "low", "high")
+        )
+        return Scale(mean, deviation, low, high, _unit(low, high, deviation))
 
     def _row(self, names: Iterable[str], part: str, like: Tensor) -> Tensor:
         """A part of some features side by side, (k1 + k2 + ...,)."""
@@ -158,6 +174,13 @@ class Normaliser(nn.Module):
     def _part(self, name: str, part: str) -> Tensor:
         found: Tensor = getattr(self, _key(name, part))
         return found
+
+
+def _unit(low: Tensor, high: Tensor, deviation: Tensor) -> Tensor:
+    """In which to count how far values are outside a range."""
+    size = torch.maximum(low.abs(), high.abs())
+    constant = high - low <= _LEAST_DEVIATION * size
+    return torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
 
 
 def _key(name: str, part: str) -> str:

@@ -42,7 +42,7 @@ class _Polar(torch.autograd.Function):
     def forward(ctx: Any, matrices: Tensor) -> Tensor:
         if matrices.device.type == "cpu":
             R = torch.empty(matrices.shape, dtype=matrices.dtype)
-            _rotations(matrices.detach().contiguous().numpy(), R.numpy())
+            rotations(matrices.detach().contiguous().numpy(), R.numpy())
         else:
             R = together(matrices)
         ctx.save_for_backward(matrices, R)
@@ -124,7 +124,7 @@ def _cofactors_of(a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _rotations(M, out):  # type: ignore[no-untyped-def]
+def rotations(M, out):  # type: ignore[no-untyped-def]
     """`polar_rotations` (n, 3, 3), one by one."""
     for k in range(M.shape[0]):
         squares = 0.0

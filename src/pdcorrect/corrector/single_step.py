@@ -56,6 +56,7 @@ class SingleCoarseStep:
         self._coarse, self._bodies, self._velocity = coarse, bodies, velocity
         self._problem, self._state, self._forces = coarse.problem, state, forces
         self._previous, self.seconds = previous, 0.0
+        self._last: tuple[State, Array] | None = None
         stage = coarse.integrate(self._problem, state, coarse.time_step, forces)
         loads = self._problem.external_forces(*stage.loads_over, stage.loads_at)
         self._loads: Array = loads if forces is None else loads + forces
@@ -99,16 +100,17 @@ class SingleCoarseStep:
         scheme = self._coarse.integrate.scheme(self._state, self._coarse.time_step)
         positions, velocities, memory = moved(scheme, answer.state, shift, self._velocity)
         state = State(positions, velocities, answer.state.time, memory)
-        ratio = float(self._problem.volume_ratios(positions).min())
+        ratio = float(self._ratios(state).min())
         work = answer.stats["external_work"] + float(np.vdot(self._loads, shift))
         stats = {
             **answer.stats,
-            "elastic_energy": self._problem.energy(positions),
+            "elastic_energy": self._problem.energy(positions, answer.modes),
             "kinetic_energy": self._kinetic(state),
             "external_work": work,
             "smallest_volume_ratio": ratio,
         }
-        return replace(answer, state=state, status=_status(answer.status, ratio), stats=stats)
+        status = _status(answer.status, ratio)
+        return replace(answer, state=state, status=status, stats=stats, modes=None)
 
     def measured(self, answer: StepResult) -> Measured:
         """See `CoarseStep`."""
@@ -125,9 +127,15 @@ class SingleCoarseStep:
         return one if bool(which) else other
 
     def _measured(self, state: State, stored: float, work: float | np.floating[Any]) -> Measured:
-        ratios = torch.from_numpy(self._problem.volume_ratios(state.positions))[None]
+        ratios = torch.from_numpy(self._ratios(state))[None]
         numbers = torch.tensor([[stored], [float(work)]], dtype=torch.float64)
         return Measured(ratios, numbers[0], numbers[1])
+
+    def _ratios(self, state: State) -> Array:
+        """Smallest det F of each cell, (C,); those of the state asked for last are kept."""
+        if self._last is None or self._last[0] is not state:
+            self._last = state, self._problem.volume_ratios(state.positions)
+        return self._last[1]
 
     def _way(self, answer: StepResult) -> Array:
         way: Array = answer.state.positions - self._state.positions

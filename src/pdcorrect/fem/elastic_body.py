@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 
 _RELAXED = 1e-13
 """Of the cell size: change of an internal mode at which its equilibrium is found."""
+_FLAT = 1e-6
+"""The same where only the energy is asked for, from modes that are near."""
+_NEAR = 1e-4
+"""Of the cell size: change below which `internal_modes.relax` uses the exact tangent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,26 +78,42 @@ class ElasticBody:
             return nodal
         return np.concatenate([nodal, np.zeros((self.space.internal, 3))])
 
-    def relaxed(self, positions: Array, steps: int = 50) -> Array:
+    def relaxed(
+        self,
+        positions: Array,
+        steps: int = 50,
+        modes: Array | None = None,
+        tolerance: float | None = None,
+    ) -> Array:
         """The configuration (N + B, 3) in which the internal modes are in equilibrium.
 
-        ``steps`` Newton steps in each cell at most.
+        ``steps`` Newton steps in each cell at most, from ``modes`` (B, 3), m, by default from 0,
+        until the last one is below ``tolerance`` cell sizes, by default far below rounding in
+        nodal positions.
         """
         self._check(positions, len(self.positions))
         if not self.space.internal:
             return positions
         x = self.extended(positions - self.positions)
+        if modes is not None:
+            x[len(positions) :] = modes
         internal_modes.relax(
             self.materials.model, x, self.space.local, self.cells.shape[1],
             self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
-            steps, _RELAXED * self.cell_size,
+            steps, (_RELAXED if tolerance is None else tolerance) * self.cell_size,
+            _NEAR * self.cell_size,
         )  # fmt: skip
         x[: len(positions)] = positions
         return x
 
-    def energy(self, positions: Array) -> float:
-        """Elastic energy, J, with internal modes in equilibrium."""
-        return self.energy_and_forces(self.relaxed(positions))[0]
+    def energy(self, positions: Array, modes: Array | None = None) -> float:
+        """Elastic energy, J, with internal modes in equilibrium.
+
+        From near ``modes`` (B, 3), m, that is quicker.  Last steps may be longer then: the energy
+        is flat at the equilibrium, and Newton's steps become as short as the square of the last.
+        """
+        tolerance = None if modes is None else _FLAT
+        return self.energy_and_forces(self.relaxed(positions, modes=modes, tolerance=tolerance))[0]
 
     def forces(self, positions: Array) -> Array:
         """Elastic nodal forces -dW/dp, (N, 3), N."""

@@ -14,21 +14,20 @@ from pdcorrect.fem.tangent_kernels import stiffness
 Array = NDArray[np.float64]
 
 _BACKTRACKS = 30
-_NEAR = 1e9
-"""Last step, in tolerances, from which on the exact tangent is used: farther from equilibrium it
-can lead to another one, and magnifies rounding where modes have hardly any stiffness."""
 
 
 @njit(**PARALLEL)
 def relax(  # type: ignore[no-untyped-def]
-    model, u, cells, nodes, gradients, weights, first, steps, tolerance
+    model, u, cells, nodes, gradients, weights, first, steps, tolerance, near
 ):
     """Bring the internal modes in u (N + B, 3) to equilibrium with the nodes, in place.
 
     Newton's method in each cell, with the projected tangent far from equilibrium and where the
     exact one is not positive definite, at most ``steps`` times or until no
-    mode changes by more than ``tolerance`` (m).  ``nodes`` is the number of nodes a cell;
-    its other local shape functions are modes.
+    mode changes by more than ``tolerance`` (m).  Farther than a last step of ``near`` (m) the
+    exact tangent can lead to another equilibrium, and magnifies rounding where modes have hardly
+    any stiffness.  ``nodes`` is the number of nodes a cell; its other local shape functions are
+    modes.
     Other arguments as `kernels.energy_and_forces`.
     """
     count, lanes = cells.shape[0], weights.shape[2]
@@ -65,7 +64,7 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                project = tried == 1 or _largest(step) > _NEAR * tolerance
+                project = tried == 1 or _largest(step) > near
                 for cautious in (project, True):
                     principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
                     stiffness(here, U, V, T, A, P, K)

@@ -57,6 +57,7 @@ class _Outcome:
     external_work: float
     clamp_work: float
     damping_loss: float
+    modes: Array | None
 
 
 class ImplicitStepper:
@@ -328,7 +329,9 @@ class ImplicitStepper:
         if status is Status.CONVERGED and stats["smallest_volume_ratio"] <= 0.0:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
-        return StepResult(state, status, effort.iterations, residual, minimum.estimate, stats)
+        return StepResult(
+            state, status, effort.iterations, residual, minimum.estimate, stats, outcome.modes
+        )
 
 
 def _outcome(
@@ -349,6 +352,7 @@ def _outcome(
         external_work=float(np.vdot(objective.forces[:nodes], moved)),
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, h),
+        modes=end[nodes:] if problem.space.internal else None,
     )
 
 
@@ -367,6 +371,7 @@ def _joined(parts: list[_Outcome], end: State) -> _Outcome:
         external_work=sum(part.external_work for part in parts),
         clamp_work=sum(part.clamp_work for part in parts),
         damping_loss=sum(part.damping_loss for part in parts),
+        modes=last.modes,
     )
 
 

@@ -1,0 +1,148 @@
+"""`CompiledCorrector`: a corrector's answers for one body by compiled loops on the CPU.
+
+The same to rounding as `Corrector` gives by torch, whose single operations take longer than
+their arithmetic on meshes of some hundred nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.compiled_features import KNOWN_OF_EDGES, KNOWN_OF_NODES, CompiledFeatures
+from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.corrector import Corrector, without_momentum
+from pdcorrect.corrector.features import View
+from pdcorrect.corrector.network import MeshGraphNetwork
+from pdcorrect.fem.decomposition import OPTIONS
+
+Array = NDArray[Any]
+
+
+class CompiledCorrector:
+    """Answers as of a `Corrector`, without derivatives.
+
+    Weights and normaliser are copied, and copied anew when they have changed; not where values
+    are written to ``.data``, which torch does not count: see `refresh`.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        One that `compilable` accepts.
+    bodies : BodyGraph
+        One, float64, on the CPU.
+
+    Attributes
+    ----------
+    config : CorrectorConfig
+    features : CompiledFeatures
+    network : CompiledNetwork
+        What the features are written to.
+    """
+
+    config: CorrectorConfig
+
+    def __init__(self, corrector: Corrector, bodies: BodyGraph) -> None:
+        self._corrector, self._bodies = corrector, bodies
+        self._groups = Groups(bodies.edge_index.numpy(), len(bodies.rest))
+        self._free = bodies.free.numpy()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copy the corrector's weights and normaliser."""
+        corrector = self._corrector
+        self.config = corrector.config
+        self._copied = list(_contents(corrector))
+        self.network = CompiledNetwork(corrector.network, self._groups)
+        self.features = CompiledFeatures(
+            corrector, self._bodies, self._groups, self.network.x, self.network.e
+        )
+        self._output_scale = float(corrector.normaliser.output_scale)
+        self._view: View | None = None
+
+    def of_view(self, view: View) -> Tensor:
+        """The correction (n, 3), m."""
+        if self._changed():
+            self.refresh()
+        features = self._seen(view)
+        answer = np.empty_like(features.frames[:, 0])
+        size = float(self._bodies.cell_size) * features.deformation
+        _in_metres(self.network(), self._output_scale, size, features.frames, self._free, answer)
+        found = torch.from_numpy(answer)
+        return without_momentum(view, found) if self.config.momentum_neutral else found
+
+    def outside(self, view: View, margin: float) -> Tensor:
+        """See `Corrector.outside`."""
+        if view is not self._view and self._changed():
+            self.refresh()
+        beyond = ~(self._seen(view).excess <= margin)
+        return torch.tensor([np.count_nonzero(beyond) / len(beyond)], dtype=torch.float64)
+
+    def _seen(self, view: View) -> CompiledFeatures:
+        """The features of a view, computed when it is first seen."""
+        if view is not self._view:
+            self.features(view.snapshot)
+            self._view = view
+        return self.features
+
+    def _changed(self) -> bool:
+        return self._corrector.config is not self.config or any(
+            table.get(name) is not part or _count(part) != count
+            for table, name, part, count in self._copied
+        )
+
+
+def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
+    """Whether `CompiledCorrector` can take the place of a corrector.
+
+    That takes features and output in node frames, one body in float64, and a corrector and a
+    network of these very classes, in single or double precision.
+    """
+    config = corrector.config
+    known = KNOWN_OF_NODES.issuperset(config.node_features) and KNOWN_OF_EDGES.issuperset(
+        config.edge_features
+    )
+    plain = type(corrector) is Corrector and type(corrector.network) is MeshGraphNetwork
+    dtypes = {weight.dtype for weight in corrector.network.parameters()}
+    return (
+        known and plain and config.output == "frame" and bodies.bodies == 1
+        and bodies.rest.dtype == torch.float64 and bodies.rest.device.type == "cpu"
+        and len(dtypes) == 1 and dtypes <= {torch.float32, torch.float64}
+    )  # fmt: skip
+
+
+_Content = tuple[dict[str, Any], str, Any, tuple[int, int] | None]
+
+
+def _contents(corrector: Corrector) -> Iterator[_Content]:
+    """All that a corrector is made of: where it is, what it is, and how often it was written."""
+    for part in corrector.modules():
+        for table in (part._parameters, part._buffers, part._modules):
+            for name, content in table.items():
+                yield table, name, content, _count(content)
+
+
+def _count(content: Tensor | nn.Module | None) -> tuple[int, int] | None:
+    """How often a tensor was written, and its address."""
+    if not isinstance(content, Tensor):
+        return None
+    return 0 if content.is_inference() else content._version, content.data_ptr()
+
+
+@njit(**OPTIONS)
+def _in_metres(x, scale, size, frames, free, out):  # type: ignore[no-untyped-def]
+    """`Corrector.in_metres` of outputs in frames; ``size`` is cell size times deformation."""
+    for n in range(out.shape[0]):
+        for i in range(3):
+            turned = 0.0
+            for j in range(3):
+                turned += frames[n, i, j] * (x[n, j] * scale)
+            out[n, i] = size * turned if free[n, i] else 0.0
