@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled_features import KNOWN_OF_EDGES, KNOWN_OF_NODES, CompiledFeatures
@@ -60,7 +60,11 @@ class CompiledCorrector:
         """Copy the corrector's weights and normaliser."""
         corrector = self._corrector
         self.config = corrector.config
-        self._copied = list(_contents(corrector))
+        self._parts = list(_contents(corrector))
+        self._tensors = [part for _, _, part in self._parts if isinstance(part, Tensor)]
+        # of inference tensors torch does not count how often they are written
+        self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
+        self._writes = self._written()
         self.network = CompiledNetwork(corrector.network, self._groups)
         self.features = CompiledFeatures(
             corrector, self._bodies, self._groups, self.network.x, self.network.e
@@ -94,10 +98,13 @@ class CompiledCorrector:
         return self.features
 
     def _changed(self) -> bool:
-        return self._corrector.config is not self.config or any(
-            table.get(name) is not part or _count(part) != count
-            for table, name, part, count in self._copied
-        )
+        if self._corrector.config is not self.config or self._written() != self._writes:
+            return True
+        return any(table.get(name) is not part for table, name, part in self._parts)
+
+    def _written(self) -> list[int]:
+        """How often each tensor was written, and where they are."""
+        return [t._version for t in self._counted] + [t.data_ptr() for t in self._tensors]
 
 
 def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
@@ -119,22 +126,12 @@ def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
     )  # fmt: skip
 
 
-_Content = tuple[dict[str, Any], str, Any, tuple[int, int] | None]
-
-
-def _contents(corrector: Corrector) -> Iterator[_Content]:
-    """All that a corrector is made of: where it is, what it is, and how often it was written."""
+def _contents(corrector: Corrector) -> Iterator[tuple[dict[str, Any], str, Any]]:
+    """All that a corrector is made of: where it is, its name there, and what it is."""
     for part in corrector.modules():
         for table in (part._parameters, part._buffers, part._modules):
             for name, content in table.items():
-                yield table, name, content, _count(content)
-
-
-def _count(content: Tensor | nn.Module | None) -> tuple[int, int] | None:
-    """How often a tensor was written, and its address."""
-    if not isinstance(content, Tensor):
-        return None
-    return 0 if content.is_inference() else content._version, content.data_ptr()
+                yield table, name, content
 
 
 @njit(**OPTIONS)
