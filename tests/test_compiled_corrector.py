@@ -339,6 +339,38 @@ def test_only_single_bodies_in_double_precision_are_compiled():
     assert not compilable(made, bodies)
 
 
+def _tanh(network):
+    network.node_encoder[1] = torch.nn.Tanh()
+
+
+def _dropout(network):
+    network.decoder.insert(1, torch.nn.Dropout(0.5))
+
+
+def _epsilon(network):
+    network.rounds[0].node[-1].eps = 1e-3
+
+
+def _hooked(network):
+    network.decoder.register_forward_hook(lambda *_: None)
+
+
+@pytest.mark.parametrize("change", [_tanh, _dropout, _epsilon, _hooked])
+def test_networks_that_were_changed_are_not_compiled(change):
+    made = corrector()
+    assert compilable(made, body())
+    change(made.network)
+    assert not compilable(made, body())
+
+
+def test_the_question_draws_no_random_numbers():
+    made, bodies = corrector(), body()
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
+    compilable(made, bodies)
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
 def test_edges_receive_in_groups_of_their_own():
     bodies = body((5, 3, 2))
     index = bodies.edge_index.numpy()

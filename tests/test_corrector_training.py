@@ -644,8 +644,12 @@ def test_a_teacher_is_asked_about_the_states_that_the_learner_meets(group, folde
     found = unroll(group, learner, started(group, frames), 1, stage, teacher=teacher)
     layer = group.layer(learner, False, "recomputed")
     before = started(group, frames)
+    assert layer.watch is None
+    layer.watch = (views := []).append
     _, _, own = layer(before.positions, before.velocities, group.times(frames), before.correction)
-    apart = layer.padded(own - teacher.of_view(layer.seen)).square().sum(dim=2)
+    layer.watch = None
+    (view,) = views
+    apart = layer.padded(own - teacher.of_view(view)).square().sum(dim=2)
     expected = group.sums(apart) / (group.counts * group.errors.one_step)
     torch.testing.assert_close(found.losses, expected)
     assert (found.losses > 0).all()
@@ -1126,6 +1130,30 @@ def test_a_start_of_another_architecture_is_refused_with_the_difference(short, e
     settings = samples.config(samples.one_step(), start_from=str(tmp_path / "nothing"))
     with pytest.raises(InputError, match="expected a folder with a model"):
         Training(settings, short, tmp_path / "out")
+
+
+def test_a_start_of_another_base_or_velocity_is_refused(short, earlier, tmp_path):
+    for changes, told in (
+        ({"base": "best"}, "start_from = .*its base is 'plain': expected 'best'"),
+        ({"velocity": "kept"}, "its velocity is 'recomputed': expected 'kept'"),
+    ):
+        settings = samples.config(samples.one_step(), start_from=str(earlier), **changes)
+        with pytest.raises(InputError, match=told):
+            Training(settings, short, tmp_path / "out")
+
+
+def test_a_training_does_not_go_on_with_another_teacher(short, earlier, tmp_path):
+    teacher = tmp_path / "teacher"
+    shutil.copytree(earlier, teacher)
+    stage = samples.unrolled(teacher=str(teacher), iterations=3)
+    settings = samples.config(stage, checkpoint_every={"iterations": 1})
+    assert not Training(settings, short, tmp_path / "out").run(seconds=0.0)
+    other = load_model(teacher)
+    with torch.no_grad():
+        next(other.corrector.network.parameters()).add_(0.1)
+    save_model(other.corrector, teacher, record=other.record)
+    with pytest.raises(InputError, match="teachers"):
+        Training(settings, short, tmp_path / "out", resume=True)
 
 
 def test_a_training_does_not_go_on_from_another_start(short, earlier, tmp_path):

@@ -6,7 +6,7 @@ result = hybrid(state)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -139,8 +139,8 @@ class HybridLayer(WithNodes, nn.Module):
     ----------
     steps : PDLayer
         The coarse step; its ``statuses`` are those of the last call.
-    seen : View
-        What the network was shown in the last call; scenes that failed as at rest.
+    watch : callable or None
+        Called with what the network is shown, a `View`, scenes that failed as at rest.
 
     Raises
     ------
@@ -157,8 +157,6 @@ class HybridLayer(WithNodes, nn.Module):
     the solver in any case.
     """
 
-    seen: View
-
     def __init__(
         self,
         stepper: BatchStepper,
@@ -171,6 +169,7 @@ class HybridLayer(WithNodes, nn.Module):
         super().__init__()
         self._hybrid = BatchParts(stepper, corrector, velocity)
         self.corrector, self.through_solver = corrector, through_solver
+        self.watch: Callable[[View], None] | None = None
         self.steps = PDLayer(stepper, on_failure=on_failure)
 
     def forward(
@@ -221,8 +220,8 @@ class HybridLayer(WithNodes, nn.Module):
         seen, known = self._at_rest_unless(ok, before, previous)
         guess, ok = hybrid.placement == "guess", by_scene(ok)
         proposed = None if guess else torch.where(ok, after.positions, seen.positions)
-        self.seen = hybrid.view(seen, proposed, known)
-        correction = torch.where(at_nodes, self.corrector.of_view(self.seen), 0.0)
+        correction = self._asked(hybrid.view(seen, proposed, known))
+        correction = torch.where(at_nodes, correction, 0.0)
         if guess:
             return after, correction
         moved = hybrid.moved(before, after, correction)
@@ -243,13 +242,11 @@ class HybridLayer(WithNodes, nn.Module):
         known = known if previous is None else [*known, previous]
         sound = self.bodies.sound(torch.cat(known, dim=1))
         seen, given = self._at_rest_unless(sound, before, previous)
-        self.seen = hybrid.view(seen, None, given)
-        correction = self.corrector.of_view(self.seen)
+        correction = self._asked(hybrid.view(seen, None, given))
         answered = sound & self.bodies.sound(correction)
         if not torch.equal(answered, sound):
             seen, given = self._at_rest_unless(answered, before, previous)
-            self.seen = hybrid.view(seen, None, given)
-            correction = self.corrector.of_view(self.seen)
+            correction = self._asked(hybrid.view(seen, None, given))
         at_nodes = self.bodies.by_node(answered)[:, None]
         after = self._step(before, nodes.forces(torch.where(at_nodes, correction, torch.nan)))
         ok = self._converged()
@@ -258,6 +255,11 @@ class HybridLayer(WithNodes, nn.Module):
         _without_derivatives(seen.velocities, ~by_scene(ok))
         _without_derivatives(given, ~at_nodes)
         return after, torch.where(at_nodes, correction, 0.0)
+
+    def _asked(self, view: View) -> Tensor:
+        if self.watch is not None:
+            self.watch(view)
+        return self.corrector.of_view(view)
 
     def _converged(self) -> Tensor:
         """Whether each scene's last step did, (B,) bool."""

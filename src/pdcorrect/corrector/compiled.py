@@ -21,7 +21,6 @@ from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector, without_momentum
 from pdcorrect.corrector.features import View
-from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.fem.decomposition import OPTIONS
 
 Array = NDArray[Any]
@@ -110,20 +109,33 @@ class CompiledCorrector:
 def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
     """Whether `CompiledCorrector` can take the place of a corrector.
 
-    That takes features and output in node frames, one body in float64, and a corrector and a
-    network of these very classes, in single or double precision.
+    That takes features and output in node frames, one body in float64, and a network of the very
+    modules that its configuration leads to, without hooks, in single or double precision.
     """
     config = corrector.config
     known = KNOWN_OF_NODES.issuperset(config.node_features) and KNOWN_OF_EDGES.issuperset(
         config.edge_features
     )
-    plain = type(corrector) is Corrector and type(corrector.network) is MeshGraphNetwork
+    plain = type(corrector) is Corrector and _usual(corrector)
     dtypes = {weight.dtype for weight in corrector.network.parameters()}
     return (
         known and plain and config.output == "frame" and bodies.bodies == 1
         and bodies.rest.dtype == torch.float64 and bodies.rest.device.type == "cpu"
         and len(dtypes) == 1 and dtypes <= {torch.float32, torch.float64}
     )  # fmt: skip
+
+
+def _usual(corrector: Corrector) -> bool:
+    """Whether its network is as it was made, weights apart."""
+    with torch.random.fork_rng(devices=[]):
+        new = Corrector(corrector.config)
+    mine, made = (list(each.network.modules()) for each in (corrector, new))
+    return len(mine) == len(made) and all(
+        type(one) is type(other)
+        and one.extra_repr() == other.extra_repr()
+        and not (one._forward_hooks or one._forward_pre_hooks)
+        for one, other in zip(mine, made, strict=True)
+    )
 
 
 def _contents(corrector: Corrector) -> Iterator[tuple[dict[str, Any], str, Any]]:

@@ -80,6 +80,8 @@ class HybridStepper:
     others; the status then says whether the corrected state has some.  One that converged only
     by fallbacks keeps that status, whether cells are inverted or not: see
     ``smallest_volume_ratio``.
+
+    For one thread at a time: threads take a hybrid each.
     """
 
     def __init__(

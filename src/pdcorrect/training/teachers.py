@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_io import load_model
+from pdcorrect.corrector.model_io import LoadedModel, load_model
 from pdcorrect.errors import InputError
 from pdcorrect.training.config import TrainingConfig
 
@@ -24,17 +24,27 @@ def load_teachers(config: TrainingConfig, device: torch.device) -> dict[str, Cor
     found: dict[str, Corrector] = {}
     for name in dict.fromkeys(s.teacher for s in config.stages if s.teacher is not None):
         model = load_model(name, device)
-        own = model.record.training.get("config")
-        told = own if isinstance(own, dict) else {}
-        taught = {
-            "base": (told.get("base", "plain"), config.base),
-            "velocity": (told.get("velocity", "recomputed"), config.velocity),
-            "placement": (model.corrector.config.placement, "state"),
-        }
-        for key, (there, here) in taught.items():
-            if there != here:
-                raise InputError(
-                    f"teacher = {name!r}: its {key} is {there!r}: expected {here!r}, as here."
-                )
+        check_trained_alike(f"teacher = {name!r}", model, config)
+        placement = model.corrector.config.placement
+        if placement != "state":
+            raise InputError(
+                f"teacher = {name!r}: its placement is {placement!r}: expected 'state'."
+            )
         found[name] = model.corrector.requires_grad_(False)
     return found
+
+
+def check_trained_alike(what: str, model: LoadedModel, config: TrainingConfig) -> None:
+    """Refuse a model whose corrections are of another kind than those of a training.
+
+    Raises
+    ------
+    InputError
+        If it corrects another base model, or its corrected states have other velocities.
+    """
+    own = model.record.training.get("config")
+    told = own if isinstance(own, dict) else {}
+    for key, default in (("base", "plain"), ("velocity", "recomputed")):
+        there, here = told.get(key, default), getattr(config, key)
+        if there != here:
+            raise InputError(f"{what}: its {key} is {there!r}: expected {here!r}, as here.")

@@ -37,7 +37,7 @@ from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recordings import data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
-from pdcorrect.training.teachers import load_teachers
+from pdcorrect.training.teachers import check_trained_alike, load_teachers
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 from pdcorrect.training.world import World
@@ -77,7 +77,7 @@ class Training:
     InputError
         If the folder holds a training and ``resume`` is not set, or it was another one; if
         the data do not have what the configuration wants, or the model to start from is
-        missing or of another architecture.
+        missing, or of another architecture, base or velocity; if a teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -273,6 +273,7 @@ class Training:
                 f"start_from = {self.config.start_from!r}: that model has {told}, unlike "
                 "corrector: expected the same there, in corrector.changes."
             )
+        check_trained_alike(f"start_from = {self.config.start_from!r}", model, self.config)
         return model
 
     def _new_corrector(self, start: LoadedModel | None, fit: bool) -> Corrector:

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.states import in_one
-from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import View
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.training.config import Stage
 from pdcorrect.training.losses import body_losses, mean_of
@@ -181,6 +181,8 @@ def unroll(
     With a teacher its correction of each step is compared with that of the teacher, over d(1).
     """
     layer = group.layer(corrector, stage.through_solver, velocity)
+    views: list[View] = []
+    layer.watch = None if teacher is None else views.append
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
     total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
@@ -200,18 +202,21 @@ def unroll(
         if teacher is None:
             errors, scale = positions - truth, group.errors.after(group.on_device(ages))
         else:
-            errors = torch.where(at, layer.padded(correction - _taught(teacher, layer, stage)), 0.0)
+            errors = torch.where(
+                at, layer.padded(correction - _taught(teacher, views.pop(), stage)), 0.0
+            )
             scale = group.errors.after(1)
         total = total + body_losses(stage.loss, errors, group.sums, group.counts, scale)
+    layer.watch = None
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
 
 
 @torch.no_grad()
-def _taught(teacher: Corrector, layer: HybridLayer, stage: Stage) -> Tensor:
-    """The teacher's corrections (n, 3) of the layer's last step, m."""
+def _taught(teacher: Corrector, view: View, stage: Stage) -> Tensor:
+    """The teacher's corrections (n, 3), m, of what the learner was shown."""
     with network_precision(teacher, stage.amp):
-        return teacher.of_view(layer.seen)
+        return teacher.of_view(view)
 
 
 def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:
