@@ -23,7 +23,7 @@ from pdcorrect.data.import_checks import (
     real_array,
     with_held_nodes,
 )
-from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.hexahedron import (
     VTK_CORNERS,
@@ -40,8 +40,6 @@ from pdcorrect.state import State, Status
 Array = NDArray[Any]
 
 SETTING = "imported"
-BEST = "best"
-"""The run of the best coarse model."""
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
 

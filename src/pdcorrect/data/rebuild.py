@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Shard
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
 
-COARSE = (PLAIN, "best", "total-mass")
+COARSE = (PLAIN, BEST, "total-mass")
 """Runs of models on the coarse mesh, which a corrector can be added to."""
 _FORCE_ERROR = 1e-5
 """Largest difference of loads from the stored ones, over their largest; those are float32."""
@@ -52,7 +52,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
         factor = float(stored.attributes["total_mass"]) / float(plain.mass.sum())
         problem = plain.with_material(density=factor * plain.materials.density)
     elif run != PLAIN:
-        exact = run == "best" or shard.attributes["setting"] == "exact"
+        exact = run == BEST or shard.attributes["setting"] == "exact"
         refine = int(stored.attributes.get("refine", 1))
         problem = discretise(best_coarse(scenes[0]) if exact else scenes[0], refine)
     return [_under(problem, scene) for scene in scenes]

@@ -43,8 +43,8 @@ from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.replacement import part_of_process, replacing
 
-REFERENCE, PLAIN = "reference", "plain"
-"""Runs: the truth, and the coarse model that is to be corrected."""
+REFERENCE, PLAIN, BEST = "reference", "plain", "best"
+"""Runs: the truth, the plain coarse model, and `pdcorrect.best_coarse`'s."""
 SUFFIX = ".h5"
 CONFIG, MANIFEST, NORMALISATION = "config.toml", "manifest.json", "statistics.json"
 """Files of a data set besides those of its meshes."""

@@ -12,7 +12,7 @@ import numpy as np
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
@@ -83,7 +83,7 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
         PLAIN: Model(1, predict=True),
     }
     if exact:
-        found["best"] = Model(1, best=True, predict=True)
+        found[BEST] = Model(1, best=True, predict=True)
     if mesh.split in (TRAINING, VALIDATION):
         return found
     if mesh.refine > 2:
