@@ -57,6 +57,12 @@ def _generate(config: DatasetConfig, workers: Workers) -> int:
     return config.training.simulations
 
 
+def _gpus() -> list[str]:
+    import torch
+
+    return [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+
+
 def main() -> None:
     """Measure and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -76,6 +82,7 @@ def main() -> None:
         "date": time.strftime("%Y-%m-%d"),
         "environment": environment(),
         "device": options.device,
+        "gpus": _gpus() if options.device == "cuda" else [],
         "dataset": config.name,
         "batch": options.batch,
         "runs": rows,
