@@ -32,7 +32,6 @@ from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.statistics import compute_statistics
 from pdcorrect.data.workers import Workers, local_cluster
 from pdcorrect.errors import InputError
 from pdcorrect.progress import FileLines
@@ -162,7 +161,6 @@ def summarise(data: Path, target: Path) -> int:
     """Check a complete data set and write its summary; how much the check found."""
     started = time.monotonic()
     findings = check_dataset(data)
-    compute_statistics(data).save(data)
     info = dataset_info(data)
     make_folder(target)
     write_text(target / "info.json", info.to_json() + "\n")

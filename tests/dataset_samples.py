@@ -62,16 +62,18 @@ def sample_simulation(config, mesh, problem, number):
     rng = np.random.default_rng((*mesh.stream, 99, number))
     motion = smooth_motion(problem, mesh.frames, rng)
     rest = problem.positions
+    scene = draw_scene(config, mesh, number, attempt=1)
+    loaded, h = problem.with_loads(scene.loads), mesh.step
     return Simulation(
-        forces=rng.normal(size=motion[1:].shape),
+        forces=np.stack([loaded.external_forces(k * h, (k + 1) * h) for k in range(mesh.frames)]),
         runs={
-            "reference": sample_run(rest + motion, rng, solver="newton", refine=4),
+            "reference": sample_run(rest + motion, rng, refine=mesh.refine),
             "plain": sample_run(
                 rest + 0.5 * motion, rng, predictions=(rest + 0.8 * motion)[1:], refine=1
             ),
             "best": sample_run(rest + 0.9 * motion, rng, refine=1),
         },
-        scene_toml=draw_scene(config, mesh, number, attempt=1).to_toml(),
+        scene_toml=scene.to_toml(),
         attempt=1,
         rejected=("reference, cells inverted at step 3",),
         seconds={"reference": 4.0, "plain": 0.25, "plain steps": 0.5},

@@ -19,6 +19,7 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import dataset_info
+from pdcorrect.data.manifest import manifest_content
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import (
     MESH,
@@ -510,7 +511,7 @@ def findings(folder, severity="error"):
 
     Besides that samples have no manifest.
     """
-    found = [f for f in check_dataset(folder) if f.message != NO_MANIFEST]
+    found = [f for f in check_dataset(folder, repeat=0) if f.message != NO_MANIFEST]
     assert all(f.severity == severity for f in found)
     return [(f.path.relative_to(folder).as_posix(), f.message) for f in found]
 
@@ -532,7 +533,7 @@ def one(folder, path=FIRST, severity="error"):
 
 def test_a_sound_data_set_has_no_findings(original):
     seen = []
-    (finding,) = check_dataset(original, on_file=seen.append)
+    (finding,) = check_dataset(original, seen.append, 0)
     assert str(finding) == f"warning: {original}: {NO_MANIFEST}"
     names = [path.relative_to(original).as_posix() for path in seen]
     assert names == [
@@ -785,7 +786,7 @@ def test_a_mesh_in_an_extra_split_and_another_is_found(tmp_path):
 
 def test_an_incomplete_data_set_needs_no_manifest(dataset):
     (dataset / "training/mesh-0001.h5").unlink()
-    (finding,) = check_dataset(dataset)
+    (finding,) = check_dataset(dataset, repeat=0)
     assert finding.message == "missing: config.toml asks for it"
 
 
@@ -844,7 +845,8 @@ def test_files_of_different_code_or_devices_are_pointed_out(dataset, what, value
 def test_a_content_other_than_the_manifest_has_is_found(dataset):
     names = [plan.name for plan in make_plan(sample_config())]
     hashes = {name: stored_hashes(dataset / f"{name}.h5")[1] for name in names}
-    (dataset / "manifest.json").write_text(json.dumps({"files": hashes}))
+    content = manifest_content(sample_config(), hashes)
+    (dataset / "manifest.json").write_text(json.dumps(content))
     assert findings(dataset) == []
     changed(dataset / FIRST, lambda s: with_simulation(s, 1, scene_toml="another"))
     assert one(dataset) == "its content is not that of which manifest.json has the hash"
@@ -1059,16 +1061,17 @@ def test_histograms_count_every_simulation(view, original, tmp_path, monkeypatch
 
 
 def test_check_ends_with_1_if_there_are_errors(program, dataset):
-    status, out, _ = program("dataset", "check", dataset)
+    check = ("dataset", "check", "--repeat", 0)  # their motions are made up
+    status, out, _ = program(*check, dataset)
     assert (status, out) == (
         0, f"warning: {dataset}: {NO_MANIFEST}\n4 files, 0 errors, 1 warnings\n"
     )  # fmt: skip
     (dataset / "notes.txt").write_text("")
-    status, out, _ = program("dataset", "check", dataset)
+    status, out, _ = program(*check, dataset)
     assert status == 0
     assert "4 files, 0 errors, 2 warnings" in out
     (dataset / FIRST).write_bytes(b"")
-    status, out, _ = program("dataset", "check", dataset)
+    status, out, _ = program(*check, dataset)
     assert status == 1
     assert f"error: {dataset / FIRST}: the file is empty" in out
     assert "4 files, 1 errors, 2 warnings" in out

@@ -148,6 +148,8 @@ ORDER = [
     "data.engines",
     "data.batch_engine",
     "data.simulate",
+    "data.manifest",
+    "data.check_motion",
     "data.check",
     "data.measuring",
     "data.info",

@@ -72,8 +72,16 @@ def generate(
 
 
 @app.command()
-def check(folder: Folder) -> None:
+def check(
+    folder: Folder,
+    repeat: Annotated[
+        int,
+        typer.Option(min=0, help="Steps of each simulation's coarse models to take again."),
+    ] = 1,
+) -> None:
     """Read every file, compare it with config.toml and the others, print what is wrong.
+
+    Some steps of the coarse models are taken again, if they are generated ones.
 
     The exit status is 1 if there are errors; warnings do not count.
     """
@@ -82,7 +90,7 @@ def check(folder: Folder) -> None:
 
     count = len(all_shards(folder))
     with _progress("checking", count) as advance:
-        findings = check_dataset(folder, on_file=advance)
+        findings = check_dataset(folder, advance, repeat)
     for finding in findings:
         typer.echo(str(finding))
     errors = sum(finding.severity == "error" for finding in findings)

@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from pdcorrect.data.check_motion import load_faults, model_faults, step_faults, volume_faults
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards, shard_number
+from pdcorrect.data.manifest import manifest_content
 from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
 from pdcorrect.data.schema import (
     CONFIG,
@@ -27,6 +29,7 @@ from pdcorrect.data.schema import (
 )
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.data.simulate import models
+from pdcorrect.data.statistics import load_statistics
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import HexMesh
@@ -62,9 +65,12 @@ class Finding:
 
 
 def check_dataset(
-    folder: str | Path, on_file: Callable[[Path], None] | None = None
+    folder: str | Path, on_file: Callable[[Path], None] | None = None, repeat: int = 1
 ) -> list[Finding]:
     """Read everything in a data set's folder and report what is wrong.
+
+    Of a generated one forces are computed again, too, and some steps of the coarse models taken
+    again, so that what files say of themselves is not all that is known of them.
 
     Parameters
     ----------
@@ -72,6 +78,9 @@ def check_dataset(
         With ``config.toml`` and a folder of files for each split.
     on_file : callable, optional
         Called with each mesh's file after it was checked.
+    repeat : int
+        Steps of each coarse run, and single steps from the reference, that are taken again in
+        each simulation of a generated data set.
 
     Returns
     -------
@@ -82,14 +91,17 @@ def check_dataset(
     Raises
     ------
     InputError
-        If there is no such folder.
+        If there is no such folder, or ``repeat`` is negative.
     """
     folder = Path(folder)
+    if repeat < 0:
+        raise InputError(f"repeat = {repeat}: expected 0 or more.")
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder: expected that of a data set.")
-    check = _Check(folder)
+    check = _Check(folder, repeat)
     check.load_config()
     check.load_manifest()
+    check.load_statistics()
     paths = all_shards(folder)
     check.files(paths)
     for path in paths:
@@ -120,6 +132,7 @@ class _Check:
     """
 
     folder: Path
+    repeat: int
     findings: list[Finding] = field(default_factory=list)
     config: DatasetConfig | None = None
     plans: dict[Path, MeshPlan] | None = None
@@ -165,9 +178,24 @@ class _Check:
         if not path.exists():
             return
         try:
-            self.hashes = dict(json.loads(path.read_text(encoding="utf-8"))["files"])
+            content = json.loads(path.read_text(encoding="utf-8"))
+            self.hashes = dict(content["files"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             self.error(path, "cannot be read: expected the hashes of all files, as JSON")
+            return
+        if self.config is not None:
+            for key, value in manifest_content(self.config, self.hashes).items():
+                if content.get(key) != value:
+                    self.error(path, f"its {key} is not that of {CONFIG} and of the files it lists")
+
+    def load_statistics(self) -> None:
+        """Compare the statistics, if there are some, with the files of the training split."""
+        if not (self.folder / NORMALISATION).exists():
+            return
+        try:
+            load_statistics(self.folder)
+        except InputError as error:
+            self.error(self.folder / NORMALISATION, _reason(self.folder / NORMALISATION, error))
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""
@@ -239,7 +267,11 @@ class _Check:
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"
         if plan is not None and self.config is not None:
-            yield from _plan_faults(self.config, plan, shard)
+            found = list(_plan_faults(self.config, plan, shard))
+            yield from found
+            if not found and self.repeat:
+                limit = float(shard.attributes["tolerance"]) * _cell_size(shard)
+                yield from step_faults(path, shard, self.repeat, limit)
 
     def _origin(self, path: Path, shard: Shard) -> None:
         """Changes of the code and of the device between files, where they tell."""
@@ -307,10 +339,7 @@ def _simulation_faults(shard: Shard, simulation: Simulation, cell: float) -> Ite
     reference = simulation.runs.get(REFERENCE)
     if reference is None or reference.positions is None:
         yield f"there is no rollout {REFERENCE!r}"
-    else:
-        ratios = reference.statistics.get("smallest_volume_ratios", np.ones(1))
-        if ratios.min() <= 0:
-            yield f"{REFERENCE}: det F is {ratios.min():.3g} after step {ratios.argmin() + 1}"
+    yield from volume_faults(shard, simulation)
     if len(simulation.rejected) != simulation.attempt:
         yield (
             f"attempt is {simulation.attempt}, with {len(simulation.rejected)} reasons of "
@@ -378,19 +407,26 @@ def _plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterato
         ("poisson", problem.materials.poisson),
         ("density", problem.materials.density),
     )
+    alike = True
     for name, wanted in arrays:
         found = getattr(shard, name)
         if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
+            alike = False
             yield f"its {name} is not what config.toml draws"
     for k, simulation in enumerate(shard.simulations):
         if simulation.steps != plan.frames:
             yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
-        if simulation.scene_toml != draw_scene(config, plan, k, simulation.attempt).to_toml():
+        scene = draw_scene(config, plan, k, simulation.attempt)
+        if simulation.scene_toml != scene.to_toml():
             yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
+        if alike and simulation.steps == plan.frames:
+            for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
+                yield f"simulation {k:04d}: {message}"
         named = {n for n, model in models(config, plan).items() if k == 0 or not model.sample}
         missing = sorted(named - set(simulation.runs))
         if missing:
             yield f"simulation {k:04d} has no run {missing[0]!r}"
+    yield from model_faults(config, plan, shard)
 
 
 # --- comparison of files -------------------------------------------------------------------

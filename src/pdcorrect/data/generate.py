@@ -6,7 +6,7 @@ is whole, so an interrupted generation is continued by starting it again.
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,13 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.config import TRAINING, DatasetConfig
 from pdcorrect.data.folder import all_shards
+from pdcorrect.data.manifest import manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.simulate import work_per_node
+from pdcorrect.data.statistics import compute_statistics, load_statistics
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.replacement import clear_parts, make_folder, write_text
@@ -103,7 +105,8 @@ def generate(
     Returns
     -------
     Generated
-        True if all that was asked for is there.  Once that is the whole data set,
+        True if all that was asked for is there.  Once that is the whole training split,
+        ``statistics.json`` has its normalisation; once it is the whole data set,
         ``manifest.json`` lists the hashes of its files.
 
     Raises
@@ -139,7 +142,10 @@ def generate(
     for plan in plans:
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
-    _write_manifest(config, folder, hashes)
+    if all(hashes[plan.name] for plan in plans if plan.split == TRAINING):
+        _write_statistics(folder)
+    if None not in hashes.values():
+        _write_manifest(config, folder, hashes)
     return _generated(plans, chosen, hashes)
 
 
@@ -255,14 +261,13 @@ def _work(config: DatasetConfig, plan: MeshPlan) -> float:
 
 
 def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:
-    """List the files' hashes if all are there."""
-    if None in hashes.values():
+    """List the files' hashes."""
+    write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")
+
+
+def _write_statistics(folder: Path) -> None:
+    """Those of the training split, unless they are there."""
+    with contextlib.suppress(InputError):
+        load_statistics(folder)
         return
-    whole = hashlib.sha256(json.dumps(hashes, sort_keys=True).encode()).hexdigest()
-    content = {
-        "dataset": config.name,
-        "config_hash": config.hash(),
-        "content_hash": whole,
-        "files": dict(hashes),
-    }
-    write_text(folder / MANIFEST, json.dumps(content, indent=1) + "\n")
+    compute_statistics(folder).save(folder)

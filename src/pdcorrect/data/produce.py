@@ -33,7 +33,7 @@ def produce(
     engines = make_engines(config, device)
     with one_thread():
         shards = simulate(config, plans, engines)
-    provenance = _provenance(device)
+    provenance = _provenance(config, device)
     for plan, shard in zip(plans, shards, strict=True):
         path = shard_path(folder, plan)
         write_shard(path, replace(shard, provenance=provenance), config.dtype, overwrite=True)
@@ -74,7 +74,7 @@ def one_thread() -> Iterator[None]:
         numba.set_num_threads(before)
 
 
-def _provenance(device: str) -> dict[str, str]:
+def _provenance(config: DatasetConfig, device: str) -> dict[str, str]:
     date = time.strftime("%Y-%m-%d", time.gmtime())
     return {
         **environment(),
@@ -82,6 +82,7 @@ def _provenance(device: str) -> dict[str, str]:
         "threads": "1",
         "device": _device_name(device),
         "date": date,
+        "configuration": config.to_toml(),
     }
 
 

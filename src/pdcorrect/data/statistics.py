@@ -202,7 +202,7 @@ def load_statistics(folder: str | Path) -> Statistics:
     more = f" (and {len(names) - 1} more)" if len(names) > 1 else ""
     changed = f"{names[0]}{more}" if names else "the configuration"
     raise InputError(
-        f"{path} is stale: {changed} has changed since: expected "
+        f"{path}: stale: {changed} has changed since: expected "
         "compute_statistics(folder).save(folder)."
     )
 
