@@ -43,13 +43,20 @@ def compare(path: Path) -> list[dict[str, Any]]:
             if s is not None
         ]
         moved = max(float(np.linalg.norm(s - s[0], axis=-1).max()) for s in stored if s is not None)
-        rows.append({
-            "dataset": shard.attributes["dataset"], "run": name, "simulations": len(jobs),
-            "steps": steps, "nodes": len(problems[0].positions), "made_on":
-            shard.provenance.get("device"), "largest_distance_m": max(away),
-            "largest_displacement_m": moved, "failures": [f.failure for f in found if f.failure], "seconds": time.perf_counter() - started,
-        })  # fmt: skip
-        print(json.dumps(rows[-1]), flush=True)
+        row = {
+            "dataset": shard.attributes["dataset"],
+            "run": name,
+            "simulations": len(jobs),
+            "steps": steps,
+            "nodes": len(problems[0].positions),
+            "made_on": shard.provenance.get("device"),
+            "largest_distance_m": max(away),
+            "largest_displacement_m": moved,
+            "failures": [steps.failure for steps in found if steps.failure],
+            "seconds": time.perf_counter() - started,
+        }
+        rows.append(row)
+        print(json.dumps(row), flush=True)
     return rows
 
 
