@@ -35,6 +35,8 @@ class ShardHeader:
         T of each simulation.
     runs : tuple of (names of runs with positions, names of runs with predictions)
         For each simulation.
+    scenes : tuple of bool
+        Whether each simulation has its scene.
     time_step : float
         s.
     config_hash, content_hash : str
@@ -46,6 +48,7 @@ class ShardHeader:
     cells: int
     steps: tuple[int, ...]
     runs: tuple[tuple[frozenset[str], frozenset[str]], ...]
+    scenes: tuple[bool, ...]
     time_step: float
     config_hash: str
     content_hash: str
@@ -126,6 +129,7 @@ def read_header(path: Path) -> ShardHeader:
             cells=len(file[MESH["cells"][0]]),
             steps=tuple(len(group["forces"]) for group in groups),
             runs=tuple((_with(g, "positions"), _with(g, "predictions")) for g in groups),
+            scenes=tuple(str(group.attrs["scene"]) != "" for group in groups),
             time_step=float(file.attrs["time_step"]),
             config_hash=str(file.attrs["config_hash"]),
             content_hash=str(file.attrs[HASH]),
