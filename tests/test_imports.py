@@ -129,6 +129,7 @@ ORDER = [
     "data.plan",
     "data.seal",
     "data.schema",
+    "data.hdf5_checks",
     "data.shard_reader",
     "data.damage",
     "data.folder",

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.graph import mesh_edges, node_means, velocities
+from pdcorrect.data.hdf5_checks import RefusalError, words
 from pdcorrect.data.schema import HASH, MESH, REFERENCE
 from pdcorrect.data.shard_reader import opened
 
@@ -185,11 +186,19 @@ def _mesh(file: h5py.File) -> MeshArrays:
 def _motion(
     group: h5py.Group, time_step: float, predictions: Sequence[str], rollouts: Sequence[str]
 ) -> MotionArrays:
-    positions = group[f"runs/{REFERENCE}/positions"][()]
+    positions = _of_run(group, REFERENCE, "positions")
     return MotionArrays(
         positions=positions,
         velocities=velocities(positions[:-1], time_step),
         forces=group["forces"][()],
-        predictions={name: group[f"runs/{name}/predictions"][()] for name in predictions},
-        rollouts={name: group[f"runs/{name}/positions"][()] for name in rollouts},
+        predictions={name: _of_run(group, name, "predictions") for name in predictions},
+        rollouts={name: _of_run(group, name, "positions") for name in rollouts},
     )
+
+
+def _of_run(simulation: h5py.Group, run: str, name: str) -> Array:
+    """Positions or predictions of a run."""
+    place = f"runs/{run}/{name}"
+    if place not in simulation:
+        raise RefusalError(f"{words(f'{simulation.name}/{place}'.lstrip('/'))} is missing")
+    return np.asarray(simulation[place][()])
