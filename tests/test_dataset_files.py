@@ -572,7 +572,9 @@ ODD = {
     "rows": (
         of_dtype("mesh/points", h5py.vlen_dtype("f8")), "mesh/points has type rows of any length"
     ),
-    "records": (of_dtype("mesh/cells", [("a", "f4"), ("b", "f4")]), "mesh/cells has type [('a', '<f4'), ("),
+    "records": (
+        of_dtype("mesh/cells", [("a", "f4"), ("b", "f4")]), "mesh/cells has type [('a', '<f4'), ("
+    ),
     "a reference among attributes": (
         references_in("/", "number"),
         "number of the file is array([<HDF5 object reference>, <HDF5 object reference>",

@@ -129,6 +129,7 @@ ORDER = [
     "data.plan",
     "data.seal",
     "data.schema",
+    "data.scene_mesh",
     "data.hdf5_checks",
     "data.shard_reader",
     "data.damage",

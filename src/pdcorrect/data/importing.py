@@ -23,6 +23,7 @@ from pdcorrect.data.import_checks import (
     real_array,
     with_held_nodes,
 )
+from pdcorrect.data.scene_mesh import portable
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.hexahedron import (
@@ -158,7 +159,8 @@ def shard_from_arrays(
     )
     _check_alike(simulations)
     if scene is not None:
-        simulations = tuple(replace(one, scene_toml=scene.to_toml()) for one in simulations)
+        text = portable(scene).to_toml()
+        simulations = tuple(replace(one, scene_toml=text) for one in simulations)
     return Shard(
         attributes={
             "dataset": dataset, "split": split, "number": number, "setting": SETTING,

@@ -13,11 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.scene_mesh import discretise_stored
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
 from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
@@ -40,6 +41,8 @@ class Recording:
     scene_toml : str
     points : (N, 3) float64
         Rest positions, m.
+    cells : (C, 8)
+        VTK order.
     reference, plain : (T+1, N, 3)
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
@@ -53,6 +56,7 @@ class Recording:
     number: int
     scene_toml: str
     points: Array
+    cells: Array
     reference: Array
     plain: Array
     one_step: float
@@ -124,7 +128,8 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
         scene = Scene.from_toml(recording.scene_toml, recording.name)
         key = recording.split, recording.mesh
         if key not in known:
-            known[key] = discretise(best_coarse(scene) if base == "best" else scene)
+            model = best_coarse(scene) if base == "best" else scene
+            known[key] = discretise_stored(model, recording.points, recording.cells)
             _check_mesh(recording, known[key])
         problems.append(known[key].with_loads(scene.loads))
     return problems
@@ -169,6 +174,7 @@ def _recording(
         number=number,
         scene_toml=simulation.scene_toml,
         points=shard.points,
+        cells=shard.cells,
         reference=reference,
         plain=plain,
         one_step=_mean_square(np.asarray(simulation.runs[base].predictions), reference[1:]),
