@@ -150,6 +150,8 @@ ORDER = [
     "data.engines",
     "data.batch_engine",
     "data.simulate",
+    "data.check_file",
+    "data.twins",
     "data.check",
     "data.measuring",
     "data.info",
