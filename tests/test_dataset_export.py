@@ -476,6 +476,11 @@ def test_a_time_step_that_is_nearly_the_scenes_is_the_scenes():
         ({"clamps": []}, "scene: its free is not the one given"),
         ({"time": {"step": 0.01, "frames": 3, "integrator": "bdf2"}}, "integrator is 'bdf2'"),
         (
+            {"solver": {"element": "hex27"}},
+            "scene: its solver.element is 'hex27', .* one of hex8, hex8-mean, hex8-bubble, "
+            "hex8-bubble-mean",
+        ),
+        (
             {"clamps": [{"region": {"plane": "x", "at": 0.0},
                          "motion": {"times": [0.0, 1.0],
                                     "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]}}]},
@@ -749,6 +754,31 @@ def test_a_fine_run_is_not_taken_for_the_coarse_one(runs):
 def test_a_reference_that_its_scene_does_not_describe_is_refused(runs, change, words):
     with pytest.raises(InputError, match=words):
         shard_from_trajectories(change(runs[0]))
+
+
+def quadratic_run(refine):
+    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}, solver={"element": "hex27"})
+    return pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine=refine)))
+
+
+def test_a_coarse_model_with_nodes_between_the_corners_is_refused(runs):
+    quadratic = quadratic_run(1)
+    for given, words in (
+        ((quadratic,), "the reference, without a coarse run: its solver.element is 'hex27'"),
+        ((runs[0], quadratic), "the coarse run: its solver.element is 'hex27'.*one of hex8, "),
+    ):
+        with pytest.raises(InputError, match=words):
+            shard_from_trajectories(*given)
+
+
+@pytest.mark.parametrize("refine", [1, 2])
+def test_a_reference_may_have_nodes_between_the_corners(runs, refine):
+    reference, coarse = quadratic_run(refine), runs[1]
+    (found,) = shard_from_trajectories(reference, coarse).simulations
+    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}))
+    positions = found.runs["reference"].positions
+    np.testing.assert_array_equal(positions, restrict(reference, problem).positions)
+    np.testing.assert_array_equal(positions[0], problem.positions)
 
 
 def test_the_coarse_runs_scene_is_the_coarse_models(runs):

@@ -30,6 +30,7 @@ from pdcorrect.data.schema import (
     content_of,
     write_shard,
 )
+from pdcorrect.data.shard_arrays import read_arrays, read_header
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.io.trajectory import save_trajectory
@@ -442,10 +443,211 @@ def test_contradictions_within_a_file_are_named(shard, saved, tmp_path):
         (lambda file: file.move("cost/0001", "cost/0005"), "cost/0001 is missing"),
         (lambda file: file.__setitem__("extra", np.zeros(3)), "extra is unknown"),
         (replaced("mesh", np.zeros(3)), "mesh is not a group"),
-        (lambda f: replaced("mesh/mass", h5py.SoftLink("/nowhere"))(f), "mesh/mass is missing"),
+        (
+            lambda f: replaced("mesh/mass", h5py.SoftLink("/nowhere"))(f),
+            "the link mesh/mass leads nowhere",
+        ),
     ):
         edited(saved, path, edit)
         assert words in refusal(path), words
+
+
+def referring(place, dangling):
+    """A dataset becomes object references, to the mesh or to what is no longer there."""
+
+    def edit(file):
+        shape, target = file[place].shape, file.create_group("gone")
+        reference = (target if dangling else file["mesh"]).ref
+        del file[place]
+        file.create_dataset(place, shape, h5py.ref_dtype)[...] = reference
+        del file["gone"]
+
+    return edit
+
+
+def regions(place):
+    def edit(file):
+        shape, reference = file[place].shape, file[place].regionref[...]
+        del file[place]
+        file.create_dataset(place, shape, h5py.regionref_dtype)[...] = reference
+
+    return edit
+
+
+def of_dtype(place, dtype, shape=None):
+    def edit(file):
+        found = file[place].shape if shape is None else shape
+        del file[place]
+        file.create_dataset(place, found, dtype)
+
+    return edit
+
+
+def attribute(place, name, value, dtype=None):
+    return lambda file: file[place].attrs.create(name, value, dtype=dtype)
+
+
+def references_in(place, name):
+    """An attribute becomes three dangling references, which NumPy shows on several lines."""
+
+    def edit(file):
+        gone = file.create_group("gone").ref
+        values = np.array([gone] * 3, dtype=h5py.ref_dtype)
+        file[place].attrs.create(name, values, dtype=h5py.ref_dtype)
+        del file["gone"]
+
+    return edit
+
+
+def nameless(place):
+    """A name that is not UTF-8, of a group in a group."""
+    return lambda file: h5py.h5g.create(file[place].id, b"\xff\xfe")
+
+
+def nameless_attribute(place):
+    def edit(file):
+        space = h5py.h5s.create(h5py.h5s.SCALAR)
+        h5py.h5a.create(file[place].id, b"\xff\xfe", h5py.h5t.NATIVE_INT32, space).write(
+            np.array(3, dtype="i4")
+        )
+
+    return edit
+
+
+def every(*edits):
+    def edit(file):
+        for one in edits:
+            one(file)
+
+    return edit
+
+
+FORCES, FORCES_TOLD = "simulations/0000/forces", "forces of simulation 0000"
+RUN = "simulations/0000/runs/reference"
+ODD = {
+    "dangling references": (
+        referring(FORCES, dangling=True), f"{FORCES_TOLD} has type reference: expected float32"
+    ),
+    "references": (
+        referring("mesh/cells", dangling=False), "mesh/cells has type reference: expected int32"
+    ),
+    "regions": (regions("mesh/points"), "mesh/points has type reference: expected float64"),
+    "several dangling references": (
+        every(*(referring(f"mesh/{name}", dangling=True) for name in ("points", "cells", "mass"))),
+        "mesh/points has type reference",
+    ),
+    "a dangling link": (
+        replaced(FORCES, h5py.SoftLink("/nowhere/x")), f"the link {FORCES_TOLD} leads nowhere"
+    ),
+    "several dangling links": (
+        every(
+            replaced("mesh/points", h5py.SoftLink("/nowhere/x")),
+            replaced(f"{RUN}/positions", h5py.SoftLink("/nowhere/y")),
+            replaced("cost", h5py.SoftLink("/nowhere/z")),
+        ),
+        "links lead nowhere: cost, mesh/points, runs/reference/positions of simulation 0000.",
+    ),
+    "very many dangling links": (
+        lambda file: [
+            replaced(place, h5py.SoftLink("/nowhere"))(file) for place, _, _ in MESH.values()
+        ],
+        "material/poisson, material/young, mesh/cells, mesh/free and 2 more.",
+    ),
+    "a link to itself": (
+        replaced("mesh", h5py.SoftLink("/mesh")), "the link mesh leads nowhere"
+    ),
+    "a link to another file": (
+        replaced(RUN, h5py.ExternalLink("other.h5", "/run")),
+        "runs/reference of simulation 0000 is a link to another file, 'other.h5': expected all",
+    ),
+    "a type in place of an array": (
+        replaced(FORCES, np.dtype("f4")), f"{FORCES_TOLD} is not a dataset"
+    ),
+    "a type in place of a group": (
+        replaced(RUN, np.dtype("f4")), "runs/reference of simulation 0000 is not a group"
+    ),
+    "nothing": (replaced("mesh/points", h5py.Empty("f8")), "mesh/points has shape None: expected"),
+    "texts": (
+        of_dtype("mesh/points", h5py.string_dtype()), "mesh/points has type text: expected float64"
+    ),
+    "rows": (
+        of_dtype("mesh/points", h5py.vlen_dtype("f8")), "mesh/points has type rows of any length"
+    ),
+    "records": (
+        of_dtype("mesh/cells", [("a", "f4"), ("b", "f4")]), "mesh/cells has type [('a', '<f4'), ("
+    ),
+    "a reference among attributes": (
+        references_in("/", "number"),
+        "number of the file is array([<HDF5 object reference>, <HDF5 object reference>",
+    ),
+    "references among texts": (
+        references_in("simulations/0000", "rejected"),
+        "rejected of simulation 0000 is array([<HDF5 object reference>",
+    ),
+    "an empty attribute": (
+        attribute("/", "time_step", h5py.Empty("f4")), "time_step of the file is Empty("
+    ),
+    "no reasons": (
+        lambda file: file["simulations/0001"].attrs.__delitem__("rejected"),
+        "the attribute rejected of simulation 0001 is missing",
+    ),
+    "bytes": (
+        attribute("/", "dataset", np.bytes_(b"set")), "dataset of the file is np.bytes_(b'set')"
+    ),
+    "a name of two lines": (
+        lambda file: file.create_group("mesh/a\nb"), "mesh/a b is unknown in version 1"
+    ),
+    "a group without a name": (
+        nameless("simulations/0000/runs"),
+        "runs of simulation 0000 holds the name b'\\xff\\xfe', which is no text",
+    ),
+    "an attribute without a name": (
+        nameless_attribute("simulations/0000"),
+        "simulation 0000 has the name b'\\xff\\xfe', which is no text",
+    ),
+    "a group among costs": (
+        lambda file: file.create_group("cost/0001/more"), "cost/0001/more is unknown"
+    ),
+    "a group in the provenance": (
+        lambda file: file.create_group("provenance/more"), "provenance/more is unknown"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_what_hdf5_may_hold_instead_is_named_with_its_place(saved, tmp_path, kind):
+    edit, words = ODD[kind]
+    path = tmp_path / "training" / "mesh-0000.h5"
+    path.parent.mkdir()
+    edited(saved, path, edit)
+    for verify in (True, False):
+        assert words in refusal(path, verify=verify)
+    (found,) = check_dataset(tmp_path)[1:]  # the first says that there is no configuration
+    assert found.path == path
+    assert words.removesuffix(".") in found.message
+    assert len(str(found).splitlines()) == 1
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_readers_of_parts_say_the_same_where_they_fail(saved, tmp_path, kind):
+    edit, words = ODD[kind]
+    path = tmp_path / "shard.h5"
+    edited(saved, path, edit)
+    for read in (read_header, lambda path: read_arrays(path, ("plain",), ("plain",))):
+        try:
+            read(path)
+        except FileFormatError as error:
+            assert str(error).startswith(f"{path}: ")
+            assert words in str(error)
+
+
+def test_a_run_that_is_not_there_is_named_by_the_reader_of_arrays(saved, tmp_path):
+    path = tmp_path / "shard.h5"
+    edited(saved, path, lambda file: file.move(RUN, f"{RUN}s"))
+    with pytest.raises(
+        FileFormatError, match="runs/reference/positions of simulation 0000 is missing"
+    ):
+        read_arrays(path)
 
 
 def test_damaged_chunks_are_named_without_the_checksum(shard, saved, tmp_path):

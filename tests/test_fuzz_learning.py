@@ -134,6 +134,8 @@ def poked(values, new):
     return out.reshape(values.shape)
 
 
+NOWHERE, ELSEWHERE = h5py.SoftLink("/nowhere"), h5py.ExternalLink("nowhere.h5", "/mesh")
+
 KINDS = {
     "delete": lambda file, place, other, attribute, new: file.__delitem__(place),
     "rename": lambda file, place, other, attribute, new: file.move(place, place + "x"),
@@ -149,6 +151,14 @@ KINDS = {
     "value": lambda f, place, other, a, new: exchange(f, place, lambda v: poked(v, new)),
     "scalar": lambda file, place, other, attribute, new: exchange(file, place, lambda v: new),
     "forget": lambda file, place, other, attribute, new: file[attribute[0]].attrs.pop(attribute[1]),
+    "nowhere": lambda f, place, *_: (f.__delitem__(place), f.__setitem__(place, NOWHERE)),
+    "elsewhere": lambda f, place, *_: (f.__delitem__(place), f.__setitem__(place, ELSEWHERE)),
+    "references": lambda f, place, *_: exchange(
+        f, place, lambda v: np.full(v.shape, f["mesh"].ref, h5py.ref_dtype)
+    ),
+    "reference": lambda f, p, o, attribute, new: f[attribute[0]].attrs.create(
+        attribute[1], f["mesh"].ref, dtype=h5py.ref_dtype
+    ),
     "attribute": lambda f, p, o, attribute, new: f[attribute[0]].attrs.create(attribute[1], new),
 }
 
@@ -172,6 +182,8 @@ def test_edited_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
                 found = read(path)
             except FileFormatError as error:
                 assert str(error).startswith(f"{path}: ")
+                assert len(str(error).splitlines()) == 1
+                assert "HDF5 cannot read it" not in str(error)  # for it can: the reason is known
             else:
                 if read is read_shard:
                     assert_same_content(found, shard)

@@ -82,10 +82,20 @@ def _host() -> str:
 
 
 def _alive(process: int) -> bool:
+    """Whether a process of this machine can still write."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    return True
+    return not _awaited(process)
+
+
+def _awaited(process: int) -> bool:
+    """Whether a process has ended and only its number is kept, for a parent to ask (Linux)."""
+    try:
+        text = Path(f"/proc/{process}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return False
+    return text.rpartition(")")[2].split()[:1] in (["Z"], ["X"])  # after the name in brackets

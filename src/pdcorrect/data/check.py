@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -11,36 +10,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.check_motion import load_faults, model_faults, step_faults, volume_faults
+from pdcorrect.data.check_file import cell_size, file_faults, plan_faults
+from pdcorrect.data.check_motion import step_faults
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards, shard_number
 from pdcorrect.data.manifest import manifest_content
-from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
-from pdcorrect.data.schema import (
-    CONFIG,
-    MANIFEST,
-    NORMALISATION,
-    REFERENCE,
-    SUFFIX,
-    Array,
-    Run,
-    Shard,
-    Simulation,
-)
+from pdcorrect.data.plan import MeshPlan, make_plan
+from pdcorrect.data.schema import CONFIG, MANIFEST, NORMALISATION, SUFFIX, Shard
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
-from pdcorrect.data.simulate import models
 from pdcorrect.data.statistics import load_statistics
+from pdcorrect.data.twins import body_digests, load_digest
 from pdcorrect.errors import InputError, MeshError
-from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import HexMesh
-from pdcorrect.fem.problem import discretise
 
 Severity = Literal["error", "warning"]
 _OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
-_DIGITS = 6
-"""Decimals, in cells, to which meshes are compared."""
-_SLACK = 1e-6
-"""Relative, for tolerances of numbers that are stored as float32."""
 
 
 @dataclass(frozen=True)
@@ -190,12 +174,13 @@ class _Check:
 
     def load_statistics(self) -> None:
         """Compare the statistics, if there are some, with the files of the training split."""
-        if not (self.folder / NORMALISATION).exists():
+        path = self.folder / NORMALISATION
+        if not path.exists():
             return
         try:
             load_statistics(self.folder)
         except InputError as error:
-            self.error(self.folder / NORMALISATION, _reason(self.folder / NORMALISATION, error))
+            self.error(path, _reason(path, error))
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""
@@ -239,7 +224,7 @@ class _Check:
         except MeshError as error:
             self.error(path, f"its mesh cannot be used: {str(error).removesuffix('.')}")
             return
-        for message in _faults(shard):
+        for message in file_faults(shard):
             self.error(path, message)
         for message in self._config_faults(path, shard):
             self.error(path, message)
@@ -267,10 +252,10 @@ class _Check:
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"
         if plan is not None and self.config is not None:
-            found = list(_plan_faults(self.config, plan, shard))
+            found = list(plan_faults(self.config, plan, shard))
             yield from found
             if not found and self.repeat:
-                limit = float(shard.attributes["tolerance"]) * _cell_size(shard)
+                limit = float(shard.attributes["tolerance"]) * cell_size(shard)
                 yield from step_faults(path, shard, self.repeat, limit)
 
     def _origin(self, path: Path, shard: Shard) -> None:
@@ -287,7 +272,7 @@ class _Check:
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
-        shape, body = _digests(shard)
+        shape, body = body_digests(shard)
         first, twin = self.meshes.setdefault(shape, path), self.bodies.setdefault(body, path)
         if first.parent != path.parent and self.plans is None:
             self.warn(
@@ -300,7 +285,7 @@ class _Check:
         elif twin != path:
             self.error(path, f"its mesh and material are those of {self._short(twin)}")
         for k, simulation in enumerate(shard.simulations):
-            key = shape + _digest(_cause(simulation))
+            key = shape + load_digest(simulation)
             here = f"simulation {k:04d} of {self._short(path)}"
             before = self.forces.setdefault(key, here)
             if before != here:
@@ -312,154 +297,3 @@ class _Check:
 
 def _reason(path: Path, error: InputError) -> str:
     return str(error).removeprefix(f"{path}: ").removesuffix(".")
-
-
-# --- one file ----------------------------------------------------------------------------
-
-
-def _faults(shard: Shard) -> Iterator[str]:
-    """What is wrong within one file whose mesh can be used."""
-    for name in ("young", "density", "mass"):
-        if getattr(shard, name).min() <= 0:
-            yield f"{name} is {getattr(shard, name).min():g} somewhere: expected more than 0"
-    cell = _cell_size(shard)
-    for k, simulation in enumerate(shard.simulations):
-        for message in _simulation_faults(shard, simulation, cell):
-            yield f"simulation {k:04d}: {message}"
-    yield from _unlike_runs(shard)
-
-
-def _cell_size(shard: Shard) -> float:
-    """Cube root of the mean cell volume, m."""
-    volumes = jacobians(shard.points, shard.cells.astype(np.int64), gauss_points(2)).mean(axis=1)
-    return float(np.cbrt(volumes.mean()))
-
-
-def _simulation_faults(shard: Shard, simulation: Simulation, cell: float) -> Iterator[str]:
-    reference = simulation.runs.get(REFERENCE)
-    if reference is None or reference.positions is None:
-        yield f"there is no rollout {REFERENCE!r}"
-    yield from volume_faults(shard, simulation)
-    if len(simulation.rejected) != simulation.attempt:
-        yield (
-            f"attempt is {simulation.attempt}, with {len(simulation.rejected)} reasons of "
-            "rejected draws: expected as many"
-        )
-    for name, run in simulation.runs.items():
-        for message in _run_faults(shard, run, cell):
-            yield f"{name}: {message}"
-
-
-def _run_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
-    errors = run.statistics.get("error_estimates")
-    limit = float(shard.attributes["tolerance"]) * cell
-    if errors is not None and errors.max() > limit * (1 + _SLACK):
-        yield (
-            f"the solver's error estimate is {errors.max():.3g} m after step "
-            f"{errors.argmax() + 1}: expected at most {limit:.3g} m"
-        )
-    if run.positions is not None:
-        away = _distance(run.positions[:1], shard.points)
-        if away > _rounding(run.positions, shard.points, cell):
-            yield f"frame 0 is {away:.3g} m off the rest shape"
-    for name in ("positions", "predictions"):
-        values = getattr(run, name)
-        if values is None or shard.free.all():
-            continue
-        away = _distance(values, shard.points, ~shard.free)
-        if away > _rounding(values, shard.points, cell):
-            yield f"held nodes are up to {away:.3g} m off their place in its {name}"
-
-
-def _distance(values: Array, points: Array, where: Array | None = None) -> float:
-    """Largest difference of a component from its rest position, m."""
-    moved = np.abs(values - points)
-    return float(moved.max() if where is None else moved[:, where].max())
-
-
-def _rounding(values: Array, points: Array, cell: float) -> float:
-    """How far stored positions may be off for being rounded, m."""
-    return float(4 * np.finfo(values.dtype).eps * np.abs(points).max() + 1e-9 * cell)
-
-
-def _unlike_runs(shard: Shard) -> Iterator[str]:
-    """Simulations that lack runs; the first one of a mesh may have some more."""
-    first = set(shard.simulations[0].runs)
-    names = [set(simulation.runs) for simulation in shard.simulations]
-    common = set.union(*names[1:]) if len(names) > 1 else first
-    for k, own in enumerate(names):
-        missing = sorted(common - own)
-        if missing:
-            yield f"simulation {k:04d} has no run {missing[0]!r}, unlike others"
-
-
-def _plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator[str]:
-    """Where a file is not the mesh, the material, the loads and the runs that it should be."""
-    if len(shard.simulations) != plan.simulations:
-        yield f"{len(shard.simulations)} simulations: expected {plan.simulations}"
-    problem = discretise(draw_scene(config, plan, 0))
-    arrays: tuple[tuple[str, Array], ...] = (
-        ("points", problem.positions),
-        ("cells", problem.cells),
-        ("free", problem.free),
-        ("mass", problem.mass),
-        ("young", problem.materials.young),
-        ("poisson", problem.materials.poisson),
-        ("density", problem.materials.density),
-    )
-    alike = True
-    for name, wanted in arrays:
-        found = getattr(shard, name)
-        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
-            alike = False
-            yield f"its {name} is not what config.toml draws"
-    for k, simulation in enumerate(shard.simulations):
-        if simulation.steps != plan.frames:
-            yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
-        scene = draw_scene(config, plan, k, simulation.attempt)
-        if simulation.scene_toml != scene.to_toml():
-            yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
-        if alike and simulation.steps == plan.frames:
-            for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
-                yield f"simulation {k:04d}: {message}"
-        named = {n for n, model in models(config, plan).items() if k == 0 or not model.sample}
-        missing = sorted(named - set(simulation.runs))
-        if missing:
-            yield f"simulation {k:04d} has no run {missing[0]!r}"
-    yield from model_faults(config, plan, shard)
-
-
-# --- comparison of files -------------------------------------------------------------------
-
-
-def _digests(shard: Shard) -> tuple[str, str]:
-    """Equal for equal meshes, and for equal meshes with equal materials.
-
-    Neither the numbering of nodes and cells nor the place in space matters.
-    """
-    scale = 1.0 / _cell_size(shard)
-    points = _rounded(scale * (shard.points - shard.points.min(axis=0)))
-    centres = points[shard.cells].mean(axis=1)
-    shape = _digest(_sorted(points)) + _digest(_sorted(_rounded(centres)))
-    material = np.column_stack([shard.young, shard.poisson, shard.density])
-    return shape, shape + _digest(_sorted(np.hstack([_rounded(centres), material])))
-
-
-def _cause(simulation: Simulation) -> Array:
-    """What makes a simulation unlike others on its mesh: forces, or else how it starts."""
-    reference = simulation.runs.get(REFERENCE)
-    if simulation.forces.any() or reference is None or reference.positions is None:
-        return simulation.forces
-    return reference.positions[:2]
-
-
-def _rounded(values: Array) -> Array:
-    return np.round(values, _DIGITS) + 0.0  # no minus zero
-
-
-def _sorted(rows: Array) -> Array:
-    return rows[np.lexsort(rows.T)]
-
-
-def _digest(values: Array) -> str:
-    return hashlib.sha256(np.ascontiguousarray(values).data).hexdigest()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.importing import INTEGRATOR, Motion, shard_from_arrays
+from pdcorrect.data.importing import INTEGRATOR, Motion, check_element, shard_from_arrays
 from pdcorrect.data.schema import CONFIG, SUFFIX, Shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.fem.problem import Problem, discretise
@@ -54,7 +54,8 @@ def shard_from_trajectories(
     ------
     InputError
         If a run has no scene, another material than it, another integrator than backward
-        Euler or does not start at rest, the runs differ in mesh, material, clamps or time step,
+        Euler or does not start at rest, the coarse model has an element with nodes besides the
+        corners of the cells, the runs differ in mesh, material, clamps or time step,
         a coarse run also in loads from its reference, or a check of `shard_from_arrays` fails.
     """
     references = [reference] if isinstance(reference, Trajectory) else list(reference)
@@ -229,6 +230,7 @@ def _shard_of_run(
     scene = _scene("the reference", run)
     if coarse is not None:
         scene = _scene_of_coarse(coarse, run, scene)
+    check_element(_coarse_model(coarse), scene)
     problem = discretise(scene)
     step = _uniform_step(run)
     rollout = None if coarse is None else _on_coarse_mesh(coarse, problem)
@@ -240,6 +242,11 @@ def _shard_of_run(
         poisson=materials.poisson, density=materials.density, time_step=step,
         dataset=dataset, split=split, number=number, scene=scene, best=best,
     )  # fmt: skip
+
+
+def _coarse_model(coarse: Trajectory | None) -> str:
+    """What says how the coarse model is discretised, for messages."""
+    return "the reference, without a coarse run" if coarse is None else "the coarse run"
 
 
 def _scene(name: str, run: Trajectory) -> Scene:

@@ -23,6 +23,7 @@ from pdcorrect.data.import_checks import (
     real_array,
     with_held_nodes,
 )
+from pdcorrect.data.scene_mesh import portable
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.hexahedron import (
@@ -42,6 +43,8 @@ Array = NDArray[Any]
 SETTING = "imported"
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
+ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean")
+"""Of coarse models: those whose nodes are the corners of the cells, as a data set's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,8 @@ def shard_from_arrays(
     mass : (N,), optional
         kg; by default the scene's, or the density integrated with the shape functions.
     scene : Scene, optional
-        Of the coarse model, by backward Euler, whose mesh, material and clamps must be these.
+        Of the coarse model, by backward Euler and with one of `ELEMENTS`, whose mesh, material
+        and clamps must be these.
         With it, missing forces are its loads and missing predictions are computed with
         `ProjectiveDynamics`.  Its time step is replaced by this one.
     best : bool
@@ -155,7 +159,8 @@ def shard_from_arrays(
     )
     _check_alike(simulations)
     if scene is not None:
-        simulations = tuple(replace(one, scene_toml=scene.to_toml()) for one in simulations)
+        text = portable(scene).to_toml()
+        simulations = tuple(replace(one, scene_toml=text) for one in simulations)
     return Shard(
         attributes={
             "dataset": dataset, "split": split, "number": number, "setting": SETTING,
@@ -246,6 +251,7 @@ def _stepper(scene: Scene, mesh: HexMesh, body: dict[str, Array]) -> ProjectiveD
             f"scene: its time.integrator is {scene.time.integrator!r}: expected {INTEGRATOR!r}, "
             "for predictions start from backward differences of the positions."
         )
+    check_element("scene", scene)
     problem = discretise(scene)
     if not np.array_equal(problem.mesh.cells, mesh.cells) or not np.allclose(
         problem.mesh.positions, mesh.positions, rtol=0, atol=1e-9
@@ -260,6 +266,21 @@ def _stepper(scene: Scene, mesh: HexMesh, body: dict[str, Array]) -> ProjectiveD
         if not np.allclose(values, body[name], rtol=1e-9, atol=0):
             raise InputError(f"scene: its {name} is not the one given: expected equal values.")
     return ProjectiveDynamics(problem)
+
+
+def check_element(name: str, scene: Scene) -> None:
+    """Refuse a coarse model with nodes besides the corners of the cells, as "hex27".
+
+    Raises
+    ------
+    InputError
+        If its element is none of `ELEMENTS`.
+    """
+    if scene.solver.element not in ELEMENTS:
+        raise InputError(
+            f"{name}: its solver.element is {scene.solver.element!r}, whose nodes are not only the "
+            f"corners of the cells: expected a coarse model with one of {', '.join(ELEMENTS)}."
+        )
 
 
 def _best_stepper(scene: Scene | None) -> ProjectiveDynamics:

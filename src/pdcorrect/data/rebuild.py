@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from pdcorrect.data.scene_mesh import discretise_stored
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Shard
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 
 COARSE = (PLAIN, BEST, "total-mass")
@@ -20,6 +21,8 @@ _FORCE_ERROR = 1e-5
 
 def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem]:
     """The problem of each simulation of a file, discretised as one of its runs was.
+
+    Bodies from mesh files are discretised on the file's own mesh.
 
     Problems of one file share mesh, operators and masses.
 
@@ -43,7 +46,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     stored = shard.simulations[0].runs.get(run)
     if stored is None:
         raise InputError(f"{path}: no run {run!r}: expected one of {_names(shard)}.")
-    plain = discretise(scenes[0])
+    plain = discretise_stored(scenes[0], shard.points, shard.cells)
     _check_mesh(plain, shard, path)
     for k, scene in enumerate(scenes):
         _check_loads(plain.with_loads(scene.loads), shard, path, k)
@@ -54,7 +57,8 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     elif run != PLAIN:
         exact = run == BEST or shard.attributes["setting"] == "exact"
         refine = int(stored.attributes.get("refine", 1))
-        problem = discretise(best_coarse(scenes[0]) if exact else scenes[0], refine)
+        scene = best_coarse(scenes[0]) if exact else scenes[0]
+        problem = discretise_stored(scene, shard.points, shard.cells, refine)
     return [_under(problem, scene) for scene in scenes]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.graph import mesh_edges, node_means, velocities
+from pdcorrect.data.hdf5_checks import RefusalError, words
 from pdcorrect.data.schema import HASH, MESH, REFERENCE
 from pdcorrect.data.shard_reader import opened
 
@@ -35,6 +36,8 @@ class ShardHeader:
         T of each simulation.
     runs : tuple of (names of runs with positions, names of runs with predictions)
         For each simulation.
+    scenes : tuple of bool
+        Whether each simulation has its scene.
     time_step : float
         s.
     config_hash, content_hash : str
@@ -46,6 +49,7 @@ class ShardHeader:
     cells: int
     steps: tuple[int, ...]
     runs: tuple[tuple[frozenset[str], frozenset[str]], ...]
+    scenes: tuple[bool, ...]
     time_step: float
     config_hash: str
     content_hash: str
@@ -126,6 +130,7 @@ def read_header(path: Path) -> ShardHeader:
             cells=len(file[MESH["cells"][0]]),
             steps=tuple(len(group["forces"]) for group in groups),
             runs=tuple((_with(g, "positions"), _with(g, "predictions")) for g in groups),
+            scenes=tuple(str(group.attrs["scene"]) != "" for group in groups),
             time_step=float(file.attrs["time_step"]),
             config_hash=str(file.attrs["config_hash"]),
             content_hash=str(file.attrs[HASH]),
@@ -181,11 +186,19 @@ def _mesh(file: h5py.File) -> MeshArrays:
 def _motion(
     group: h5py.Group, time_step: float, predictions: Sequence[str], rollouts: Sequence[str]
 ) -> MotionArrays:
-    positions = group[f"runs/{REFERENCE}/positions"][()]
+    positions = _of_run(group, REFERENCE, "positions")
     return MotionArrays(
         positions=positions,
         velocities=velocities(positions[:-1], time_step),
         forces=group["forces"][()],
-        predictions={name: group[f"runs/{name}/predictions"][()] for name in predictions},
-        rollouts={name: group[f"runs/{name}/positions"][()] for name in rollouts},
+        predictions={name: _of_run(group, name, "predictions") for name in predictions},
+        rollouts={name: _of_run(group, name, "positions") for name in rollouts},
     )
+
+
+def _of_run(simulation: h5py.Group, run: str, name: str) -> Array:
+    """Positions or predictions of a run."""
+    place = f"runs/{run}/{name}"
+    if place not in simulation:
+        raise RefusalError(f"{words(f'{simulation.name}/{place}'.lstrip('/'))} is missing")
+    return np.asarray(simulation[place][()])

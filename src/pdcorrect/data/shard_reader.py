@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,20 @@ from typing import Any
 import h5py
 import numpy as np
 
+from pdcorrect.data.hdf5_checks import (
+    RefusalError,
+    Value,
+    attributes_of,
+    check_inside,
+    check_links,
+    check_types,
+    members_of,
+    symbols,
+    texts,
+    type_name,
+    values_of,
+    words,
+)
 from pdcorrect.data.schema import (
     ATTRIBUTES,
     HASH,
@@ -27,7 +40,6 @@ from pdcorrect.data.schema import (
 from pdcorrect.data.seal import FORMAT, VERSION, check_seal, read_sealed
 from pdcorrect.errors import FileFormatError
 
-Value = str | int | float
 _GROUPS = frozenset({"mesh", "material", "simulations", "provenance", "cost"})
 _PARTS = frozenset({"forces", "runs"})
 _RESERVED = frozenset({"format", "version", HASH})
@@ -39,12 +51,6 @@ _RUN = {
     **{name: ((np.dtype(kind),), ("T",)) for name, kind in STATISTICS.items()},
 }
 """Datasets of a run: types and shape."""
-_DENSEST = 1100
-"""Times by which gzip can make data smaller, at most."""
-
-
-class _RefusalError(Exception):
-    """Why a file is not accepted; becomes `FileFormatError` with the file's name."""
 
 
 def read_shard(
@@ -92,15 +98,22 @@ def read_shard(
 def opened(path: Path, verify: bool) -> Iterator[h5py.File]:
     """A file of a data set, open; whatever fails in it is a `FileFormatError`.
 
-    ``verify`` compares the file with its checksum first, see `read_shard`.
+    ``verify`` compares the file with its checksum first, see `read_shard`.  Whoever reads
+    need not look at what is there: where that fails, the reason is what `read_shard` says.
     """
     try:
         with _unsealed(path, verify) as file:
-            yield file
+            try:
+                yield file
+            except FileFormatError:
+                raise
+            except Exception:
+                _Reader(file, file.id.get_filesize()).shard(None, None)
+                raise
     except FileFormatError:
         raise
-    except _RefusalError as refusal:
-        raise FileFormatError(f"{path}: {refusal}.") from None
+    except RefusalError as refusal:
+        raise FileFormatError(f"{path}: {' '.join(str(refusal).split())}.") from None
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
         text = str(error.args[0]).splitlines() if error.args else []
         reason = text[0] if text else type(error).__name__
@@ -151,18 +164,20 @@ class _Reader:
 
     def shard(self, simulations: Collection[int] | None, runs: Collection[str] | None) -> Shard:
         """The file's content, or the chosen part of it."""
+        check_links(self.file)
         self._check_members(self.file, "", _GROUPS, _GROUPS)
         attributes = self._noted(self.file, "")
         if attributes.get("format") != FORMAT or attributes.get("version") != VERSION:
-            raise _RefusalError(
+            raise RefusalError(
                 f"its format is {attributes.get('format')!r}, version "
                 f"{attributes.get('version')!r}: expected {FORMAT!r}, version {VERSION}"
             )
-        _check_types(attributes, {**ATTRIBUTES, HASH: str}, "the file")
+        check_types(attributes, {**ATTRIBUTES, HASH: str}, "the file")
         groups = {name: self._group(self.file, "", name) for name in _GROUPS}
         mesh = self._mesh(groups)
         chosen = self._chosen(groups, simulations)
-        provenance = _values(dict(groups["provenance"].attrs), "provenance")
+        self._check_members(groups["provenance"], "provenance", (), ())
+        provenance = values_of(groups["provenance"], "provenance")
         return Shard(
             attributes={k: v for k, v in attributes.items() if k not in _RESERVED},
             **mesh,
@@ -176,7 +191,7 @@ class _Reader:
         """Compare what was read, which is everything, with the hash of the content."""
         expected = dict(self.content[""])[HASH]
         if content_hash(self.content) != expected:
-            raise _RefusalError(f"damaged: its content is not that of its attribute {HASH!r}")
+            raise RefusalError(f"damaged: its content is not that of its attribute {HASH!r}")
 
     def _mesh(self, groups: Mapping[str, h5py.Group]) -> dict[str, Array]:
         for name in ("mesh", "material"):
@@ -193,9 +208,9 @@ class _Reader:
     def _check_cells(self, cells: Array) -> None:
         nodes = self.lengths["N"]
         if not nodes or not len(cells):
-            raise _RefusalError("mesh/points or mesh/cells is empty")
+            raise RefusalError("mesh/points or mesh/cells is empty")
         if cells.min() < 0 or cells.max() >= nodes:
-            raise _RefusalError(
+            raise RefusalError(
                 f"mesh/cells refers to nodes {cells.min()} to {cells.max()}: expected 0 to "
                 f"{nodes - 1}"
             )
@@ -206,14 +221,14 @@ class _Reader:
         """Numbers of the simulations to read."""
         count = len(groups["simulations"])
         if not count:
-            raise _RefusalError("it holds no simulation")
+            raise RefusalError("it holds no simulation")
         names = [f"{k:04d}" for k in range(count)]
         for name in ("simulations", "cost"):
             self._check_members(groups[name], name, names, names)
         self._noted(groups["simulations"], "simulations")
         for k in wanted or ():
             if not 0 <= k < count:
-                raise _RefusalError(f"it has no simulation {k}: expected 0 to {count - 1}")
+                raise RefusalError(f"it has no simulation {k}: expected 0 to {count - 1}")
         return list(range(count)) if wanted is None else list(wanted)
 
     def _simulation(
@@ -223,16 +238,18 @@ class _Reader:
         group = self._group(simulations, "simulations", f"{k:04d}")
         self._check_members(group, place, _PARTS, _PARTS)
         attributes = self._raw(group, place)
-        rejected = _texts(attributes.get("rejected"), where)
-        values = _values({n: v for n, v in attributes.items() if n != "rejected"}, where)
-        _check_types(values, {"attempt": int, "scene": str}, where)
+        rejected = texts(attributes, "rejected", where)
+        values = values_of({n: v for n, v in attributes.items() if n != "rejected"}, where)
+        check_types(values, {"attempt": int, "scene": str}, where)
         self.lengths = {name: self.lengths[name] for name in "NC"}
         forces = self._array(group, place, "forces", _FLOATS, ("T", "N", 3))
         if not len(forces):
-            raise _RefusalError(f"forces of {where} has no step")
+            raise RefusalError(f"forces of {where} has no step")
         self.lengths["T+1"] = len(forces) + 1
-        seconds = _values(dict(self._group(cost, "cost", f"{k:04d}").attrs), f"cost of {where}")
-        _check_types(seconds, dict.fromkeys(seconds, float), f"cost of {where}")
+        costs = self._group(cost, "cost", f"{k:04d}")
+        self._check_members(costs, f"cost/{k:04d}", (), ())
+        seconds = values_of(costs, f"cost of {where}")
+        check_types(seconds, dict.fromkeys(seconds, float), f"cost of {where}")
         return Simulation(
             forces=forces,
             runs=self._runs(self._group(group, place, "runs"), f"{place}/runs", wanted),
@@ -245,13 +262,13 @@ class _Reader:
     def _runs(
         self, group: h5py.Group, place: str, wanted: Collection[str] | None
     ) -> dict[str, Run]:
-        names = list(group)
+        names = members_of(group, words(place))
         if not names:
-            raise _RefusalError(f"{_words(place)} is empty")
+            raise RefusalError(f"{words(place)} is empty")
         for name in wanted or ():
             if name not in names:
-                raise _RefusalError(
-                    f"{_words(place)} has no {name!r}: expected one of {', '.join(names)}"
+                raise RefusalError(
+                    f"{words(place)} has no {name!r}: expected one of {', '.join(names)}"
                 )
         self._noted(group, place)
         return {
@@ -262,7 +279,7 @@ class _Reader:
         group, place = self._group(runs, place, name), f"{place}/{name}"
         members = self._check_members(group, place, (), _RUN)
         if not members & {"positions", "predictions"}:
-            raise _RefusalError(f"{_words(place)} has neither positions nor predictions")
+            raise RefusalError(f"{words(place)} has neither positions nor predictions")
         arrays = {k: self._array(group, place, k, *_RUN[k]) for k in _RUN if k in members}
         return Run(
             positions=arrays.get("positions"),
@@ -272,34 +289,34 @@ class _Reader:
         )
 
     def _group(self, parent: h5py.Group, place: str, name: str) -> h5py.Group:
-        group = parent.get(name)
+        group = parent[name]
         if not isinstance(group, h5py.Group):
-            raise _RefusalError(f"{_words(f'{place}/{name}'.lstrip('/'))} is not a group")
+            raise RefusalError(f"{words(f'{place}/{name}'.lstrip('/'))} is not a group")
         return group
 
     def _check_members(
         self, group: h5py.Group, place: str, needed: Collection[str], known: Collection[str]
     ) -> set[str]:
         """Names in a group; refuses one that lacks something or holds something unknown."""
-        found = set(group)
+        found = set(members_of(group, words(place) or "the file"))
         inside = f"{place}/".lstrip("/")
         for name in sorted(set(needed) - found):
-            raise _RefusalError(f"{_words(inside + name)} is missing")
+            raise RefusalError(f"{words(inside + name)} is missing")
         for name in sorted(found - set(known)):
-            raise _RefusalError(
-                f"{_words(inside + name)} is unknown in version {VERSION} of the format"
+            raise RefusalError(
+                f"{words(inside + name)} is unknown in version {VERSION} of the format"
             )
         return found
 
     def _raw(self, group: h5py.Group, place: str) -> dict[str, Any]:
         """A group's attributes as they are, noted for the hash."""
-        attributes = dict(group.attrs)
+        attributes = attributes_of(group, words(place) or "the file")
         self.content[place] = attributes
         return attributes
 
     def _noted(self, group: h5py.Group, place: str) -> dict[str, Value]:
         """A group's attributes as texts and numbers, noted for the hash."""
-        return _values(self._raw(group, place), _words(place) or "the file")
+        return values_of(self._raw(group, place), words(place) or "the file")
 
     def _array(
         self,
@@ -312,25 +329,27 @@ class _Reader:
         """A dataset of given types and shape, in which a new letter stands for any length."""
         place = f"{place}/{name}"
         dataset = group.get(name)
+        if dataset is None:
+            raise RefusalError(f"{words(place)} is missing")
         if not isinstance(dataset, h5py.Dataset):
-            raise _RefusalError(f"{_words(place)} is missing")
+            raise RefusalError(f"{words(place)} is not a dataset")
         found, kind = dataset.shape, dataset.dtype
         if not self._fits(found, shape):
             known = tuple(self.lengths.get(str(n), n) for n in shape)
-            raise _RefusalError(
-                f"{_words(place)} has shape {found}: expected {_symbols(shape)}"
+            raise RefusalError(
+                f"{words(place)} has shape {found}: expected {symbols(shape)}"
                 + (f" = {known}" if all(isinstance(n, int) for n in known) else "")
             )
         if kind not in types:
             expected = " or ".join(str(t) for t in types)
-            raise _RefusalError(f"{_words(place)} has type {kind}: expected {expected}")
-        self._check_stored(dataset, math.prod(found) * kind.itemsize, place)
+            raise RefusalError(f"{words(place)} has type {type_name(kind)}: expected {expected}")
+        check_inside(dataset, self.size, words(place))
         try:
             values = dataset[()]
         except OSError as error:
-            raise _RefusalError(f"{_words(place)} is damaged ({error})") from None
+            raise RefusalError(f"{words(place)} is damaged ({error})") from None
         if kind.kind == "f" and not np.isfinite(values).all():
-            raise _RefusalError(f"{_words(place)} has infinite or NaN entries")
+            raise RefusalError(f"{words(place)} has infinite or NaN entries")
         self.content[place] = values
         self.lengths |= {n: m for n, m in zip(shape, found, strict=True) if isinstance(n, str)}
         return values
@@ -342,62 +361,3 @@ class _Reader:
             m == (self.lengths.get(n, m) if isinstance(n, str) else n)
             for m, n in zip(found, shape, strict=True)
         )
-
-    def _check_stored(self, dataset: h5py.Dataset, size: int, place: str) -> None:
-        """Refuse lengths that the file's bytes cannot hold, and what lies in other files."""
-        stored = min(dataset.id.get_storage_size(), self.size)
-        if size <= stored and not dataset.external:
-            return
-        if size > stored * (_DENSEST if dataset.compression else 1) or dataset.external:
-            raise _RefusalError(
-                f"{_words(place)} has shape {dataset.shape}, {size} bytes, of which {stored} are "
-                "stored in this file"
-            )
-
-
-def _words(place: str) -> str:
-    """A place in the file in words: "forces of simulation 0003"."""
-    parts = place.split("/", 2)
-    if parts[0] != "simulations" or len(parts) < 2:
-        return place
-    simulation = f"simulation {parts[1]}"
-    return simulation if len(parts) == 2 else f"{parts[2]} of {simulation}"
-
-
-def _symbols(shape: tuple[Any, ...]) -> str:
-    return f"({', '.join(str(n) for n in shape)}{',' if len(shape) == 1 else ''})"
-
-
-def _values(attributes: Mapping[str, Any], where: str) -> dict[str, Value]:
-    return {name: _value(value, f"{name} of {where}") for name, value in attributes.items()}
-
-
-def _value(value: Any, where: str) -> Value:
-    """An attribute as text or number."""
-    if isinstance(value, str):
-        return value
-    if isinstance(value, (np.integer, np.bool_)):
-        return value.item()
-    if isinstance(value, np.floating) and np.isfinite(value):
-        return float(value)
-    raise _RefusalError(f"the attribute {where} is {value!r:.60}: expected text or a number")
-
-
-def _texts(value: Any, where: str) -> tuple[str, ...]:
-    texts = np.asarray(value, dtype=object)
-    if texts.ndim != 1 or not all(isinstance(text, str) for text in texts):
-        raise _RefusalError(
-            f"the attribute rejected of {where} is {value!r:.60}: expected a list of texts"
-        )
-    return tuple(texts)
-
-
-def _check_types(values: Mapping[str, Value], wanted: Mapping[str, type], where: str) -> None:
-    """Attributes that must be there, and of which type; integers pass for floats."""
-    for name, kind in wanted.items():
-        if name not in values:
-            raise _RefusalError(f"the attribute {name} of {where} is missing")
-        if not isinstance(values[name], (int, float) if kind is float else kind):
-            raise _RefusalError(
-                f"the attribute {name} of {where} is {values[name]!r:.60}: expected {kind.__name__}"
-            )

@@ -186,7 +186,12 @@ class Problem(ElasticBody):
 
 
 def discretise(
-    scene: Scene, refine: int = 1, mass: str | None = None, element: str | None = None
+    scene: Scene,
+    refine: int = 1,
+    mass: str | None = None,
+    element: str | None = None,
+    *,
+    mesh: HexMesh | None = None,
 ) -> Problem:
     """Mesh a scene and assemble its operators.
 
@@ -197,6 +202,8 @@ def discretise(
         1 coarse, 2 intermediate, 4 fine (64 cells for each coarse one).
     mass, element : str, optional
         Override the scene's solver section.
+    mesh : HexMesh, optional
+        Coarse mesh in place of the one that the scene's body makes or names.
 
     Raises
     ------
@@ -216,13 +223,13 @@ def discretise(
             "resists the element's modes, for the volume term sees the mean deformation only. "
             "Use hex8-bubble, or an energy with a corotated part."
         )
-    coarse = _coarse_mesh(scene, refine)
-    mesh = refine_mesh(coarse, refine)
-    space = Space(mesh, scene.solver.element)
+    coarse = _coarse_mesh(scene, refine, mesh)
+    refined = refine_mesh(coarse, refine)
+    space = Space(refined, scene.solver.element)
     cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
-    selector = Selector(mesh, space.positions, cell_size)
-    materials = Materials.from_scene(scene, selector, len(mesh.cells))
-    body = ElasticBody(mesh, space, space.quadrature(), materials, cell_size)
+    selector = Selector(refined, space.positions, cell_size)
+    materials = Materials.from_scene(scene, selector, len(refined.cells))
+    body = ElasticBody(refined, space, space.quadrature(), materials, cell_size)
     return problem_from_body(scene, refine, body)
 
 
@@ -242,8 +249,11 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     )  # fmt: skip
 
 
-def _coarse_mesh(scene: Scene, refine: int) -> HexMesh:
+def _coarse_mesh(scene: Scene, refine: int, given: HexMesh | None) -> HexMesh:
     body = scene.body
+    if given is not None:
+        _check_size(scene, len(given.cells), refine)
+        return given
     if isinstance(body, MeshFile):
         from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
 

@@ -13,11 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.scene_mesh import discretise_stored
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
-from pdcorrect.data.shard_arrays import read_header
+from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
@@ -40,6 +41,8 @@ class Recording:
     scene_toml : str
     points : (N, 3) float64
         Rest positions, m.
+    cells : (C, 8)
+        VTK order.
     reference, plain : (T+1, N, 3)
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
@@ -53,6 +56,7 @@ class Recording:
     number: int
     scene_toml: str
     points: Array
+    cells: Array
     reference: Array
     plain: Array
     one_step: float
@@ -69,21 +73,33 @@ class Recording:
         return f"{self.split}/mesh-{self.mesh:04d}/{self.number}"
 
 
-def load_recordings(folder: str | Path, split: str, base: Base) -> list[Recording]:
+def load_recordings(
+    folder: str | Path, split: str, base: Base, *, scenes: bool = True
+) -> list[Recording]:
     """All simulations of a split, mesh by mesh.
+
+    Parameters
+    ----------
+    folder : path
+    split : str
+    base : {"plain", "best"}
+    scenes : bool
+        Whether the base model is to step again, for which it takes the scenes.
 
     Raises
     ------
     InputError
-        If there is no such split, or a simulation lacks a run that is needed.
+        If there is no such split, or a simulation lacks a run or a scene that is needed; names
+        the file and all that it lacks.
     FileFormatError
         If a file is damaged.
     """
     found = []
     for path in shard_paths(folder, split):
+        _check_complete(read_header(path), base, scenes)
         shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
         for number, simulation in enumerate(shard.simulations):
-            found.append(_recording(shard, simulation, number, split, base, path))
+            found.append(_recording(shard, simulation, number, split, base))
     return found
 
 
@@ -112,7 +128,8 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
         scene = Scene.from_toml(recording.scene_toml, recording.name)
         key = recording.split, recording.mesh
         if key not in known:
-            known[key] = discretise(best_coarse(scene) if base == "best" else scene)
+            model = best_coarse(scene) if base == "best" else scene
+            known[key] = discretise_stored(model, recording.points, recording.cells)
             _check_mesh(recording, known[key])
         problems.append(known[key].with_loads(scene.loads))
     return problems
@@ -127,17 +144,28 @@ def data_hash(folder: str | Path, splits: Sequence[str]) -> str:
     return digest.hexdigest()
 
 
+def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
+    """Refuse a file of which a simulation lacks what a training of ``base`` needs."""
+    rollouts = tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
+    for number, (positions, predictions) in enumerate(header.runs):
+        lacks = ["scene"] if scenes and not header.scenes[number] else []
+        lacks += [f"rollout of run {name!r}" for name in rollouts if name not in positions]
+        lacks += [f"single steps of run {base!r}"] if base not in predictions else []
+        if lacks:
+            runs = " and ".join(map(repr, rollouts[1:]))
+            raise InputError(
+                f"{header.path}: simulation {number} has no {', no '.join(lacks)}: a training "
+                f"with base = {base!r} needs simulations with rollouts of {REFERENCE!r} and "
+                f"{runs}, single steps of {base!r}"
+                f"{', and scenes for stepping them again' if scenes else ''}."
+            )
+
+
 def _recording(
-    shard: Shard, simulation: Simulation, number: int, split: str, base: Base, path: Path
+    shard: Shard, simulation: Simulation, number: int, split: str, base: Base
 ) -> Recording:
-    reference = _positions(simulation, REFERENCE, path, number)
-    predictions = simulation.runs[base].predictions
-    if predictions is None:
-        raise InputError(
-            f"{path}: simulation {number} has no single steps of run {base!r}: expected data "
-            "with them, or another base."
-        )
-    rollout = _positions(simulation, base, path, number)
+    """A simulation that lacks nothing, see `_check_complete`."""
+    reference, plain, rollout = (_positions(simulation, run) for run in (REFERENCE, PLAIN, base))
     return Recording(
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
@@ -146,18 +174,16 @@ def _recording(
         number=number,
         scene_toml=simulation.scene_toml,
         points=shard.points,
+        cells=shard.cells,
         reference=reference,
-        plain=_positions(simulation, PLAIN, path, number),
-        one_step=_mean_square(predictions, reference[1:]),
+        plain=plain,
+        one_step=_mean_square(np.asarray(simulation.runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
     )
 
 
-def _positions(simulation: Simulation, run: str, path: Path, number: int) -> Array:
-    found = simulation.runs[run].positions
-    if found is None:
-        raise InputError(f"{path}: simulation {number} has no positions of run {run!r}.")
-    return found
+def _positions(simulation: Simulation, run: str) -> Array:
+    return np.asarray(simulation.runs[run].positions)
 
 
 def _mean_square(x: Array, y: Array) -> float:

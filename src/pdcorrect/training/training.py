@@ -106,7 +106,8 @@ class Training:
         if self._teachers:
             self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
-        self._recordings = load_recordings(data, TRAINING, config.base)
+        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
+        self._recordings = load_recordings(data, TRAINING, config.base, scenes=unrolled)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
             workers=config.workers,

@@ -1,0 +1,130 @@
+"""What is wrong within one file of a data set: its numbers, its runs, and against its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pdcorrect.data.check_motion import load_faults, model_faults, volume_faults
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.plan import MeshPlan, draw_scene
+from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
+from pdcorrect.data.simulate import models
+from pdcorrect.fem.hexahedron import gauss_points, jacobians
+from pdcorrect.fem.problem import discretise
+
+_SLACK = 1e-6
+"""Relative, for tolerances of numbers that are stored as float32."""
+
+
+def file_faults(shard: Shard) -> Iterator[str]:
+    """What is wrong within one file whose mesh can be used."""
+    for name in ("young", "density", "mass"):
+        if getattr(shard, name).min() <= 0:
+            yield f"{name} is {getattr(shard, name).min():g} somewhere: expected more than 0"
+    cell = cell_size(shard)
+    for k, simulation in enumerate(shard.simulations):
+        for message in _simulation_faults(shard, simulation, cell):
+            yield f"simulation {k:04d}: {message}"
+    yield from _unlike_runs(shard)
+
+
+def cell_size(shard: Shard) -> float:
+    """Cube root of the mean cell volume, m."""
+    volumes = jacobians(shard.points, shard.cells.astype(np.int64), gauss_points(2)).mean(axis=1)
+    return float(np.cbrt(volumes.mean()))
+
+
+def _simulation_faults(shard: Shard, simulation: Simulation, cell: float) -> Iterator[str]:
+    reference = simulation.runs.get(REFERENCE)
+    if reference is None or reference.positions is None:
+        yield f"there is no rollout {REFERENCE!r}"
+    yield from volume_faults(shard, simulation)
+    if len(simulation.rejected) != simulation.attempt:
+        yield (
+            f"attempt is {simulation.attempt}, with {len(simulation.rejected)} reasons of "
+            "rejected draws: expected as many"
+        )
+    for name, run in simulation.runs.items():
+        for message in _run_faults(shard, run, cell):
+            yield f"{name}: {message}"
+
+
+def _run_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
+    errors = run.statistics.get("error_estimates")
+    limit = float(shard.attributes["tolerance"]) * cell
+    if errors is not None and errors.max() > limit * (1 + _SLACK):
+        yield (
+            f"the solver's error estimate is {errors.max():.3g} m after step "
+            f"{errors.argmax() + 1}: expected at most {limit:.3g} m"
+        )
+    if run.positions is not None:
+        away = _distance(run.positions[:1], shard.points)
+        if away > _rounding(run.positions, shard.points, cell):
+            yield f"frame 0 is {away:.3g} m off the rest shape"
+    for name in ("positions", "predictions"):
+        values = getattr(run, name)
+        if values is None or shard.free.all():
+            continue
+        away = _distance(values, shard.points, ~shard.free)
+        if away > _rounding(values, shard.points, cell):
+            yield f"held nodes are up to {away:.3g} m off their place in its {name}"
+
+
+def _distance(values: Array, points: Array, where: Array | None = None) -> float:
+    """Largest difference of a component from its rest position, m."""
+    moved = np.abs(values - points)
+    return float(moved.max() if where is None else moved[:, where].max())
+
+
+def _rounding(values: Array, points: Array, cell: float) -> float:
+    """How far stored positions may be off for being rounded, m."""
+    return float(4 * np.finfo(values.dtype).eps * np.abs(points).max() + 1e-9 * cell)
+
+
+def _unlike_runs(shard: Shard) -> Iterator[str]:
+    """Simulations that lack runs; the first one of a mesh may have some more."""
+    first = set(shard.simulations[0].runs)
+    names = [set(simulation.runs) for simulation in shard.simulations]
+    common = set.union(*names[1:]) if len(names) > 1 else first
+    for k, own in enumerate(names):
+        missing = sorted(common - own)
+        if missing:
+            yield f"simulation {k:04d} has no run {missing[0]!r}, unlike others"
+
+
+def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator[str]:
+    """Where a file is not the mesh, the material, the loads and the runs that it should be."""
+    if len(shard.simulations) != plan.simulations:
+        yield f"{len(shard.simulations)} simulations: expected {plan.simulations}"
+    problem = discretise(draw_scene(config, plan, 0))
+    arrays: tuple[tuple[str, Array], ...] = (
+        ("points", problem.positions),
+        ("cells", problem.cells),
+        ("free", problem.free),
+        ("mass", problem.mass),
+        ("young", problem.materials.young),
+        ("poisson", problem.materials.poisson),
+        ("density", problem.materials.density),
+    )
+    alike = True
+    for name, wanted in arrays:
+        found = getattr(shard, name)
+        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
+            alike = False
+            yield f"its {name} is not what config.toml draws"
+    for k, simulation in enumerate(shard.simulations):
+        if simulation.steps != plan.frames:
+            yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
+        scene = draw_scene(config, plan, k, simulation.attempt)
+        if simulation.scene_toml != scene.to_toml():
+            yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
+        if alike and simulation.steps == plan.frames:
+            for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
+                yield f"simulation {k:04d}: {message}"
+        named = {n for n, model in models(config, plan).items() if k == 0 or not model.sample}
+        missing = sorted(named - set(simulation.runs))
+        if missing:
+            yield f"simulation {k:04d} has no run {missing[0]!r}"
+    yield from model_faults(config, plan, shard)
