@@ -81,7 +81,7 @@ def test_both_settings_pull_a_part_with_the_same_total_force():
 
 
 def test_the_published_field_twists_three_times_as_hard_as_the_exact_one():
-    """On bodies of the published sizes, 2.56 to 3.95 times; see docs/datasets.md."""
+    """On crosses of the published sizes; 2.6 to 3.9 times in the sets (docs/datasets.md)."""
     ratios = []
     for setting in ("exact", "as-published"):
         config = small(
