@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from pdcorrect.data.config import DatasetConfig, ExtraSplit
+from pdcorrect.data.config import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import DatasetInfo, SplitInfo
@@ -37,13 +37,19 @@ _SETTINGS = {
     "exact": "lumped masses that sum to density times volume, volume weight 3 lambda, loads "
     "integrated on each mesh, and in the reference the best coarse model's element and mass",
 }
+_PUBLISHED_PARTS = (
+    ". The force is divided among all coarse nodes of its part, inner ones too, where the thesis "
+    "speaks of the part's borders"
+)
 _LIMITS = (
-    "Backward Euler's own error is the same in all runs and is not seen in their distances"
-    " ({converged}).",
     "Loads under which a run failed or turned a cell inside out were drawn again, so the errors "
-    "are those of survivable loads.",
+    "are those of survivable loads. All runs of a simulation count, so splits with more runs than "
+    "`training`, as `evaluation`, pass a stricter filter.",
     "No contact, no gravity, one material a body.",
 )
+CONVERGED = "time-converged"
+_FEWEST = 20
+"""Simulations for which a 5 % quantile is told."""
 
 
 def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
@@ -80,6 +86,23 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
             "computes what is missing and writes it."
         ) from None
     made_with = read_shard(all_shards(folder)[0], simulations=(), verify=False).provenance
+    return card_text(config, info, made_with, content_hash)
+
+
+def card_text(
+    config: DatasetConfig, info: DatasetInfo, made_with: Mapping[str, str], content_hash: str
+) -> str:
+    """The card of a data set from its numbers alone.
+
+    Parameters
+    ----------
+    config : DatasetConfig
+    info : DatasetInfo
+    made_with : mapping of str to str
+        Provenance: date, pdcorrect, and device or processor.
+    content_hash : str
+        Of the manifest.
+    """
     sections = [
         f"# {config.name}",
         _what(config),
@@ -87,7 +110,7 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
         "## Errors of the models\n\n" + _errors(info),
         "## Generation\n\n" + _generation(config, info, made_with, content_hash),
         "## Evaluation\n\n" + _evaluation(config),
-        "## Known limits\n\n" + _limits(config),
+        "## Known limits\n\n" + _limits(config, info),
     ]
     return "\n\n".join(sections) + "\n"
 
@@ -96,6 +119,9 @@ def _what(config: DatasetConfig) -> str:
     motion, material = config.motion, config.material
     loads = _MOTIONS[motion.kind].format(duration=motion.duration)
     nodes = config.coarse_nodes or PUBLISHED[config.family].coarse
+    setting = _SETTINGS[config.setting]
+    if config.setting == "as-published" and motion.kind != "torsion":
+        setting += _PUBLISHED_PARTS
     return "\n".join((
         "- **Equation**: elastodynamics with the corotated energy and a volume term, backward "
         f"Euler, {config.frames} frames of {config.step:g} s from rest.",
@@ -105,7 +131,7 @@ def _what(config: DatasetConfig) -> str:
         f"{'m/s' if motion.kind == 'impulse' else 'm/s2'} times the density or the part's mass.",
         f"- **Material**, one draw a mesh: E {_range(material.young)} Pa (log-uniform), Poisson's "
         f"ratio {_range(material.poisson)}, density {_range(material.density)} kg/m3.",
-        f"- **Setting** `{config.setting}`: {_SETTINGS[config.setting]}.",
+        f"- **Setting** `{config.setting}`: {setting}.",
         f"- **Reference**: {config.reference.solver.upper()} on cells cut into "
         f"{config.reference.refine} x {config.reference.refine} x {config.reference.refine}, to "
         f"{config.tolerance:g} of a cell in each step.",
@@ -132,7 +158,21 @@ def _sizes(config: DatasetConfig, info: DatasetInfo) -> str:
         "split", "meshes", "simulations", "nodes", "reference's cut", "displacement: median, mm",
         "largest, mm", "loads rejected, %",
     )  # fmt: skip
-    return _table(heads, rows) + f"\n\n{info.whole.bytes / 1e6:.3g} MB in all."
+    size = f"{info.whole.bytes / 1e6:.3g} MB in all."
+    return "\n\n".join([_table(heads, rows), *_rejections(info), size])
+
+
+def _rejections(info: DatasetInfo) -> Iterable[str]:
+    """Which runs rejected loads, and why."""
+    if info.whole.rejections:
+        rows = [
+            (name, "`{}`".format(text.partition(", ")[0]), text.partition(", ")[2], count)
+            for name, split in info.splits.items()
+            for text, count in split.rejections.items()
+        ]
+        yield _table(("split", "rejected by the run", "reason", "loads"), rows)
+    elif info.whole.rejected:
+        yield "Each file says which run rejected its loads and why (attribute `rejected`)."
 
 
 def _whole(ends: tuple[float, float]) -> str:
@@ -146,7 +186,8 @@ def _errors(info: DatasetInfo) -> str:
     rows = [row for name, split in info.splits.items() for row in _runs(name, split)]
     return _table(heads, rows) + (
         "\n\nDistances from the reference on the coarse nodes, means over simulations; Omega (eq. "
-        "7-3) is the share of the plain run's squared error that is gone, per cent."
+        "7-3) is the share of the plain run's squared error that is gone, per cent. A dash: fewer "
+        f"than {_FEWEST} simulations give no 5 % quantile."
     )
 
 
@@ -158,7 +199,10 @@ def _runs(name: str, split: SplitInfo) -> Iterable[tuple[object, ...]]:
         shares = (omega.mean, omega.median, omega.q05, omega.smallest) if omega else (None,) * 4
         errors = (found.rms_error, found.step_error)
         lengths = [None if e is None else 1e3 * e for e in errors]
-        yield (name, f"`{run}`", *("" if v is None else f"{v:.3g}" for v in (*lengths, *shares)))
+        texts = ["" if v is None else f"{v:.3g}" for v in (*lengths, *shares)]
+        if omega and found.simulations < _FEWEST:
+            texts[4] = "–"
+        yield (name, f"`{run}`", *texts)
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -199,7 +243,20 @@ def _difference(extra: ExtraSplit) -> str:
     return ", ".join(told).replace("refine", "reference cut into") or "the same distribution"
 
 
-def _limits(config: DatasetConfig) -> str:
-    converged = "the run `time-converged` in the evaluation split shows it"
-    text = "\n".join(f"- {line}" for line in _LIMITS)
-    return text.format(converged=converged if config.converged_steps else "no run here shows it")
+def _limits(config: DatasetConfig, info: DatasetInfo) -> str:
+    return "\n".join(f"- {line}" for line in (_time_error(config, info), *_LIMITS))
+
+
+def _time_error(config: DatasetConfig, info: DatasetInfo) -> str:
+    """What is known of the error that the reference itself has from its time step."""
+    runs = info.splits[EVALUATION].runs if EVALUATION in info.splits else {}
+    errors = [run.rms_error for n in (CONVERGED, PLAIN) if (run := runs.get(n)) is not None]
+    text = "The errors above leave out the reference's own error of the time step"
+    if len(errors) < 2 or None in errors:
+        return text + "; no run here measures it."
+    converged, plain = (f"{1e3 * e:.3g} mm" for e in errors if e is not None)
+    return (
+        f"{text}. In `{EVALUATION}` the run `{CONVERGED}`, the reference with each time step cut "
+        f"into {config.converged_steps}, is {converged} RMS from the reference, and the `{PLAIN}` "
+        f"run {plain}."
+    )

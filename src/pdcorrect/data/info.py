@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -86,6 +87,8 @@ class SplitInfo:
     runs : mapping of str to RunInfo
     seconds : mapping of str to float
         Cost by run, and of all as "total".
+    rejections : mapping of str to int
+        Rejected draws by "run, reason"; empty where the files do not say it.
     """
 
     meshes: int
@@ -104,6 +107,7 @@ class SplitInfo:
     rejection_rate: float
     runs: Mapping[str, RunInfo]
     seconds: Mapping[str, float]
+    rejections: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -128,11 +132,29 @@ class DatasetInfo:
         """All numbers, in SI units and per cent."""
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
+    @classmethod
+    def from_json(cls, text: str) -> DatasetInfo:
+        """What `to_json` wrote."""
+        found = json.loads(text)
+        splits = {name: _split_from(split) for name, split in found["splits"].items()}
+        return cls(found["name"], _split_from(found["whole"]), splits, found["damaged"])
+
     def tables(self) -> RenderableType:
         """For rich's console; those without rows are left out."""
         from rich.console import Group
 
         return Group(*(found for found in (table(self) for table in _TABLES) if found.row_count))
+
+
+def _split_from(found: dict[str, Any]) -> SplitInfo:
+    """A split of a JSON file."""
+    ranges = {n: tuple(found[n]) for n in ("nodes", "cells", "young", "poisson", "density")}
+    spreads = {n: Spread(**found[n]) for n in ("displacement", "speed", "force")}
+    runs = {
+        name: RunInfo(**{**run, "omega": Spread(**run["omega"]) if run["omega"] else None})
+        for name, run in found["runs"].items()
+    }
+    return SplitInfo(**{**found, **ranges, **spreads, "runs": runs})
 
 
 def dataset_info(
@@ -182,6 +204,7 @@ def _split(meshes: Sequence[MeasuredMesh]) -> SplitInfo:
         rejection_rate=rejected / (rejected + len(simulations)),
         runs={n: _run_info([s.runs[n] for s in simulations if n in s.runs]) for n in names},
         seconds=_seconds(simulations),
+        rejections=dict(Counter(sorted(r for s in simulations for r in s.reasons))),
     )
 
 
@@ -224,7 +247,7 @@ def _table(title: str, *headings: str) -> Any:
         pad_edge=False,
     )
     for number, heading in enumerate(headings):
-        left = number == 0 or heading in ("run", "quantity")
+        left = number == 0 or heading in ("run", "quantity", "reason")
         table.add_column(heading, justify="left" if left else "right", no_wrap=True)
     return table
 
@@ -318,11 +341,20 @@ def _draw_table(info: DatasetInfo) -> Any:
     return table
 
 
+def _reason_table(info: DatasetInfo) -> Any:
+    table = _table("why loads were rejected", "split", "run", "reason", "loads")
+    for split_name, split in _rows(info):
+        for number, (text, count) in enumerate(split.rejections.items()):
+            run, _, reason = text.partition(", ")
+            table.add_row("" if number else split_name, run, reason, str(count))
+    return table
+
+
 def _text(value: float | None, factor: float = 1.0) -> str:
     return "" if value is None else f"{factor * value:.3g}"
 
 
 _TABLES = (
     _size_table, _material_table, _motion_table, _error_table, _iteration_table, _cost_table,
-    _draw_table,
+    _draw_table, _reason_table,
 )  # fmt: skip

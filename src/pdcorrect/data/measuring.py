@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
 
 Range = tuple[float, float]
+_STEP = re.compile(r"step \d+: ")
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class MeasuredSimulation:
     frames : int
     rejected : int
         Draws before it.
+    reasons : tuple of str
+        Of each rejection, "run, reason", where the file says it; without the step's number.
     seconds : mapping of str to float
         Cost by run.
     runs : mapping of str to MeasuredRun
@@ -64,6 +68,7 @@ class MeasuredSimulation:
     force: float
     frames: int
     rejected: int
+    reasons: tuple[str, ...]
     seconds: Mapping[str, float]
     runs: Mapping[str, MeasuredRun]
 
@@ -163,6 +168,7 @@ def _simulation(simulation: Simulation, step: float) -> MeasuredSimulation:
         force=float(np.linalg.norm(simulation.forces.astype(np.float64), axis=2).max()),
         frames=simulation.steps,
         rejected=simulation.attempt,
+        reasons=tuple(_STEP.sub("", text) for text in simulation.rejected),
         seconds=simulation.seconds,
         runs={name: _run(simulation, name, reference) for name in simulation.runs},
     )

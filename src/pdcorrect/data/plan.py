@@ -234,8 +234,8 @@ def _strength(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -
 def _torsion(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
     """Eq. 6-1 to 6-3 about the central beam's axis.
 
-    Published: sigma is a force on each coarse node.  Exact: the density that gives an
-    inner node of the coarse mesh that force, sigma over the cell's volume.
+    Published: sigma is a force on each coarse node.  Exact: a force density, that force over
+    a cell's volume.  The torque about the axis is then about a third of the published one.
     """
     motion, cell = config.motion, config.cell_size
     density = mesh.density * _strength(config, mesh, rng)
