@@ -200,7 +200,7 @@ def test_a_changed_bit_in_any_array_is_found_without_the_seal(folder, tmp_path):
         changed = bytearray(whole)
         changed[chunk.byte_offset + chunk.size // 2] ^= 4
         path.write_bytes(changed)
-        with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: damaged"):
+        with pytest.raises(FileFormatError, match=rf"mesh-0000\.h5: {place} is damaged"):
             opened(tmp_path / "set")[0]
         path.write_bytes(whole)
 
