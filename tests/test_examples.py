@@ -133,6 +133,16 @@ def test_ones_own_body_is_recorded_learned_judged_and_drawn(own, monkeypatch, tm
     assert Path("hook.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("name", ["finetune", "finetune_compact"])
+def test_recipes_of_fine_tuning_have_the_architecture_of_the_model_they_start_from(name):
+    pytest.importorskip("torch")
+    from pdcorrect.training.config import TrainingConfig
+
+    config = TrainingConfig.load(OWN / f"{name}.toml")
+    assert config.start_from is not None
+    assert config.architecture == pc.load_model(config.start_from).corrector.config
+
+
 def blocks(language):
     for page in PAGES:
         for i, text in enumerate(re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.S)):
