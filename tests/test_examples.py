@@ -140,7 +140,7 @@ def test_recipes_of_fine_tuning_have_the_architecture_of_the_model_they_start_fr
 
     config = TrainingConfig.load(OWN / f"{name}.toml")
     assert config.start_from is not None
-    assert config.architecture == pc.load_model(config.start_from).corrector.config
+    assert config.architecture() == pc.load_model(config.start_from).corrector.config
 
 
 def blocks(language):
