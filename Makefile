@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Processes that share the tests, of one thread each.
+JOBS ?= 2
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo demo-learn test test-slow lint docs bench clean
@@ -14,7 +16,7 @@ demo-learn: $(VENV)/learn.stamp
 	OMP_NUM_THREADS=1 $(BIN)/pdcorrect train examples/training/tiny.toml --data datasets/tiny -o demo-learn --evaluate evaluation
 
 test: $(VENV)/dev.stamp lint
-	$(BIN)/python -m pytest -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile
 
 test-slow: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow

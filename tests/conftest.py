@@ -1,8 +1,10 @@
 """Scenes and meshes that several tests share; all asymmetric on purpose."""
 
+import os
 import sys
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 
@@ -16,6 +18,9 @@ from pdcorrect.fem.problem import problem_from_body
 from pdcorrect.fem.selection import Selector
 
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # kernels of one thread each, as the others want cores
+    numba.set_num_threads(1)
 
 CLAMPED = [{"region": {"plane": "x", "at": 0.0}}]
 GRAVITY = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]

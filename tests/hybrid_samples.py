@@ -1,5 +1,7 @@
 """Correctors of small scenes, fitted to their plain runs, with random or chosen weights."""
 
+import itertools
+
 import numpy as np
 import torch
 
@@ -42,11 +44,9 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
     config = preset("compact", **{"layers": 2, "width": 16, **changes})
     torch.manual_seed(seed)
     corrector = kind(config).double()
-    stepper = pc.BatchStepper(scenes)
-    nodes, state = BatchBodies(stepper), stepper.rest_state()
+    nodes, states = _plain_run(scenes, steps)
     moments = {name: Moments() for name in corrector.normaliser.names}
-    for _ in range(steps):
-        after = stepper(state).state
+    for state, after in itertools.pairwise(states):
         coarse = after.positions if config.placement == "state" else None
         view = View(nodes.graph, nodes.snapshot(state, coarse, None))
         for table, names in (
@@ -55,11 +55,36 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         ):
             for name in names:
                 moments[name].add(table[name][1](view))
-        state = after
     target = Moments()
     target.add(torch.full((4, 1), size))
     corrector.normaliser.fit(moments, target)
     return corrector
+
+
+_plain_runs: dict = {}
+"""By what a run depends on: tests fit correctors to the same few scenes."""
+
+
+def _plain_run(scenes, steps):
+    """Bodies of a batch and its states from rest on, ``steps`` steps; never changed by anyone."""
+    key = (steps, *(_contents(problem) for problem in scenes))
+    if key not in _plain_runs:
+        stepper = pc.BatchStepper(scenes)
+        states = [stepper.rest_state()]
+        for _ in range(steps):
+            states.append(stepper(states[-1]).state)
+        _plain_runs[key] = BatchBodies(stepper), states
+    return _plain_runs[key]
+
+
+def _contents(problem):
+    """What tells two problems apart, as bytes."""
+    materials, clamps = problem.materials, problem.clamps
+    arrays = (
+        problem.mesh.positions, problem.mesh.cells, problem.mass, problem.mass_matrix.data,
+        problem.free, clamps.rest, materials.young, materials.poisson, materials.density,
+    )  # fmt: skip
+    return (problem.scene.to_toml(), *(a.tobytes() for a in arrays))
 
 
 def silent(corrector):
