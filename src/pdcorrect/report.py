@@ -224,4 +224,6 @@ def _panel_label(comparison: Comparison, row: Row) -> str:
         if row.label == comparison.reference
         else f"RMS error {1e3 * row.rms_error:.2g} mm"
     )
-    return f"{row.label}, {row.nodes} nodes\n{error}, {1e3 * row.seconds_a_frame:.3g} ms a frame"
+    ms = 1e3 * row.seconds_a_frame
+    time = f"{ms:.3g}" if ms < 999.5 else f"{ms:.0f}"  # no powers of ten
+    return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame"
