@@ -946,6 +946,9 @@ def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
     text = samples.config(samples.one_step(iterations=3), report_every=1).to_toml()
     (tmp_path / "c.toml").write_text(text)
     call = ("train", tmp_path / "c.toml", "--data", short, "-o", tmp_path / "out")
+    status, _, err = program(*call, "--evaluate", "eval")
+    assert (status, (tmp_path / "out").exists()) == (2, False)
+    assert "eval" in err
     status, out, err = program(*call, "--seconds", 1e-6)
     assert status == 1, err
     assert "not finished after 1 iterations" in out

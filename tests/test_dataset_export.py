@@ -862,6 +862,12 @@ def test_the_program_imports_and_exports(program, runs, tmp_path):
     )  # fmt: skip
     assert (status, err) == (0, "")
     assert "mesh-0000.h5" in out.replace("\n", "")
+    status, _, err = program(
+        "dataset", "import", tmp_path / "fine.h5", "-o", root, "--split", "train"
+    )
+    assert status == 0
+    assert err.startswith("note: split 'train' is one of your own; training reads 'training' and")
+    shutil.rmtree(root / "train")
     status, out, _ = program("dataset", "export", root, tmp_path / "mgn")
     assert status == 0
     assert (tmp_path / "mgn" / "train.h5").exists()

@@ -211,13 +211,16 @@ def import_(
         Optional[list[Path]],
         typer.Option(help="Coarse trajectory; one for each reference, in order."),
     ] = None,
-    split: Annotated[str, typer.Option(help="Split.")] = "training",
+    split: Annotated[
+        str, typer.Option(help="Split: training, validation, evaluation, or a name of your own.")
+    ] = "training",
     number: Annotated[int, typer.Option(help="Number of the mesh in the split.", min=0)] = 0,
     best: Annotated[
         bool, typer.Option("--best", help="Also compute the best coarse model's run.")
     ] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
+    from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
     from pdcorrect.data.import_files import import_trajectories
 
     if "/" in split or split in ("", ".", ".."):
@@ -226,6 +229,13 @@ def import_(
         sources, output, coarse=coarse or (), split=split, number=number, best=best
     )
     typer.echo(f"wrote {path}")
+    known = (TRAINING, VALIDATION, EVALUATION)
+    if split not in known:
+        typer.echo(
+            f"note: split {split!r} is one of your own; training reads {TRAINING!r} and "
+            f"{VALIDATION!r}, evaluation {EVALUATION!r} unless told otherwise.",
+            err=True,
+        )
 
 
 @contextlib.contextmanager

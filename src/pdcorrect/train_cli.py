@@ -49,6 +49,10 @@ def train(
     from pdcorrect.training.world import joined
 
     loaded = TrainingConfig.load(config)
+    if evaluate is not None:
+        from pdcorrect.data.folder import shard_paths
+
+        shard_paths(data, evaluate)  # refused now, not when the training has ended
     with joined(device) as (world, own):
         training = Training(
             loaded, data, output, device=own, resume=resume, world=world, on_report=_tell

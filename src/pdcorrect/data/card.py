@@ -215,9 +215,11 @@ def _generation(
 ) -> str:
     where = made_with.get("device", "cpu")
     machine = made_with.get("processor", "?") if where == "cpu" else where
+    device = "" if where == "cpu" else " --device cuda --workers N"
     return (
-        f"`pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}: "
-        f"{info.whole.seconds['total']:.3g} s of computing time in all, begun on "
+        f"`pdcorrect dataset generate {CONFIG} -o FOLDER{device}`, seed {config.seed}: "
+        f"{info.whole.seconds['total']:.3g} s of all workers in all, those that share a GPU "
+        "waiting for each other and compiling of kernels included, begun on "
         f"{made_with.get('date', '?')} with pdcorrect {made_with.get('pdcorrect', '?')} on "
         f"{machine}.\n\nSHA-256 of all files' contents: `{content}`. On another processor or "
         "device numbers agree to the solver's tolerance, and the hash differs."
