@@ -9,7 +9,7 @@ from pathlib import Path
 from pdcorrect.data.config import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.info import DatasetInfo, SplitInfo
+from pdcorrect.data.info import FEWEST, DatasetInfo, SplitInfo
 from pdcorrect.data.schema import CONFIG, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError
@@ -48,8 +48,6 @@ _LIMITS = (
     "No contact, no gravity, one material a body.",
 )
 CONVERGED = "time-converged"
-_FEWEST = 20
-"""Simulations for which a 5 % quantile is told."""
 
 
 def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
@@ -187,7 +185,7 @@ def _errors(info: DatasetInfo) -> str:
     return _table(heads, rows) + (
         "\n\nDistances from the reference on the coarse nodes, means over simulations; Omega (eq. "
         "7-3) is the share of the plain run's squared error that is gone, per cent. A dash: fewer "
-        f"than {_FEWEST} simulations give no 5 % quantile."
+        f"than {FEWEST} simulations give no 5 % quantile."
     )
 
 
@@ -195,13 +193,9 @@ def _runs(name: str, split: SplitInfo) -> Iterable[tuple[object, ...]]:
     for run, found in split.runs.items():
         if found.rms_error is None and found.step_error is None:
             continue
-        omega = found.omega
-        shares = (omega.mean, omega.median, omega.q05, omega.smallest) if omega else (None,) * 4
         errors = (found.rms_error, found.step_error)
-        lengths = [None if e is None else 1e3 * e for e in errors]
-        texts = ["" if v is None else f"{v:.3g}" for v in (*lengths, *shares)]
-        if omega and found.simulations < _FEWEST:
-            texts[4] = "–"
+        texts = ["" if e is None else f"{1e3 * e:.3g}" for e in errors]
+        texts += found.omega_texts()
         yield (name, f"`{run}`", *texts)
 
 

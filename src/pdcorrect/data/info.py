@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 
+FEWEST = 20
+"""Simulations for which a 5 % quantile is told."""
+
+
 @dataclass(frozen=True)
 class Spread:
     """How a quantity is distributed over simulations."""
@@ -66,6 +70,17 @@ class RunInfo:
     rms_error: float | None
     step_error: float | None
     omega: Spread | None
+
+    def omega_texts(self) -> tuple[str, str, str, str]:
+        """Mean, median, 5 % quantile and worst of omega for a table.
+
+        Empty where there is none; a dash for the quantile of fewer than `FEWEST` simulations.
+        """
+        if self.omega is None:
+            return "", "", "", ""
+        quantile = _text(self.omega.q05) if self.simulations >= FEWEST else "–"
+        mean, median, worst = map(_text, (self.omega.mean, self.omega.median, self.omega.smallest))
+        return mean, median, quantile, worst
 
 
 @dataclass(frozen=True)
@@ -305,10 +320,8 @@ def _error_table(info: DatasetInfo) -> Any:
     for split_name, split in _rows(info):
         runs = {name: run for name, run in split.runs.items() if name != REFERENCE}
         for number, (name, run) in enumerate(runs.items()):
-            omega = run.omega
-            shares = (omega.mean, omega.median, omega.q05, omega.smallest) if omega else [None] * 4
             errors = _text(run.rms_error, 1e3), _text(run.step_error, 1e3)
-            table.add_row("" if number else split_name, name, *errors, *map(_text, shares))
+            table.add_row("" if number else split_name, name, *errors, *run.omega_texts())
     return table
 
 
