@@ -31,19 +31,13 @@ def test_example_scenes_run_with_both_solvers(path):
     assert pc.metrics.largest_displacement(pd) > 0.02 * problem.cell_size
 
 
-def run_script(name, folder, **constants):
-    """The summary of a script in examples/, which draws one figure of its name.
-
-    ``constants`` replace those of the script.
-    """
+def run_script(name, folder):
+    """The summary of a script in examples/, which draws one figure of its name."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     try:
         spec.loader.exec_module(module)
-        for constant, value in constants.items():
-            assert hasattr(module, constant), constant
-            setattr(module, constant, value)
         summary = module.main(folder)
     finally:
         del sys.modules[name]
@@ -64,15 +58,10 @@ def test_the_target_is_reached(tmp_path):
     assert max(distances.values()) < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("iterations", "factor"),
-    [(8, 4.0), pytest.param(30, 20.0, marks=pytest.mark.slow)],
-    ids=["few iterations", "all iterations"],
-)
-def test_the_network_learns_to_reach_targets(tmp_path, iterations, factor):
+def test_the_network_learns_to_reach_targets(tmp_path):
     pytest.importorskip("torch")
-    summary = run_script("train_with_layer", tmp_path, ITERATIONS=iterations)
-    assert summary["factor"] > factor
+    summary = run_script("train_with_layer", tmp_path)
+    assert summary["factor"] > 20.0
 
 
 OWN = ROOT / "examples" / "bring_your_own"

@@ -98,11 +98,12 @@ def whole(run, tmp_path_factory):
 
 def test_a_file_left_between_any_two_writes_is_continued(run, whole, tmp_path, monkeypatch):
     """What a killed process leaves: the bytes on the disk, without what HDF5 still holds."""
-    left = {}  # with what was found on the disk more than once counted once
+    noted, left = [], {}  # what is on the disk again is tried once
     real = GrowingFile._extend
 
     def note(file):
         if file.path.exists():
+            noted.append(file.records)
             left[file.records, file.path.read_bytes()] = None
 
     def noting(self, name, entries):
@@ -113,6 +114,7 @@ def test_a_file_left_between_any_two_writes_is_continued(run, whole, tmp_path, m
     with monkeypatch.context() as patch:
         patch.setattr(GrowingFile, "_extend", noting)
         write(tmp_path / "noted.h5", run)
+    assert len(noted) > 100
     assert len(left) > 80
     path = tmp_path / "run.h5"
     for records, data in left:

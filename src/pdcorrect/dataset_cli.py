@@ -81,7 +81,7 @@ def check(
 ) -> None:
     """Read every file, compare it with config.toml and the others, print what is wrong.
 
-    Some steps of the coarse models are taken again, if they are generated ones.
+    Of a generated data set some steps of the coarse models are taken again.
 
     The exit status is 1 if there are errors; warnings do not count.
     """

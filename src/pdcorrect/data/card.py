@@ -10,7 +10,7 @@ from pdcorrect.data.config import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import FEWEST, DatasetInfo, SplitInfo
-from pdcorrect.data.schema import CONFIG, MANIFEST, PLAIN
+from pdcorrect.data.schema import CONFIG, CONVERGED, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError
 
@@ -47,7 +47,6 @@ _LIMITS = (
     "`training`, as `evaluation`, pass a stricter filter.",
     "No contact, no gravity, one material a body.",
 )
-CONVERGED = "time-converged"
 
 
 def dataset_card(folder: str | Path, info: DatasetInfo) -> str:

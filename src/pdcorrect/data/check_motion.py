@@ -15,7 +15,7 @@ import numpy as np
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import MOST_ITERATIONS
 from pdcorrect.data.plan import MeshPlan
-from pdcorrect.data.rebuild import COARSE, rebuilt_problems
+from pdcorrect.data.rebuild import COARSE, FORCE_ERROR, rebuilt_problems
 from pdcorrect.data.schema import REFERENCE, STATISTICS, Array, Shard, Simulation
 from pdcorrect.data.simulate import models
 from pdcorrect.errors import InputError
@@ -27,8 +27,6 @@ from pdcorrect.state import State
 _CENTRE = np.full((1, 3), 0.5)
 _LOADS_COMPARED = 8
 """Steps of each simulation, the first and the last among them."""
-_FORCE_ERROR = 1e-5
-"""Largest difference of forces over their largest; stored ones are float32."""
 _STEP_ERROR = 10.0
 """Largest distance from a step that is taken again, in tolerances of the data set."""
 _ROUNDINGS = 16.0
@@ -91,9 +89,9 @@ def load_faults(problem: Problem, shard: Shard, simulation: Simulation) -> Itera
     steps = np.unique(np.linspace(0, simulation.steps - 1, _LOADS_COMPARED).astype(int))
     wanted = np.stack([problem.external_forces(k * h, (k + 1) * h) for k in steps])
     away = np.abs(wanted - simulation.forces[steps]).max(axis=(1, 2))
-    if away.max() > _FORCE_ERROR * np.abs(wanted).max():
-        first = int(steps[np.argmax(away > _FORCE_ERROR * np.abs(wanted).max())])
-        yield f"its forces in step {first + 1} are not what config.toml draws"
+    wrong = steps[away > FORCE_ERROR * np.abs(wanted).max()]
+    if len(wrong):
+        yield f"its forces in step {wrong[0] + 1} are not what config.toml draws"
 
 
 def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:

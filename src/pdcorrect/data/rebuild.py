@@ -15,7 +15,7 @@ from pdcorrect.scene import Scene, best_coarse
 
 COARSE = (PLAIN, BEST, "total-mass")
 """Runs of models on the coarse mesh, which a corrector can be added to."""
-_FORCE_ERROR = 1e-5
+FORCE_ERROR = 1e-5
 """Largest difference of loads from the stored ones, over their largest; those are float32."""
 
 
@@ -110,7 +110,7 @@ def _check_loads(problem: Problem, shard: Shard, path: Path, k: int) -> None:
     size = float(np.abs(forces).max())
     for step in (0, len(forces) - 1):
         found = problem.external_forces(step * h, (step + 1) * h)
-        if np.abs(found - forces[step]).max() > _FORCE_ERROR * size:
+        if np.abs(found - forces[step]).max() > FORCE_ERROR * size:
             raise InputError(
                 f"{path}: simulation {k}: loads of step {step + 1} rebuilt from the stored scene "
                 "differ from the file's: expected the same."

@@ -45,6 +45,8 @@ from pdcorrect.replacement import part_of_process, replacing
 
 REFERENCE, PLAIN, BEST = "reference", "plain", "best"
 """Runs: the truth, the plain coarse model, and `pdcorrect.best_coarse`'s."""
+CONVERGED = "time-converged"
+"""Run: the reference with smaller time steps."""
 SUFFIX = ".h5"
 CONFIG, MANIFEST, NORMALISATION = "config.toml", "manifest.json", "statistics.json"
 """Files of a data set besides those of its meshes."""

@@ -12,7 +12,7 @@ import numpy as np
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import BEST, CONVERGED, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
@@ -92,7 +92,7 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
         found["total-mass"] = Model(1, heavy=True)
     if mesh.split == EVALUATION:
         if config.converged_steps:
-            found["time-converged"] = Model(
+            found[CONVERGED] = Model(
                 mesh.refine, best=exact, divisor=config.converged_steps, truth=True
             )
         if mesh.number < config.finest_meshes:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.graph import velocities
-from pdcorrect.data.schema import PLAIN
+from pdcorrect.data.schema import CONVERGED, PLAIN
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.evaluation.cases import Case
 from pdcorrect.evaluation.physics import energies, stress_error
@@ -23,9 +23,6 @@ from pdcorrect.metrics import (
 )
 
 Array = NDArray[np.float64]
-
-CONVERGED = "time-converged"
-"""Run: the reference with smaller time steps."""
 
 
 @dataclass(frozen=True, eq=False)
