@@ -665,6 +665,32 @@ def test_a_damaged_file_is_named_and_may_be_left_out(damaged):
     assert "checksum" in content["data"]["damaged"]["mesh-0001.h5"]
 
 
+@pytest.fixture
+def unfinished(tmp_path):
+    """The tiny data set with a file of its evaluation split not there yet."""
+    folder = tmp_path / "tiny"
+    shutil.copytree(TINY, folder)
+    (folder / "evaluation" / "mesh-0001.h5").unlink()
+    return folder
+
+
+def test_a_split_of_which_files_are_missing_is_evaluated_on_request_only(unfinished):
+    with pytest.raises(InputError, match=r"evaluation: 1 of the files .* as mesh-0001\.h5"):
+        evaluate([], unfinished)
+    found = evaluate([], unfinished, incomplete=True)
+    assert [path.name for path in found.missing] == ["mesh-0001.h5"]
+    assert json.loads(tables.to_json(found))["data"]["missing"] == ["mesh-0001.h5"]
+    assert {t.measures.mesh for t in found.runs["plain"].trajectories} == {0, 2}
+
+
+def test_the_command_says_what_was_missing(unfinished):
+    refused = CliRunner().invoke(app, ["evaluate", str(unfinished)])
+    assert "--incomplete" in str(refused.exception)
+    done = CliRunner().invoke(app, ["evaluate", str(unfinished), "--incomplete"])
+    assert done.exit_code == 0
+    assert "1 of 3 files of the split are missing" in done.output
+
+
 def untrained(folder, base="plain", seed=0, dataset="tiny"):
     """A saved model whose correction is zero."""
     corrector = Corrector(preset("compact", layers=1, width=8))

@@ -718,6 +718,18 @@ def test_stages_share_the_groups_that_are_alike(folder, tmp_path, monkeypatch):
     assert len(made) == len({tuple(names) for names in made}) == 1
 
 
+@pytest.mark.parametrize("split", ["training", "validation"])
+def test_splits_of_which_files_are_missing_are_refused_unless_asked_for(split, tmp_path):
+    data, output = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(ROOT / "datasets" / "tiny", data)
+    (data / split / "mesh-0001.h5").unlink()
+    settings = samples.config(samples.one_step(iterations=1))
+    with pytest.raises(InputError, match=rf"{split}: 1 of the files .* as mesh-0001\.h5"):
+        Training(settings, data, output)
+    assert not output.exists()
+    Training(settings, data, output, incomplete=True)
+
+
 def test_too_long_a_horizon_is_refused(folder):
     recordings = load_recordings(folder, "training", "plain")
     with pytest.raises(InputError, match="0 simulations of 21 steps or more"):

@@ -134,6 +134,7 @@ ORDER = [
     "data.shard_reader",
     "data.damage",
     "data.folder",
+    "data.missing",
     "data.graph",
     "data.shard_arrays",
     "data.cache",

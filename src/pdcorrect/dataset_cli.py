@@ -164,11 +164,12 @@ def export(
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
     from pdcorrect.data import export as exports
+    from pdcorrect.data.missing import missing_files
 
     if to is Layout.meshgraphnet:
         _unused(to, {"--mesh": mesh, "--simulation": simulation, "--run": run})
         with contextlib.suppress(InputError):  # of config.toml, which no export needs
-            _warn_of_missing(exports.missing_files(folder, split))
+            _warn_of_missing(missing_files(folder, split))
         written = exports.export_meshgraphnet(
             folder, target, base=base or "plain", split=split, overwrite=overwrite
         )

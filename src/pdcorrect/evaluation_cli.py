@@ -35,6 +35,9 @@ def evaluate(
     skip_damaged: Annotated[
         bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
     ] = False,
+    incomplete: Annotated[
+        bool, typer.Option("--incomplete", help="Also if files of the split are missing.")
+    ] = False,
     figures: Annotated[
         bool, typer.Option(help="Also draw figures into the folder (extra 'view').")
     ] = True,
@@ -61,7 +64,7 @@ def evaluate(
         task = progress.add_task("evaluating", total=None)
         found = run(
             [one.candidate for one in saved], folder, split, device=device, batch=batch,
-            workers=workers, skip_damaged=skip_damaged,
+            workers=workers, skip_damaged=skip_damaged, incomplete=incomplete,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
     notes = _notes(saved, found)
@@ -76,6 +79,12 @@ def evaluate(
 def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
     notes = [f"left out: {text}" for text in found.damaged.values()]
+    if found.missing:
+        count = len(found.missing) + len(found.shards) + len(found.damaged)
+        notes.append(
+            f"{len(found.missing)} of {count} files of the split are missing: all figures are of "
+            "the others."
+        )
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
     for name, run in found.runs.items():

@@ -29,6 +29,10 @@ def train(
         Optional[float],
         typer.Option(help="Stop after about so many seconds, start included; --resume goes on."),
     ] = None,
+    incomplete: Annotated[
+        bool,
+        typer.Option("--incomplete", help="Also if files of the data set's splits are missing."),
+    ] = False,
     evaluate: Annotated[
         Optional[str],
         typer.Option(
@@ -51,11 +55,21 @@ def train(
     loaded = TrainingConfig.load(config)
     if evaluate is not None:
         from pdcorrect.data.folder import shard_paths
+        from pdcorrect.data.missing import check_whole
 
         shard_paths(data, evaluate)  # refused now, not when the training has ended
+        if not incomplete:
+            check_whole(data, [evaluate])
     with joined(device) as (world, own):
         training = Training(
-            loaded, data, output, device=own, resume=resume, world=world, on_report=_tell
+            loaded,
+            data,
+            output,
+            device=own,
+            resume=resume,
+            incomplete=incomplete,
+            world=world,
+            on_report=_tell,
         )
         left = None if seconds is None else max(0.0, seconds - (time.monotonic() - started))
         finished = training.run(left)
@@ -72,7 +86,7 @@ def train(
 
         judge(
             [str(output / MODEL), str(data)], split=evaluate, device=own,
-            output=output / EVALUATION, figures=False,
+            output=output / EVALUATION, incomplete=incomplete, figures=False,
         )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ import common
 from scenarios import SCENARIOS, Scenario
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from solvers import SOLVERS, Run, run, tight
+from solvers import MODELS, SOLVERS, Run, run, tight
 
 import pdcorrect as pc
 from pdcorrect.fem.hexahedron import corner_jacobians
@@ -107,7 +107,7 @@ def part(scenario: Scenario) -> common.Outcome:
         "PD best": cache(partial(tight, scenario, "PD best")),
         "Newton": partial(tight, scenario, "Newton"),
     }
-    reference["hybrid"] = reference["PD best"]
+    reference |= dict.fromkeys(MODELS, reference["PD best"])
     for solver in SOLVERS:
         if scenario.solvers and solver not in scenario.solvers:
             cells.append("–")
@@ -175,7 +175,7 @@ def _detail(scenario: Scenario, solver: str, found: Run, far: float) -> tuple[fl
     frames = len(found.statuses)
     unusual = sum(status in FALLBACKS for status in found.statuses)
     inverted = found.statuses.count(pc.Status.INVERTED)
-    refused = f"{sum(found.refused)} of {frames}" if solver == "hybrid" else ""
+    refused = f"{sum(found.refused)} of {frames}" if solver in MODELS else ""
     return (
         scenario.name, solver, far, worst(found).name, unusual, inverted,
         float(np.mean(found.iterations)), max(found.iterations), refused,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -13,9 +13,11 @@ from scenarios import Scenario
 import pdcorrect as pc
 
 Array = np.ndarray
-SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid")
+MODELS = {"hybrid": "tiny", "hybrid torsion": "torsion-exact"}
+"""Correctors by solver."""
+SOLVERS = ("PD", "PD best", "Newton", "batch", *MODELS)
 """Projective dynamics on the plain and on the best coarse mesh, Newton and the batch stepper on
-the plain one, and the model `tiny` with its gate on the best."""
+the plain one, and correctors with their gate on the best."""
 
 TIGHT = 1e-8
 """Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""
@@ -44,7 +46,7 @@ class Run:
 
 def problem_of(scenario: Scenario, solver: str) -> pc.Problem:
     """The mesh that a solver works on."""
-    best = solver in ("PD best", "hybrid")
+    best = solver == "PD best" or solver in MODELS
     return pc.discretise(pc.best_coarse(scenario.scene) if best else scenario.scene)
 
 
@@ -64,19 +66,19 @@ def tight(scenario: Scenario, solver: str) -> Run:
 
 
 @cache
-def _model() -> Any:
-    return pc.load_model("tiny").corrector
+def _corrector(model: str) -> Any:
+    return pc.load_model(model).corrector
 
 
-def _hybrid(problem: pc.Problem) -> pc.HybridStepper:
-    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _model(), gate=pc.Gate())
+def _hybrid(model: str, problem: pc.Problem) -> pc.HybridStepper:
+    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _corrector(model), gate=pc.Gate())
 
 
 MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
     "PD": pc.ProjectiveDynamics,
     "PD best": pc.ProjectiveDynamics,
     "Newton": pc.Newton,
-    "hybrid": _hybrid,
+    **{solver: partial(_hybrid, model) for solver, model in MODELS.items()},
 }
 
 

@@ -11,12 +11,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.export_target import SIMULATOR, placed, staging_folder
 from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.graph import node_means, tetrahedra, velocities
-from pdcorrect.data.plan import make_plan
-from pdcorrect.data.schema import CONFIG, PLAIN, REFERENCE, SUFFIX, Shard, Simulation
+from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.vtk import write_vtu_series
@@ -166,28 +165,6 @@ def export_vtu(
     with staging_folder(Path(target), overwrite) as staging:
         written = [_write_series(shard, found, name, staging, series) for name in names]
         return placed(written, Path(target))
-
-
-def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
-    """Files that a data set's ``config.toml`` asks for and that are not there.
-
-    Parameters
-    ----------
-    folder : path
-    split : str, optional
-        The only one to look at; all by default.
-
-    Raises
-    ------
-    InputError
-        If the configuration cannot be used.
-    """
-    folder = Path(folder)
-    if not (folder / CONFIG).exists():
-        return []
-    plans = make_plan(DatasetConfig.load(folder / CONFIG))
-    paths = [folder / f"{p.name}{SUFFIX}" for p in plans if split in (None, p.split)]
-    return [path for path in paths if not path.exists()]
 
 
 def _chosen(simulation: Simulation, runs: Sequence[str] | None) -> Sequence[str]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage
+from pdcorrect.data.missing import check_whole, missing_files
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.cases import Case, read_cases
@@ -101,6 +102,8 @@ class Evaluation:
         Content hash of each file, by its name.
     damaged : mapping of Path to str
         Files that were left out.
+    missing : tuple of Path
+        Files that the data set's configuration asks for and that are not there.
     """
 
     dataset: str
@@ -111,6 +114,7 @@ class Evaluation:
     runs: Mapping[str, EvaluatedRun]
     shards: Mapping[str, str]
     damaged: Damage = field(default_factory=dict)
+    missing: tuple[Path, ...] = ()
 
 
 def evaluate(
@@ -122,6 +126,7 @@ def evaluate(
     batch: int = 32,
     workers: int = 1,
     skip_damaged: bool = False,
+    incomplete: bool = False,
     on_cases: OnCases | None = None,
 ) -> Evaluation:
     """Free rollouts and single steps of candidates, and of the stored runs, measured.
@@ -144,13 +149,16 @@ def evaluate(
         Processes that measure; the results do not depend on their number.
     skip_damaged : bool
         Leave out files that are damaged.
+    incomplete : bool
+        Take the files that are there, if the data set's configuration asks for more.
     on_cases : callable, optional
         For progress.
 
     Raises
     ------
     InputError
-        If names are not unlike, a base is none, or as of `read_cases`.
+        If names are not unlike, a base is none, files of the split are missing, or as of
+        `read_cases`.
     FileFormatError
         As of `read_cases`.
     """
@@ -160,6 +168,8 @@ def evaluate(
         raise InputError(f"workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
+    if not incomplete:
+        check_whole(folder, [split])
     stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
     names = [candidate.name for candidate in candidates]
     if len({*names, *stored, REFERENCE}) < len(names) + len({*stored, REFERENCE}):
@@ -206,6 +216,7 @@ def evaluate(
     return Evaluation(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
         float(about["time_step"]), runs, found.shards, found.damaged,
+        tuple(missing_files(folder, split)),
     )  # fmt: skip
 
 

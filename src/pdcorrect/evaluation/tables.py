@@ -64,6 +64,7 @@ def to_json(evaluation: Evaluation, record: Mapping[str, Any] | None = None, see
             "trajectories": count,
             "shards": dict(evaluation.shards),
             "damaged": {path.name: text for path, text in evaluation.damaged.items()},
+            "missing": [path.name for path in evaluation.missing],
         },
         "runs": {name: _run(run, seed) for name, run in evaluation.runs.items()},
         "seeds": {

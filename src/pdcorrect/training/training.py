@@ -25,6 +25,7 @@ from pdcorrect.corrector.model_io import (
 )
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import splits_of
+from pdcorrect.data.missing import check_whole
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.toml_config import as_toml
@@ -62,6 +63,8 @@ class Training:
     device : str
     resume : bool
         Go on from the checkpoint, if there is one.
+    incomplete : bool
+        Take the files that are there, if the data set's configuration asks for more.
     world : World
     on_report : callable, optional
         Called with each row of the history.
@@ -76,8 +79,9 @@ class Training:
     ------
     InputError
         If the folder holds a training and ``resume`` is not set, or it was another one; if
-        the data do not have what the configuration wants, or the model to start from is
-        missing, or of another architecture, base or velocity; if a teacher is.
+        files of the data set are missing, or do not have what the configuration wants; if the
+        model to start from is missing, or of another architecture, base or velocity; if a
+        teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -90,12 +94,15 @@ class Training:
         *,
         device: str = "cpu",
         resume: bool = False,
+        incomplete: bool = False,
         world: World | None = None,
         on_report: Report | None = None,
     ) -> None:
         self.config, self.world = config, World() if world is None else world
         self.device = usable_device(device)
         self.output, self._on_report = Path(output), on_report
+        if not incomplete:
+            check_whole(data, (TRAINING, VALIDATION))
         splits = [s for s in (TRAINING, VALIDATION) if s in splits_of(data)]
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
