@@ -8,8 +8,8 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c c
 
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
-demo: $(VENV)/view.stamp
-	$(BIN)/pdcorrect compare examples/twisted_cross.toml -o demo
+demo: $(VENV)/view.stamp $(VENV)/learn.stamp
+	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact -o demo
 
 demo-learn: $(VENV)/learn.stamp
 	rm -rf demo-learn

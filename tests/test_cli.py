@@ -16,6 +16,8 @@ import pdcorrect as pc
 from conftest import beam, cross
 from pdcorrect import cli, report
 
+ROOT = Path(__file__).parent.parent
+
 PROGRAM = Path(sys.executable).parent / "pdcorrect"
 
 
@@ -329,3 +331,41 @@ def test_render_refuses_what_would_mislead(program, scene_file, tmp_path):
         status, _, err = program("render", tmp_path / "a.h5", *more)
         assert status == cli.BAD_INPUT
         assert words in err
+
+
+def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program, tmp_path):
+    pytest.importorskip("torch_geometric")
+    scene, folder = ROOT / "examples" / "unseen_cross.toml", tmp_path / "report"
+    command = ("compare", scene, "-o", folder, "--frames", 6, "--no-figures")
+    assert program(*command, "--model", "torsion-exact-compact")[0] == 0
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    coarse = ["coarse PD", "coarse Newton", "best coarse PD", "hybrid torsion-exact-compact"]
+    assert list(rows) == [*coarse, "intermediate PD", "fine best PD"]
+    errors = [float(rows[name]["rms_error"]) for name in coarse]
+    assert errors[3] < 0.5 * errors[2] < 0.5 * errors[0]
+    assert [rows[name]["refused_frames"] for name in coarse] == ["", "", "", "0"]
+    assert rows[coarse[3]]["solver"] == "hybrid"
+
+
+def test_a_corrector_of_the_plain_mesh_is_held_against_the_plain_fine_run():
+    pytest.importorskip("torch_geometric")
+    cases = pc.evaluate.cases_with(["torsion-as-published"])
+    assert cases[:-1] == pc.evaluate.CASES
+    assert (cases[-1].label, cases[-1].better) == ("hybrid torsion-as-published", False)
+
+
+def test_refused_corrections_are_told(program, tmp_path):
+    pytest.importorskip("torch_geometric")
+    scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
+    stiff = scene.with_changes(material={"young": 1e7}, time={"frames": 2})
+    cases = (pc.evaluate.CASES[2], pc.evaluate.cases_with(["torsion-exact"])[-1])
+    notes = report.notes(pc.compare(stiff, cases=cases))
+    assert "hybrid torsion-exact: 2 of 2 corrections were refused by the gate." in notes
+
+
+def test_compare_with_a_model_that_is_not_there_is_bad_input(program, scene_file, tmp_path):
+    pytest.importorskip("torch_geometric")
+    status, _, err = program("compare", scene_file, "-o", tmp_path / "r", "--model", "nothing")
+    assert status == cli.BAD_INPUT
+    assert "nothing" in err
+    assert not (tmp_path / "r").exists()

@@ -102,9 +102,17 @@ def compare(
         "comparison"
     ),
     frames: Frames = None,
+    model: Annotated[
+        Optional[list[str]],
+        typer.Option(help="Also a corrector, by name or folder; repeatable (extra 'learn')."),
+    ] = None,
     figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
 ) -> None:
-    """Run coarse, intermediate and fine PD and Newton; report error and run time."""
+    """Run coarse, intermediate and fine PD and Newton; report error and run time.
+
+    With a corrector of the best coarse model, the fine run has that model's element, and the
+    best coarse model itself is compared too.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -118,25 +126,26 @@ def compare(
     if figures:
         require_extra("pyvista", "view")
         require_extra("matplotlib", "view")
+    if model:
+        require_extra("torch", "learn")
     loaded = Scene.load(scene)
+    cases = evaluate.cases_with(model or [])
     count = frames or loaded.time.frames
     make_folder(output)
     with progress_bar() as progress:
-        tasks = {
-            c.label: progress.add_task(c.label, total=count, start=False) for c in evaluate.CASES
-        }
+        tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases}
 
         def on_step(label: str, frame: int, result: StepResult) -> None:
             if frame == 1:
                 progress.start_task(tasks[label])
             progress.update(tasks[label], completed=frame)
 
-        comparison = evaluate.compare(loaded, count, on_step=on_step)
+        comparison = evaluate.compare(loaded, count, cases, on_step)
 
     table = Table(title=loaded.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for heading in report.HEADINGS:
         table.add_column(heading, justify="right", no_wrap=True)
-    table.columns[0].justify = "left"
+    table.columns[0].justify, table.columns[0].no_wrap = "left", False
     for row in report.table(comparison):
         table.add_row(*row)
     Console().print(table)

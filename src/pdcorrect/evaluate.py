@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from pdcorrect import metrics
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import discretise
-from pdcorrect.scene import Scene
+from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
@@ -24,11 +25,30 @@ OnStep = Callable[[str, int, StepResult], None]
 
 @dataclass(frozen=True)
 class Case:
-    """One solver on one mesh."""
+    """One solver on one mesh.
+
+    Attributes
+    ----------
+    label : str
+    solver : str
+        "pd" or "newton".
+    refine : int
+    better : bool
+        With the element and mass of `best_coarse`, on any mesh.
+    model : str or None
+        Name or folder of a corrector of the steps.
+    """
 
     label: str
     solver: str
     refine: int
+    better: bool = False
+    model: str | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is the scene itself on the coarse mesh."""
+        return self.refine == 1 and not self.better and self.model is None
 
 
 CASES = (
@@ -48,7 +68,8 @@ class Row:
     reference case, in metres; ``omega`` is eq. 7-2 with the first case on the
     coarse mesh as its zero.  Times are medians for one frame; ``setup_seconds``
     covers meshing, assembly and the first factorisation.  ``unusual_frames``
-    converged only by a fallback (see `Status`).
+    converged only by a fallback (see `Status`).  ``refused_frames`` are those whose correction
+    a gate refused; None without a corrector.
     """
 
     label: str
@@ -63,6 +84,7 @@ class Row:
     setup_seconds: float
     iterations_a_frame: float
     unusual_frames: int
+    refused_frames: int | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +133,65 @@ def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
     return kinds[solver](discretise(scene, refine=refine)).prepare()
 
 
+def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
+    """The default comparison with correctors.
+
+    Those of the best coarse model have learned references with its element: all errors
+    are then distances from such a one, and the best coarse model is among the cases.
+
+    Parameters
+    ----------
+    models : sequence of str
+        Names or folders.
+
+    Raises
+    ------
+    InputError
+        If there is no such model, or it corrects neither the plain nor the best coarse model.
+    """
+    if not models:
+        return CASES
+    from pdcorrect.corrector.model_io import load_model
+
+    bases = {name: load_model(name).base for name in models}
+    for name, base in bases.items():
+        if base not in ("plain", "best"):
+            raise InputError(f"{name}: a corrector of {base!r}: expected of 'plain' or 'best'.")
+    reference, *others = CASES
+    better = "best" in bases.values()
+    return (
+        replace(reference, label="fine best PD", better=True) if better else reference,
+        *others,
+        *([Case("best coarse PD", "pd", 1, better=True)] if better else []),
+        *(
+            Case(f"hybrid {Path(name).name}", "pd", 1, base == "best", name)
+            for name, base in bases.items()
+        ),
+    )
+
+
+def case_stepper(scene: Scene, case: Case) -> Stepper:
+    """What steps a case, factorised and with its kernels compiled; correctors have their gate.
+
+    Raises
+    ------
+    InputError
+        If there is no such solver or model, or a model does not fit the scene.
+    """
+    if case.better:
+        scene = best_coarse(scene)
+    if case.model is None:
+        return make_stepper(scene, case.solver, case.refine)
+    from pdcorrect.corrector.gate import Gate
+    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.corrector.model_io import load_model
+
+    model = load_model(case.model)
+    coarse = ProjectiveDynamics(discretise(scene, refine=case.refine))
+    hybrid = HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=Gate())
+    return hybrid.prepare()
+
+
 def compare(
     scene: Scene,
     frames: int | None = None,
@@ -135,24 +216,22 @@ def compare(
     runs, on_coarse, setup = {}, {}, {}
     for case in cases:
         started = time.perf_counter()
-        stepper = make_stepper(scene, case.solver, case.refine)
+        stepper = case_stepper(scene, case)
         setup[case.label] = time.perf_counter() - started
         runs[case.label] = rollout(
             stepper, frames, on_step=_progress(on_step, case.label), on_failure="raise"
         )
         on_coarse[case.label] = restrict(runs[case.label], to=coarse)
     truth = on_coarse[cases[0].label]
-    base = next(
-        (on_coarse[c.label] for c in cases[::-1] if c.refine == 1 and c.solver == "pd"), None
-    )
+    base = next((on_coarse[c.label] for c in cases[::-1] if c.plain and c.solver == "pd"), None)
     rows = []
-    for case in sorted(cases, key=lambda c: (c.refine, c.solver != "pd")):
+    for case in sorted(cases, key=lambda c: (c.refine, c.better, c.solver != "pd")):
         run, here = runs[case.label], on_coarse[case.label]
         has_base = base is not None and metrics.mean_squared_error(base, truth) > 0
         rows.append(
             Row(
                 label=case.label,
-                solver=case.solver,
+                solver="hybrid" if case.model else case.solver,
                 refine=case.refine,
                 nodes=len(run.points),
                 cells=len(run.cells),
@@ -163,6 +242,7 @@ def compare(
                 setup_seconds=setup[case.label],
                 iterations_a_frame=float(np.mean(run.stats["iterations"])),
                 unusual_frames=int(np.isin(run.stats["status"], _FALLBACKS).sum()),
+                refused_frames=int(np.sum(run.stats["refused"])) if case.model else None,
             )
         )
     return Comparison(
@@ -184,7 +264,7 @@ def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float
 
 
 def _solver_error(cases: tuple[Case, ...], runs: dict[str, Trajectory]) -> float | None:
-    coarse = {case.solver: runs[case.label] for case in cases if case.refine == 1}
+    coarse = {case.solver: runs[case.label] for case in cases if case.plain}
     if not {"pd", "newton"} <= set(coarse):
         return None
     if any((run.stats["status"] != Status.CONVERGED.name).any() for run in coarse.values()):

@@ -89,6 +89,11 @@ def notes(comparison: Comparison) -> list[str]:
         for row in comparison.rows
         if row.unusual_frames
     ]
+    out += [
+        f"{row.label}: {row.refused_frames} of {frames} corrections were refused by the gate."
+        for row in comparison.rows
+        if row.refused_frames
+    ]
     for row in comparison.rows:
         inverted = inverted_frames(comparison.runs[row.label].stats, scene.time.step)
         if inverted:

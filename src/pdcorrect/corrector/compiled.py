@@ -7,6 +7,7 @@ their arithmetic on meshes of some hundred nodes.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,7 @@ class CompiledCorrector:
         corrector = self._corrector
         self.config = corrector.config
         self._parts = list(_contents(corrector))
+        self._kept = [part for _, _, part in self._parts]
         self._tensors = [part for _, _, part in self._parts if isinstance(part, Tensor)]
         # of inference tensors torch does not count how often they are written
         self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
@@ -99,7 +101,8 @@ class CompiledCorrector:
     def _changed(self) -> bool:
         if self._corrector.config is not self.config or self._written() != self._writes:
             return True
-        return any(table.get(name) is not part for table, name, part in self._parts)
+        there = (table.get(name) for table, name, _ in self._parts)
+        return not all(map(is_, there, self._kept))
 
     def _written(self) -> list[int]:
         """How often each tensor was written, and where they are."""

@@ -92,6 +92,23 @@ class LoadedModel:
     corrector: Corrector
     record: ModelRecord
 
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """Of its training, as far as it is recorded."""
+        training: dict[str, Any] = self.record.training
+        inner = training.get("config")
+        return inner if isinstance(inner, dict) else training
+
+    @property
+    def base(self) -> str:
+        """Run of the coarse model that it corrects: "plain", "best" or "total-mass"."""
+        return str(self.configuration.get("base", "plain"))
+
+    @property
+    def velocity(self) -> Any:
+        """What becomes of velocities, see `HybridStepper`."""
+        return self.configuration.get("velocity", "recomputed")
+
 
 # --- writing -----------------------------------------------------------------------------
 

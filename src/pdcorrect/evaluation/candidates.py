@@ -14,7 +14,6 @@ from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.data.config import TRAINING, VALIDATION
-from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.evaluation.rollouts import Hybrid
@@ -47,8 +46,8 @@ class SavedCandidate:
             "weights_sha256": self.weights_sha256,
             "base": self.candidate.base,
             "group": self.candidate.group,
-            "seed": _configured(self.model, "seed", None),
-            "velocity": _configured(self.model, "velocity", "recomputed"),
+            "seed": self.model.configuration.get("seed"),
+            "velocity": self.model.velocity,
             "dataset": found.dataset,
             "dataset_hash": found.dataset_hash,
             "code_digest": found.code_digest,
@@ -117,36 +116,23 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandidate:
     folder = model_folder(path)
     model = load_model(path, device)
-    velocity = _configured(model, "velocity", "recomputed")
 
     def hybrid(stepper: BatchStepper) -> Hybrid:
         return BatchHybrid(
-            stepper, model.corrector, velocity=velocity, gate=Gate() if gate else None
+            stepper, model.corrector, velocity=model.velocity, gate=Gate() if gate else None
         )
 
-    base = _configured(model, "base", PLAIN)
-    candidate = Candidate(name, base, hybrid, _group(model, base))
+    candidate = Candidate(name, model.base, hybrid, _group(model))
     return SavedCandidate(candidate, folder, model, weights_digest(folder))
 
 
-def _configuration(model: LoadedModel) -> dict[str, Any]:
-    """Of the training, as far as it is recorded."""
-    training: dict[str, Any] = model.record.training
-    inner = training.get("config")
-    return inner if isinstance(inner, dict) else training
-
-
-def _configured(model: LoadedModel, key: str, default: Any) -> Any:
-    return _configuration(model).get(key, default)
-
-
-def _group(model: LoadedModel, base: str) -> str | None:
+def _group(model: LoadedModel) -> str | None:
     """A name shared by models of equal configuration but the seed; None without a seed."""
-    configuration = dict(_configuration(model))
+    configuration = dict(model.configuration)
     if configuration.pop("seed", None) is None:
         return None
     content = [
         model.corrector.config.model_dump(mode="json"), model.record.dataset_hash, configuration,
     ]  # fmt: skip
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-    return f"{base}-{digest[:_GROUP_DIGITS]}"
+    return f"{model.base}-{digest[:_GROUP_DIGITS]}"

@@ -43,6 +43,8 @@ Array = NDArray[np.float64]
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _KINK = 1e-9
 """Relative distance from a kink below which its tangent mode is set to zero."""
+_CLEAR = 1e-10
+"""Relative size above which a leading minor is positive whatever rounding did."""
 
 
 @njit(**OPTIONS)
@@ -163,6 +165,16 @@ def _volume_diagonal(s, v, l, omega, T):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _project_diagonal(T, l):  # type: ignore[no-untyped-def]
     """Raise the negative eigenvalues of the diagonal block to zero."""
+    a, b, c, d, e, f = T[0, l], T[1, l], T[2, l], T[3, l], T[4, l], T[5, l]
+    minor = a * b - d * d
+    size = abs(a) + abs(b) + abs(c)
+    # leading minors clearly positive (Sylvester): no eigenvalue is negative
+    if (
+        a > _CLEAR * size
+        and minor > _CLEAR * size * size
+        and c * minor - a * f * f - b * e * e + 2.0 * d * e * f > _CLEAR * size * size * size
+    ):
+        return
     block = np.empty((3, 3))
     for i in range(3):
         block[i, i] = T[i, l]

@@ -14,6 +14,8 @@ from pdcorrect.fem.tangent_kernels import stiffness
 Array = NDArray[np.float64]
 
 _BACKTRACKS = 30
+_CHORD = 100.0
+"""Times ``near``: length of a step after which the next one tries the same tangent first."""
 
 
 @njit(**PARALLEL)
@@ -26,8 +28,10 @@ def relax(  # type: ignore[no-untyped-def]
     exact one is not positive definite, at most ``steps`` times or until no
     mode changes by more than ``tolerance`` (m).  Farther than a last step of ``near`` (m) the
     exact tangent can lead to another equilibrium, and magnifies rounding where modes have hardly
-    any stiffness.  ``nodes`` is the number of nodes a cell; its other local shape functions are
-    modes.
+    any stiffness.  A tangent costs several times a stress, so near equilibrium the last one is
+    used again as long as steps become shorter by a factor of ten (chord method).
+
+    ``nodes`` is the number of nodes a cell; its other local shape functions are modes.
     Other arguments as `kernels.energy_and_forces`.
     """
     count, lanes = cells.shape[0], weights.shape[2]
@@ -64,12 +68,15 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                project = tried == 1 or _largest(step) > near
-                for cautious in (project, True):
-                    principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
-                    stiffness(here, U, V, T, A, P, K)
-                    if _solve(K, forces, step) or cautious:
-                        break
+                last = np.inf if tried == 1 else _largest(step)
+                if last <= _CHORD * near:
+                    _substitute(K, forces, step)
+                if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):
+                    for cautious in (last > near, True):
+                        principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
+                        stiffness(here, U, V, T, A, P, K)
+                        if _solve(K, forces, step) or cautious:
+                            break
                 for m in range(width):
                     old[m] = u[modes[m]]
                     u[modes[m]] = old[m] + step[m]
@@ -89,12 +96,11 @@ def _largest(step):  # type: ignore[no-untyped-def]
 def _solve(K, forces, step):  # type: ignore[no-untyped-def]
     """Step = K^-1 forces for the lower triangle (L, 3, L, 3) of K, by Cholesky's method.
 
-    Whether K, which is overwritten, is positive definite; if not, pivots that are zero to
-    working precision or negative are raised.
+    Whether K, which its factor takes the place of, is positive definite; if not, pivots that are
+    zero to working precision or negative are raised.
     """
     size = 3 * len(forces)
-    M, x = K.reshape(size, size), step.reshape(size)
-    f = forces.reshape(size)
+    M = K.reshape(size, size)
     least = 0.0
     for i in range(size):
         least = max(least, 1e-12 * M[i, i])
@@ -109,6 +115,16 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
             M[i, i] -= M[i, n] * M[i, n]
         positive &= M[i, i] > least
         M[i, i] = np.sqrt(max(M[i, i], least))
+    _substitute(K, forces, step)
+    return positive
+
+
+@njit(**OPTIONS)
+def _substitute(K, forces, step):  # type: ignore[no-untyped-def]
+    """Step (L, 3) by the factor that `_solve` left in K."""
+    size = 3 * len(forces)
+    M, x, f = K.reshape(size, size), step.reshape(size), forces.reshape(size)
+    for i in range(size):
         x[i] = f[i]
         for n in range(i):
             x[i] -= M[i, n] * x[n]
@@ -117,7 +133,6 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
         for n in range(i + 1, size):
             x[i] -= M[n, i] * x[n]
         x[i] /= M[i, i]
-    return positive
 
 
 @njit(**PARALLEL)

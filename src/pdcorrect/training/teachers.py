@@ -42,9 +42,7 @@ def check_trained_alike(what: str, model: LoadedModel, config: TrainingConfig) -
     InputError
         If it corrects another base model, or its corrected states have other velocities.
     """
-    own = model.record.training.get("config")
-    told = own if isinstance(own, dict) else {}
-    for key, default in (("base", "plain"), ("velocity", "recomputed")):
-        there, here = told.get(key, default), getattr(config, key)
+    for key in ("base", "velocity"):
+        there, here = getattr(model, key), getattr(config, key)
         if there != here:
             raise InputError(f"{what}: its {key} is {there!r}: expected {here!r}, as here.")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pdcorrect.environment import environment
 from pdcorrect.errors import InputError, PdcorrectError
+from pdcorrect.figures.files import replacing
 from pdcorrect.replacement import clear_parts, make_folder, write_text
 from pdcorrect.validation.cases import Parts, ValidationCase
 from pdcorrect.validation.outcome import Outcome, missing, outside
@@ -112,7 +113,8 @@ def _run_part(compute: Callable[[], Outcome], folder: Path, part: PartRecord) ->
     part.seconds = round(time.perf_counter() - started, 3)
     if part.drawn:
         for picture in outcome.pictures:
-            picture.draw(folder / f"{picture.name}.png")
+            with replacing(folder / f"{picture.name}.png") as path:
+                picture.draw(path)
             part.pictures[f"{folder.name}/{picture.name}.png"] = picture.caption
     return part
 

@@ -1,0 +1,363 @@
+"""Programs killed or told to end, disks that fill up or become read-only, at random moments.
+
+Whatever happened, the same command then ends with what a run without faults leaves.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import training_samples as samples  # noqa: E402
+from conftest import beam  # noqa: E402
+from dataset_configs import small  # noqa: E402
+from pdcorrect.cli import TERMINATED  # noqa: E402
+from pdcorrect.data.folder import all_shards  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard, stored_hashes  # noqa: E402
+from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
+
+NAMESPACE = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+"""Mounts inside are gone with the program, and concern nobody else."""
+
+FULL = """
+cp -a "$OUT" "$ASIDE/before" && mount -t tmpfs -o size="$SIZE" none "$OUT" &&
+cp -a "$ASIDE/before/." "$OUT" || exit 99
+"$@"; status=$?
+cp -a "$OUT" "$ASIDE/after" && umount "$OUT" && find "$OUT" -mindepth 1 -delete &&
+cp -a "$ASIDE/after/." "$OUT" || exit 99
+exit $status
+"""
+"""Run a command while the disk of $OUT has no more than $SIZE bytes."""
+
+READ_ONLY = """
+mount --bind "$OUT" "$OUT" || exit 99
+[ "$DELAY" = 0 ] && { mount -o remount,bind,ro "$OUT" || exit 99; }
+"$@" & program=$!
+if [ "$DELAY" != 0 ]; then
+    sleep "$DELAY"
+    until mount -o remount,bind,ro "$OUT" 2>/dev/null; do  # refused while a file is being written
+        kill -0 $program 2>/dev/null || break
+        sleep 0.005
+    done
+fi
+wait $program
+"""
+"""Run a command whose folder $OUT becomes read-only after $DELAY seconds."""
+
+CASE = """
+import time
+from pathlib import Path
+from pdcorrect.validation.outcome import Outcome, Picture, Table
+
+
+def draw(path):
+    from PIL import Image
+
+    Image.effect_noise((128, 128), 90).save(path)
+
+
+def part(number):
+    time.sleep(0.15)
+    rows = tuple((float(k), float(k * number)) for k in range(300))
+    picture = Picture(f"noise-{number}", "Noise", draw)
+    tables = (Table(f"{number}", ("k", "x"), rows),)
+    return Outcome({f"{number}": float(number)}, tables, (picture,))
+
+
+def parts(quick):
+    return {f"part {n}": (lambda n=n: part(n)) for n in range(8)}
+"""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A command that writes into a folder and goes on if it is called again.
+
+    `arguments` are its own, given the folder with its input and that of its output; `found` is what
+    its output says, to be the same whatever happened; `sound` fails if a file under a final
+    name is not whole.
+    """
+
+    name: str
+    prepare: object
+    arguments: object
+    found: object
+    sound: object
+
+
+# --- the four programs -------------------------------------------------------------------
+
+
+def scene_input(folder):
+    swing = {"kind": "body-force", "density": [0.0, 3e3, -9e3]}
+    scene = beam((3, 1, 1), loads=[swing], time={"step": 0.01, "frames": 600})
+    (folder / "scene.toml").write_text(scene.to_toml())
+
+
+def trajectory(output):
+    run = load_trajectory(output / "run.h5")
+    return [x.tobytes() for x in (run.positions, run.velocities, run.times)]
+
+
+def whole_trajectory(output):
+    if (output / "run.h5").exists():
+        load_trajectory(output / "run.h5", salvage=True)
+
+
+def dataset_input(folder):
+    config = small(training={"meshes": 6, "simulations": 12}, frames=8)
+    (folder / "set.toml").write_text(config.to_toml())
+
+
+def shards(output):
+    folder = output / "set"
+    manifest = json.loads((folder / "manifest.json").read_text())["files"]
+    statistics = json.loads((folder / "statistics.json").read_text())
+    return {p.name: stored_hashes(p)[1] for p in all_shards(folder)}, manifest, statistics
+
+
+def whole_shards(output):
+    for path in all_shards(output / "set"):
+        read_shard(path)
+    for path in output.rglob("*.json"):
+        json.loads(path.read_text())
+
+
+def training_input(folder):
+    samples.dataset(folder / "data", frames=5)
+    often = {"iterations": 1}
+    stages = samples.one_step(iterations=12), samples.unrolled(iterations=6)
+    settings = samples.config(*stages, validate_every=often, checkpoint_every=often, report_every=1)
+    (folder / "training.toml").write_text(settings.to_toml())
+
+
+def training(output):
+    folder = output / "training"
+    rows = [line.split(",") for line in (folder / "history.csv").read_text().splitlines()]
+    seconds = rows[0].index("seconds")
+    weights = (folder / "model" / "weights.safetensors").read_bytes()
+    return weights, [row[:seconds] + row[seconds + 1 :] for row in rows]
+
+
+def whole_training(output):
+    from pdcorrect.corrector.model_io import load_model
+    from pdcorrect.training.checkpoints import read_checkpoint
+
+    if (output / "training" / "model").exists():
+        load_model(output / "training" / "model")
+    if (output / "training" / "checkpoint.safetensors").exists():
+        read_checkpoint(output / "training" / "checkpoint.safetensors")
+
+
+def case_input(folder):
+    case = folder / "validation" / "noise"
+    case.mkdir(parents=True)
+    (case / "run.py").write_text(CASE)
+    (case / "README.md").write_text("# Noise\n\n**Question.** Is it there?\n")
+    (case / "expected.json").write_text(
+        json.dumps({"3": {"value": 3.0, "tolerance": 0.0, "source": "counting"}})
+    )
+
+
+def report(output):
+    folder = output / "report"
+    record = json.loads((folder / "noise.json").read_text())
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*"))
+    return record["figures"], record["tables"], sorted(record["pictures"]), names
+
+
+def whole_report(output):
+    from PIL import Image
+
+    for path in output.rglob("*.json"):
+        json.loads(path.read_text())
+    for path in output.rglob("*.png"):
+        Image.open(path).load()
+    for path in output.rglob("index.html"):
+        assert path.read_text().rstrip().endswith("</html>")
+
+
+PROGRAMS = [
+    Program(
+        "simulate", scene_input,
+        lambda given, out: ["simulate", given / "scene.toml", "-o", out / "run.h5", "--resume"],
+        trajectory, whole_trajectory,
+    ),
+    Program(
+        "generate", dataset_input,
+        lambda given, out: ["dataset", "generate", given / "set.toml", "-o", out / "set"],
+        shards, whole_shards,
+    ),
+    Program(
+        "train", training_input,
+        lambda given, out: ["train", given / "training.toml", "--data", given / "data",
+                            "-o", out / "training", "--resume"],
+        training, whole_training,
+    ),
+    Program(
+        "validate", case_input,
+        lambda given, out: ["validate", "-o", out / "report"],
+        report, whole_report,
+    ),
+]  # fmt: skip
+
+
+@dataclass
+class Bench:
+    """A program with its input, what it leaves without faults, and how long that took."""
+
+    program: Program
+    given: object
+    output: object
+    expected: object = None
+    seconds: float = 0.0
+    size: int = 0
+
+    def command(self):
+        own = self.program.arguments(self.given, self.output)
+        return [sys.executable, "-m", "pdcorrect.cli", *map(str, own)]
+
+    def environment(self, **more):
+        paths = {"PYTHONPATH": os.pathsep.join(sys.path), "PDCORRECT_HOME": str(self.given)}
+        return {**os.environ, **paths, "OMP_NUM_THREADS": "1", **more}
+
+    def start(self, wrapper=(), **environment):
+        return subprocess.Popen(
+            [*wrapper, *self.command()], env=self.environment(**environment),
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )  # fmt: skip
+
+    def ended(self, process):
+        """The exit status and what was said, which is no traceback."""
+        said = process.communicate(timeout=300)[1]
+        assert "Traceback" not in said
+        assert process.returncode != 99, said  # of the wrappers
+        self.program.sound(self.output)
+        return process.returncode, said
+
+    def finish(self):
+        """The same command without faults: nothing is lost, and nothing is left over."""
+        assert self.ended(self.start())[0] == 0
+        assert self.program.found(self.output) == self.expected
+        assert not [p.name for p in self.output.rglob("*") if ".part" in p.name]
+
+
+@pytest.fixture(scope="module")
+def benches(tmp_path_factory):
+    """By program: its input, expected result, time and size; made when first asked for."""
+    known = {}
+
+    def bench(program, folder):
+        if program.name not in known:
+            given = tmp_path_factory.mktemp(f"{program.name}-input")
+            program.prepare(given)
+            for _ in range(2):  # the first one may compile kernels
+                whole = Bench(program, given, tmp_path_factory.mktemp(f"{program.name}-whole"))
+                began = time.perf_counter()
+                assert whole.ended(whole.start())[0] == 0
+                seconds = time.perf_counter() - began
+            size = sum(p.stat().st_size for p in whole.output.rglob("*") if p.is_file())
+            known[program.name] = given, program.found(whole.output), seconds, size
+        given, expected, seconds, size = known[program.name]
+        return Bench(program, given, folder, expected, seconds, size)
+
+    return bench
+
+
+# --- the four faults ---------------------------------------------------------------------
+
+
+def kill(bench, number, chance):
+    process = bench.start()
+    time.sleep(chance.uniform(0.2, 0.95) * bench.seconds)
+    os.killpg(process.pid, number)
+    return bench.ended(process)
+
+
+def killed(bench, times, chance):
+    for _ in range(times):
+        yield kill(bench, signal.SIGKILL, chance)[0] == -signal.SIGKILL
+
+
+def terminated(bench, times, chance):
+    for _ in range(times):
+        status, _ = kill(bench, signal.SIGTERM, chance)
+        assert status in (0, TERMINATED, -signal.SIGTERM)  # the last one while Python starts
+        yield status != 0
+
+
+def full_disk(bench, times, chance):
+    aside = bench.output.parent / "aside"
+    for share in np.sort([chance.uniform(0.05, 0.9) for _ in range(times)]):
+        shutil.rmtree(aside, ignore_errors=True)
+        aside.mkdir()
+        used = sum(-(-p.stat().st_size // 4096) for p in bench.output.rglob("*") if p.is_file())
+        room = 4096 * (used + 2) + int(share * bench.size)
+        process = bench.start(
+            [*NAMESPACE, FULL, "full"], OUT=str(bench.output), ASIDE=str(aside), SIZE=str(room)
+        )
+        status, said = bench.ended(process)
+        if status:
+            assert "No space left on device" in said or "cannot be written" in said
+        yield status != 0
+
+
+def read_only_folder(bench, times, chance):
+    for number in range(times):
+        delay = chance.uniform(0.2, 0.95) * bench.seconds if number else 0
+        process = bench.start(
+            [*NAMESPACE, READ_ONLY, "read-only"], OUT=str(bench.output), DELAY=str(delay)
+        )
+        status, said = bench.ended(process)
+        if status:
+            assert "Read-only file system" in said or "cannot be written" in said
+        yield status != 0
+
+
+FAULTS = [killed, terminated, full_disk, read_only_folder]
+QUICK = {("simulate", "full_disk"), ("validate", "killed"), ("validate", "full_disk"),
+         ("validate", "read_only_folder")}  # fmt: skip
+"""Those that take seconds."""
+
+
+def namespaces():
+    """Whether mounts of one's own are possible here."""
+    try:
+        return not subprocess.run([*NAMESPACE, "mount -t tmpfs none /mnt"], timeout=10).returncode
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="signals and mounts of Linux")
+@pytest.mark.parametrize(
+    ("program", "fault", "times"),
+    [
+        pytest.param(p, f, 2 if quick else 6, id=f"{p.name}-{f.__name__}",
+                     marks=() if quick else pytest.mark.slow)
+        for p in PROGRAMS
+        for f in FAULTS
+        for quick in [(p.name, f.__name__) in QUICK]
+    ],
+)  # fmt: skip
+def test_whatever_happens_the_same_command_ends_with_the_same_result(
+    benches, tmp_path, program, fault, times
+):
+    if fault in (full_disk, read_only_folder) and not namespaces():
+        pytest.skip("no mount namespaces for users here")
+    output = tmp_path / "out"
+    output.mkdir()
+    bench = benches(program, output)
+    hits = sum(fault(bench, times, random.Random(f"{program.name} {fault.__name__}")))
+    assert hits, "the program was never hit"
+    bench.finish()
