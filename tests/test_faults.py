@@ -154,7 +154,7 @@ def whole_training(output):
     from pdcorrect.corrector.model_io import load_model
     from pdcorrect.training.checkpoints import read_checkpoint
 
-    if (output / "training" / "model").exists():
+    if (output / "training" / "model" / "model.json").exists():
         load_model(output / "training" / "model")
     if (output / "training" / "checkpoint.safetensors").exists():
         read_checkpoint(output / "training" / "checkpoint.safetensors")

@@ -273,8 +273,9 @@ def _read(path: Path) -> bytes:
 
 
 def _read_description(path: Path) -> _Description:
+    data = _read(path)
     try:
-        content = json.loads(_read(path).decode("utf-8"))
+        content = json.loads(data.decode("utf-8"))
         digest = _digest({k: v for k, v in content.items() if k != _CHECKSUM})
     except (ValueError, AttributeError, RecursionError) as error:
         reason = "expected keys and values" if isinstance(error, AttributeError) else error
