@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -345,6 +346,10 @@ def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program
     assert errors[3] < 0.5 * errors[2] < 0.5 * errors[0]
     assert [rows[name]["refused_frames"] for name in coarse] == ["", "", "", "0"]
     assert rows[coarse[3]]["solver"] == "hybrid"
+    record = json.loads((folder / "report.json").read_text())
+    about = record["models"][coarse[3]]
+    assert (about["base"], about["dataset"]) == ("best", "torsion-exact")
+    assert any("trained on scenes of the data set 'torsion-exact'" in x for x in record["notes"])
 
 
 def test_a_corrector_of_the_plain_mesh_is_held_against_the_plain_fine_run():
@@ -354,13 +359,26 @@ def test_a_corrector_of_the_plain_mesh_is_held_against_the_plain_fine_run():
     assert (cases[-1].label, cases[-1].better) == ("hybrid torsion-as-published", False)
 
 
-def test_refused_corrections_are_told(program, tmp_path):
+def test_refused_corrections_are_told():
     pytest.importorskip("torch_geometric")
     scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
     stiff = scene.with_changes(material={"young": 1e7}, time={"frames": 2})
-    cases = (pc.evaluate.CASES[2], pc.evaluate.cases_with(["torsion-exact"])[-1])
+    cases = pc.evaluate.cases_with(["torsion-exact"])[-1:]
     notes = report.notes(pc.compare(stiff, cases=cases))
     assert "hybrid torsion-exact: 2 of 2 corrections were refused by the gate." in notes
+
+
+def test_correctors_are_told_apart_and_are_of_one_coarse_model(tmp_path):
+    pytest.importorskip("torch_geometric")
+    for name in ("one", "two"):
+        shutil.copytree(ROOT / "models" / "torsion-exact-compact", tmp_path / name / "model")
+    models = [str(tmp_path / name / "model") for name in ("one", "two")]
+    labels = [case.label for case in pc.evaluate.cases_with(models)]
+    assert labels[-2:] == ["hybrid one/model", "hybrid two/model"]
+    with pytest.raises(pc.errors.InputError, match="correctors of best, plain: expected of one"):
+        pc.evaluate.cases_with([models[0], "torsion-as-published"])
+    with pytest.raises(pc.errors.InputError, match="coarse PD, coarse PD: expected each one once"):
+        pc.compare(beam((2, 1, 1)), cases=pc.evaluate.CASES[2:3] * 2)
 
 
 def test_compare_with_a_model_that_is_not_there_is_bad_input(program, scene_file, tmp_path):

@@ -683,6 +683,25 @@ def test_a_split_of_which_files_are_missing_is_evaluated_on_request_only(unfinis
     assert {t.measures.mesh for t in found.runs["plain"].trajectories} == {0, 2}
 
 
+def test_what_is_missing_is_what_was_not_read(unfinished, monkeypatch):
+    def late(*arguments, **options):
+        found = read_cases(*arguments, **options)
+        shutil.copy(TINY / "evaluation" / "mesh-0001.h5", unfinished / "evaluation")
+        return found
+
+    monkeypatch.setattr("pdcorrect.evaluation.evaluation.read_cases", late)
+    found = evaluate([], unfinished, incomplete=True)
+    assert [path.name for path in found.missing] == ["mesh-0001.h5"]
+    assert "mesh-0001.h5" not in found.shards
+
+
+def test_a_configuration_that_cannot_be_used_is_told_before_anything_is_done(unfinished):
+    (unfinished / "config.toml").write_text("name = 3")
+    with pytest.raises(InputError, match="name"):
+        evaluate([], unfinished)
+    assert evaluate([], unfinished, incomplete=True).missing == ()
+
+
 def test_the_command_says_what_was_missing(unfinished):
     refused = CliRunner().invoke(app, ["evaluate", str(unfinished)])
     assert "--incomplete" in str(refused.exception)

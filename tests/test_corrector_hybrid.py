@@ -116,6 +116,20 @@ def test_energies_from_near_modes_are_those_from_none(size):
     assert problem.energy(near, state.modes) == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize("element", ["hex8-bubble", "hex8-bubble-mean"])
+@pytest.mark.parametrize("size", [1e-4, 1e-3, 1e-2])
+def test_modes_in_equilibrium_are_those_from_anywhere_near(element, size, rng):
+    problem = pc.discretise(soft_beam(solver={"element": element}))
+    positions = shaken(problem).positions + bumped(problem, 0.05, 4)
+    rested, nodes = problem.relaxed(positions), len(positions)
+    forces = problem.energy_and_forces(rested)[1]
+    scale = problem.scene.material.young * problem.cell_size**2
+    assert np.abs(forces[nodes:]).max() < 1e-12 * scale
+    start = rested[nodes:] + size * problem.cell_size * rng.normal(size=rested[nodes:].shape)
+    again = problem.relaxed(positions, modes=start)
+    assert np.abs(again - rested).max() < 1e-12 * problem.cell_size
+
+
 def test_corrected_steps_do_not_pass_on_the_coarse_modes():
     problem = pc.discretise(soft_beam(solver={"element": "hex8-bubble"}, loads=[TORSION]))
     coarse = pc.ProjectiveDynamics(problem)

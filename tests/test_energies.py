@@ -102,6 +102,19 @@ def test_rotations_of_cells_squeezed_to_a_line_are_accurate(small):
     np.testing.assert_allclose(energies.nearest_rotation(F), R @ Q, atol=1e-14 / small)
 
 
+@pytest.mark.parametrize("least", [-1.0, -1e-9, -1e-11, 0.0, 1e-11, 1e-9, 1.0])
+def test_only_negative_eigenvalues_of_the_diagonal_block_are_raised(least, rng):
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    block = turn @ np.diag([least, 0.7, 3.0]) @ turn.T
+    T = np.zeros((12, 1))
+    T[:6, 0] = *np.diag(block), block[0, 1], block[0, 2], block[1, 2]
+    energies._project_diagonal(T, 0)
+    xx, yy, zz, xy, xz, yz = T[:6, 0]
+    found = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    expected = turn @ np.diag([max(least, 0.0), 0.7, 3.0]) @ turn.T
+    np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
 def test_projections_are_idempotent(rng):
     F = rng.normal(size=(100, 3, 3))
     rotations = energies.nearest_rotation(F)

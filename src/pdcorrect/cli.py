@@ -133,7 +133,7 @@ def compare(
     count = frames or loaded.time.frames
     make_folder(output)
     with progress_bar() as progress:
-        tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases}
+        tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases[::-1]}
 
         def on_step(label: str, frame: int, result: StepResult) -> None:
             if frame == 1:

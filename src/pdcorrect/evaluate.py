@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -99,6 +98,10 @@ class Comparison:
         Each case on its own mesh.
     on_coarse : dict of str to Trajectory
         The same on the coarse nodes.
+    cases : tuple of Case
+    models : dict of str to dict
+        Of correctors, by label: model, base, the data set that it was trained on, digest of
+        its weights.
     reference : str
         Label of the case that errors are measured against.
     solver_error : float or None
@@ -114,6 +117,8 @@ class Comparison:
     on_coarse: dict[str, Trajectory]
     reference: str
     solver_error: float | None
+    cases: tuple[Case, ...] = ()
+    models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance from the reference in each frame, by label, m."""
@@ -134,7 +139,7 @@ def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
 
 
 def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
-    """The default comparison with correctors.
+    """The default comparison with correctors of one coarse model.
 
     Those of the best coarse model have learned references with its element: all errors
     are then distances from such a one, and the best coarse model is among the cases.
@@ -147,25 +152,31 @@ def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
     Raises
     ------
     InputError
-        If there is no such model, or it corrects neither the plain nor the best coarse model.
+        If there is no such model, or they do not all correct the plain mesh or all the best
+        coarse model.
     """
     if not models:
         return CASES
-    from pdcorrect.corrector.model_io import load_model
+    from pdcorrect.corrector.model_io import load_model, model_folder, model_names
 
-    bases = {name: load_model(name).base for name in models}
-    for name, base in bases.items():
-        if base not in ("plain", "best"):
-            raise InputError(f"{name}: a corrector of {base!r}: expected of 'plain' or 'best'.")
+    names = model_names([model_folder(model).resolve() for model in models])
+    bases = {load_model(model).base for model in models}
+    if len(bases) > 1:
+        raise InputError(
+            f"models {', '.join(names)}: correctors of {', '.join(sorted(bases))}: expected of one "
+            "coarse model, as their references have its element; compare the others apart."
+        )
+    if not bases <= {"plain", "best"}:
+        raise InputError(f"{names[0]}: corrects {bases.pop()!r}: expected 'plain' or 'best'.")
     reference, *others = CASES
-    better = "best" in bases.values()
+    better = bases == {"best"}
     return (
         replace(reference, label="fine best PD", better=True) if better else reference,
         *others,
         *([Case("best coarse PD", "pd", 1, better=True)] if better else []),
         *(
-            Case(f"hybrid {Path(name).name}", "pd", 1, base == "best", name)
-            for name, base in bases.items()
+            Case(f"hybrid {name}", "pd", 1, better, model)
+            for name, model in zip(names, models, strict=True)
         ),
     )
 
@@ -212,9 +223,12 @@ def compare(
     """
     if not cases:
         raise InputError("cases is empty: expected at least the reference.")
+    labels = [case.label for case in cases]
+    if len(set(labels)) < len(labels):
+        raise InputError(f"labels {', '.join(labels)}: expected each one once.")
     coarse = discretise(scene)
     runs, on_coarse, setup = {}, {}, {}
-    for case in cases:
+    for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
         started = time.perf_counter()
         stepper = case_stepper(scene, case)
         setup[case.label] = time.perf_counter() - started
@@ -246,8 +260,26 @@ def compare(
             )
         )
     return Comparison(
-        scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(cases, runs)
+        scene,
+        tuple(rows),
+        runs,
+        on_coarse,
+        cases[0].label,
+        _solver_error(cases, runs),
+        cases,
+        {case.label: _about(case.model) for case in cases if case.model},
     )
+
+
+def _about(name: str) -> dict[str, str]:
+    """Which model that is."""
+    from pdcorrect.corrector.model_io import load_model, model_folder, weights_digest
+
+    model = load_model(name)
+    return {
+        "model": model_folder(name).name, "base": model.base, "dataset": model.record.dataset,
+        "weights_sha256": weights_digest(model_folder(name)),
+    }  # fmt: skip
 
 
 def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float], None] | None:

@@ -41,9 +41,27 @@ def write_text(path: Path, text: str) -> None:
     OutputError
         If it cannot be written.
     """
+    with _own_part(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """The same for any content.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    with _own_part(path) as part:
+        part.write_bytes(data)
+
+
+@contextlib.contextmanager
+def _own_part(path: Path) -> Iterator[Path]:
     try:
         with replacing(path, part_of_process(path)) as part:
-            part.write_text(text, encoding="utf-8")
+            yield part
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
 

@@ -78,16 +78,23 @@ def notes(comparison: Comparison) -> list[str]:
             "all rows share)."
         )
     if comparison.solver_error is not None:
+        better = any(c.better for c in comparison.cases if c.label == comparison.reference)
+        of_element = " and the element's" if better else ""
         out.append(
             f"PD and Newton on the coarse mesh differ by at most "
             f"{1e3 * comparison.solver_error:.2g} mm (solver error); the rest of their error is "
-            "the mesh's."
+            f"the mesh's{of_element}."
         )
     out += [
         f"{row.label}: {row.unusual_frames} of {frames} frames converged only by a fallback "
         "(Newton-CG or smaller steps), which changes their time error."
         for row in comparison.rows
         if row.unusual_frames
+    ]
+    out += [
+        f"{label}: trained on scenes of the data set {about['dataset']!r} and with references of "
+        "its setting; on others it may be of no use, and its gate need not notice."
+        for label, about in comparison.models.items()
     ]
     out += [
         f"{row.label}: {row.refused_frames} of {frames} corrections were refused by the gate."
@@ -164,6 +171,9 @@ def to_json(comparison: Comparison) -> str:
         "scene": comparison.scene.to_toml(),
         "reference": comparison.reference,
         "solver_error": comparison.solver_error,
+        "notes": notes(comparison),
+        "cases": [dataclasses.asdict(case) for case in comparison.cases],
+        "models": dict(comparison.models),
         "rows": rows,
         "environment": environment(),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +34,6 @@ MODELS: Mapping[tuple[str, str], Sequence[str]] = {
     ("torsion", "exact"): ("torsion-exact", "torsion-exact-compact"),
 }
 """Released correctors that were trained on such scenes, by motion and setting."""
-BASES = {"as-published": "plain", "exact": "best"}
-"""Coarse models that those of a setting correct."""
 OTHERS = ("plain", "best", "plain 2×2×2", "hex27")
 """Named in figures, besides those on the front."""
 FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
@@ -162,10 +160,10 @@ class Comparison:
         return pc.Newton(make(), time_step=step)
 
     def _hybrid(self, name: str) -> Any:
-        corrector = pc.load_model(home_folder("models") / name).corrector
-        scene = self.best if BASES[self.setting] == "best" else self.scene
+        model = released(name)
+        scene = self.best if model.base == "best" else self.scene
         coarse = pc.ProjectiveDynamics(pc.discretise(scene))
-        return pc.HybridStepper(coarse, corrector, gate=pc.Gate())
+        return pc.HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=pc.Gate())
 
     def _right_mass(self) -> pc.ProjectiveDynamics:
         problem = self.points
@@ -188,6 +186,12 @@ class Comparison:
             error, bounds=(-2.0, 1.0), method="bounded", options={"xatol": 0.02, "maxiter": 12}
         )
         return stepper(float(found.x))
+
+
+@cache
+def released(name: str) -> Any:
+    """A corrector of `models/`."""
+    return pc.load_model(home_folder("models") / name)
 
 
 def median_step(run: pc.Trajectory) -> float:
@@ -283,7 +287,7 @@ def outcome(motion: str, setting: str, quick: bool) -> common.Outcome:
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
     for row in (row for row in rows if row.family == "hybrid"):
-        base = by_name[BASES[setting]]
+        base = by_name[released(row.name.removeprefix("hybrid, ")).base]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
     for name in ("plain", "best"):
         if f"{name}, 1e-06" in by_name:

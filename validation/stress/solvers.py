@@ -66,12 +66,14 @@ def tight(scenario: Scenario, solver: str) -> Run:
 
 
 @cache
-def _corrector(model: str) -> Any:
-    return pc.load_model(model).corrector
+def _model(model: str) -> Any:
+    return pc.load_model(model)
 
 
 def _hybrid(model: str, problem: pc.Problem) -> pc.HybridStepper:
-    return pc.HybridStepper(pc.ProjectiveDynamics(problem), _corrector(model), gate=pc.Gate())
+    found = _model(model)
+    coarse = pc.ProjectiveDynamics(problem)
+    return pc.HybridStepper(coarse, found.corrector, velocity=found.velocity, gate=pc.Gate())
 
 
 MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {

@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -108,6 +109,25 @@ class LoadedModel:
     def velocity(self) -> Any:
         """What becomes of velocities, see `HybridStepper`."""
         return self.configuration.get("velocity", "recomputed")
+
+
+def model_names(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of models' paths that are all unlike, such as "seed-1/model".
+
+    Raises
+    ------
+    InputError
+        If a folder comes twice.
+    """
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(f"{folder}: this model comes twice: expected each one once.")
+    longest = max((len(folder.parts) for folder in folders), default=0)
+    for length in range(1, longest + 1):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return []
 
 
 # --- writing -----------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pdcorrect.data.config import DatasetConfig
@@ -44,10 +44,19 @@ def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
         If some are, with the first one's name, or as of `missing_files`.
     """
     for split in splits:
-        missing = missing_files(folder, split)
-        if missing:
-            raise InputError(
-                f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
-                f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
-                "generate' goes on), or --incomplete for those that are there."
-            )
+        refuse(folder, split, missing_files(folder, split))
+
+
+def refuse(folder: str | Path, split: str, missing: Sequence[Path]) -> None:
+    """Say which files of a split are missing, if any are.
+
+    Raises
+    ------
+    InputError
+    """
+    if missing:
+        raise InputError(
+            f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
+            f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
+            "generate' goes on), or --incomplete for those that are there."
+        )

@@ -12,9 +12,14 @@ from typing import Any
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
+from pdcorrect.corrector.model_io import (
+    LoadedModel,
+    load_model,
+    model_folder,
+    model_names,
+    weights_digest,
+)
 from pdcorrect.data.config import TRAINING, VALIDATION
-from pdcorrect.errors import InputError
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.evaluation.rollouts import Hybrid
 
@@ -96,21 +101,8 @@ def saved_candidates(
     FileFormatError
         If one is damaged.
     """
-    names = _names([model_folder(path).resolve() for path in paths])
+    names = model_names([model_folder(path).resolve() for path in paths])
     return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
-
-
-def _names(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that are all unlike, such as "seed-1/model"."""
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise InputError(f"{folder}: this model comes twice: expected each one once.")
-    longest = max((len(folder.parts) for folder in folders), default=0)
-    for length in range(1, longest + 1):
-        names = ["/".join(folder.parts[-length:]) for folder in folders]
-        if len(set(names)) == len(names):
-            return names
-    return []
 
 
 def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandidate:

@@ -109,8 +109,8 @@ class ElasticBody:
     def energy(self, positions: Array, modes: Array | None = None) -> float:
         """Elastic energy, J, with internal modes in equilibrium.
 
-        From near ``modes`` (B, 3), m, that is quicker.  Last steps may be longer then: the energy
-        is flat at the equilibrium, and Newton's steps become as short as the square of the last.
+        From near ``modes`` (B, 3), m, that is quicker.  Last steps may be longer then: what is
+        left is a tenth of them at most, and the energy is flat at the equilibrium.
         """
         tolerance = None if modes is None else _FLAT
         return self.energy_and_forces(self.relaxed(positions, modes=modes, tolerance=tolerance))[0]

@@ -165,14 +165,14 @@ def _volume_diagonal(s, v, l, omega, T):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _project_diagonal(T, l):  # type: ignore[no-untyped-def]
     """Raise the negative eigenvalues of the diagonal block to zero."""
-    a, b, c, d, e, f = T[0, l], T[1, l], T[2, l], T[3, l], T[4, l], T[5, l]
-    minor = a * b - d * d
-    size = abs(a) + abs(b) + abs(c)
+    xx, yy, zz, xy, xz, yz = T[0, l], T[1, l], T[2, l], T[3, l], T[4, l], T[5, l]
+    minor = xx * yy - xy * xy
+    size = abs(xx) + abs(yy) + abs(zz)
     # leading minors clearly positive (Sylvester): no eigenvalue is negative
     if (
-        a > _CLEAR * size
-        and minor > _CLEAR * size * size
-        and c * minor - a * f * f - b * e * e + 2.0 * d * e * f > _CLEAR * size * size * size
+        xx > _CLEAR * size
+        and minor > _CLEAR * size**2
+        and zz * minor - xx * yz**2 - yy * xz**2 + 2.0 * xy * xz * yz > _CLEAR * size**3
     ):
         return
     block = np.empty((3, 3))

@@ -47,7 +47,7 @@ def relax(  # type: ignore[no-untyped-def]
             modes, here = cells[c, nodes:], gradients[c, nodes:]
             shear, volume = weights[c, 0], weights[c, 1]
             start = first if volume[lanes - 1] > 0.0 else lanes
-            energy, scale, tried = np.inf, 1.0, 0
+            energy, scale, tried, cut = np.inf, 1.0, 0, False
             for _ in range(steps + _BACKTRACKS):
                 deformation(u, cells[c], gradients[c], 1.0, F)
                 signed_svd_lanes(F, U, s, V, B, S)
@@ -55,6 +55,7 @@ def relax(  # type: ignore[no-untyped-def]
                 new = total(density)
                 if not new <= energy + 1e-13 * abs(energy):
                     scale *= 0.5
+                    cut = True
                     if scale < 1e-6:
                         for m in range(width):
                             u[modes[m]] = old[m]
@@ -68,7 +69,8 @@ def relax(  # type: ignore[no-untyped-def]
                 energy, scale = new, 1.0
                 stress_lanes(U, t, V, P)
                 nodal_forces(P, here, -1.0, forces)
-                last = np.inf if tried == 1 else _largest(step)
+                last = np.inf if tried == 1 or cut else _largest(step)
+                cut = False
                 if last <= _CHORD * near:
                     _substitute(K, forces, step)
                 if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 import time
 import traceback
 from collections.abc import Callable
@@ -11,8 +12,7 @@ from pathlib import Path
 
 from pdcorrect.environment import environment
 from pdcorrect.errors import InputError, PdcorrectError
-from pdcorrect.figures.files import replacing
-from pdcorrect.replacement import clear_parts, make_folder, write_text
+from pdcorrect.replacement import clear_parts, make_folder, write_bytes, write_text
 from pdcorrect.validation.cases import Parts, ValidationCase
 from pdcorrect.validation.outcome import Outcome, missing, outside
 from pdcorrect.validation.records import PartRecord, Record, load, save, table_csv
@@ -113,8 +113,10 @@ def _run_part(compute: Callable[[], Outcome], folder: Path, part: PartRecord) ->
     part.seconds = round(time.perf_counter() - started, 3)
     if part.drawn:
         for picture in outcome.pictures:
-            with replacing(folder / f"{picture.name}.png") as path:
-                picture.draw(path)
+            with tempfile.TemporaryDirectory() as scratch:  # errors of drawing are the case's
+                drawn = Path(scratch) / f"{picture.name}.png"
+                picture.draw(drawn)
+                write_bytes(folder / drawn.name, drawn.read_bytes())
             part.pictures[f"{folder.name}/{picture.name}.png"] = picture.caption
     return part
 
