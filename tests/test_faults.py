@@ -45,8 +45,13 @@ exit $status
 READ_ONLY = """
 mount --bind "$OUT" "$OUT" || exit 99
 [ "$DELAY" = 0 ] && { mount -o remount,bind,ro "$OUT" || exit 99; }
+mark=$(mktemp)
 "$@" & program=$!
 if [ "$DELAY" != 0 ]; then
+    until [ -n "$(find "$OUT" -type f -newer "$mark")" ]; do  # something is written
+        kill -0 $program 2>/dev/null || break
+        sleep 0.005
+    done
     sleep "$DELAY"
     until mount -o remount,bind,ro "$OUT" 2>/dev/null; do  # refused while a file is being written
         kill -0 $program 2>/dev/null || break
@@ -55,7 +60,8 @@ if [ "$DELAY" != 0 ]; then
 fi
 wait $program
 """
-"""Run a command whose folder $OUT becomes read-only after $DELAY seconds."""
+"""Run a command whose folder $OUT becomes read-only $DELAY seconds after it wrote something; at
+once if that is 0."""
 
 CASE = """
 import time
@@ -336,7 +342,7 @@ def full_disk(bench, times, chance):
 
 def read_only_folder(bench, times, chance):
     for number in range(times):
-        delay = chance.uniform(0.2, 0.95) * bench.seconds if number else 0
+        delay = chance.uniform(0.01, 0.1) * bench.seconds if number else 0
         process = bench.start(
             [*NAMESPACE, READ_ONLY, "read-only"], OUT=str(bench.output), DELAY=str(delay)
         )
