@@ -32,6 +32,9 @@ from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
 NAMESPACE = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
 """Mounts inside are gone with the program, and concern nobody else."""
 
+SOON = 0.3
+"""Seconds after the first writing within which all programs here are still at work."""
+
 FULL = """
 cp -a "$OUT" "$ASIDE/before" && mount -t tmpfs -o size="$SIZE" none "$OUT" &&
 cp -a "$ASIDE/before/." "$OUT" || exit 99
@@ -58,6 +61,7 @@ if [ "$DELAY" != 0 ]; then
         sleep 0.005
     done
 fi
+rm -f "$mark"
 wait $program
 """
 """Run a command whose folder $OUT becomes read-only $DELAY seconds after it wrote something; at
@@ -306,7 +310,7 @@ def kill(bench, number, chance):
         before = bench.state()
         while process.poll() is None and bench.state() == before:
             time.sleep(0.002)
-        time.sleep((share - 0.25) * 0.2 * bench.seconds)
+        time.sleep(min((share - 0.25) * 0.2 * bench.seconds, SOON))
     with contextlib.suppress(ProcessLookupError):
         os.killpg(process.pid, number)
     return bench.ended(process)
@@ -342,7 +346,7 @@ def full_disk(bench, times, chance):
 
 def read_only_folder(bench, times, chance):
     for number in range(times):
-        delay = chance.uniform(0.01, 0.1) * bench.seconds if number else 0
+        delay = min(chance.uniform(0.01, 0.1) * bench.seconds, SOON) if number else 0
         process = bench.start(
             [*NAMESPACE, READ_ONLY, "read-only"], OUT=str(bench.output), DELAY=str(delay)
         )

@@ -260,15 +260,9 @@ def compare(
             )
         )
     return Comparison(
-        scene,
-        tuple(rows),
-        runs,
-        on_coarse,
-        cases[0].label,
-        _solver_error(cases, runs),
-        cases,
+        scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(cases, runs), cases,
         {case.label: _about(case.model) for case in cases if case.model},
-    )
+    )  # fmt: skip
 
 
 def _about(name: str) -> dict[str, str]:

@@ -62,15 +62,9 @@ def train(
             check_whole(data, [evaluate])
     with joined(device) as (world, own):
         training = Training(
-            loaded,
-            data,
-            output,
-            device=own,
-            resume=resume,
-            incomplete=incomplete,
-            world=world,
+            loaded, data, output, device=own, resume=resume, incomplete=incomplete, world=world,
             on_report=_tell,
-        )
+        )  # fmt: skip
         left = None if seconds is None else max(0.0, seconds - (time.monotonic() - started))
         finished = training.run(left)
         if not world.first:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from pdcorrect.data.config import DatasetConfig
@@ -44,19 +44,29 @@ def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
         If some are, with the first one's name, or as of `missing_files`.
     """
     for split in splits:
-        refuse(folder, split, missing_files(folder, split))
+        accepted_gaps(folder, split, incomplete=False)
 
 
-def refuse(folder: str | Path, split: str, missing: Sequence[Path]) -> None:
-    """Say which files of a split are missing, if any are.
+def accepted_gaps(folder: str | Path, split: str, *, incomplete: bool) -> list[Path]:
+    """Files of a split that are missing, which only ``incomplete`` permits.
+
+    It permits a configuration that cannot be used, too: none are known to be missing then.
 
     Raises
     ------
     InputError
+        Without ``incomplete``, as of `check_whole`.
     """
-    if missing:
+    try:
+        missing = missing_files(folder, split)
+    except InputError:
+        if not incomplete:
+            raise
+        return []
+    if missing and not incomplete:
         raise InputError(
             f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
             f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
             "generate' goes on), or --incomplete for those that are there."
         )
+    return missing

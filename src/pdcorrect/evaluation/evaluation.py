@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage
-from pdcorrect.data.missing import missing_files, refuse
+from pdcorrect.data.missing import accepted_gaps
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.cases import Case, read_cases
@@ -167,17 +167,10 @@ def evaluate(
     if workers < 1:
         raise InputError(f"workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
-    missing: list[Path] = []
-    try:
-        missing = missing_files(folder, split)  # before reading: files may be added meanwhile
-    except InputError:
-        if not incomplete:  # which asks for no configuration
-            raise
-    if not incomplete:
-        refuse(folder, split, missing)
+    gaps = accepted_gaps(folder, split, incomplete=incomplete)  # files may be added while reading
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
     read = {*found.shards, *(path.name for path in found.damaged)}
-    missing = [path for path in missing if path.name not in read]
+    missing = tuple(path for path in gaps if path.name not in read)
     stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
     names = [candidate.name for candidate in candidates]
     if len({*names, *stored, REFERENCE}) < len(names) + len({*stored, REFERENCE}):
@@ -224,7 +217,7 @@ def evaluate(
     return Evaluation(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
         float(about["time_step"]), runs, found.shards, found.damaged,
-        tuple(missing),
+        missing,
     )  # fmt: skip
 
 
