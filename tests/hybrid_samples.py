@@ -46,18 +46,22 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
     corrector = kind(config).double()
     nodes, states = _plain_run(scenes, steps)
     moments = {name: Moments() for name in corrector.normaliser.names}
+    views = []
     for state, after in itertools.pairwise(states):
         coarse = after.positions if config.placement == "state" else None
-        view = View(nodes.graph, nodes.snapshot(state, coarse, None))
+        views.append(View(nodes.graph, nodes.snapshot(state, coarse, None)))
         for table, names in (
             (NODE_FEATURES, config.node_features),
             (EDGE_FEATURES, config.edge_features),
         ):
             for name in names:
-                moments[name].add(table[name][1](view))
-    target = Moments()
+                moments[name].add(table[name][1](views[-1]))
+    target, averages = Moments(), Moments()
     target.add(torch.full((4, 1), size))
     corrector.normaliser.fit(moments, target)
+    for view in views:
+        averages.add(nodes.graph.body_means(corrector.inputs(view)[0]))
+    corrector.normaliser.fit_averages(averages)
     return corrector
 
 

@@ -122,9 +122,11 @@ def fit(corrector, view):
         for name, values in features.values(table, names, view).items():
             found[name] = Moments()
             found[name].add(values)
-    target = Moments()
+    target, averages = Moments(), Moments()
     target.add(torch.tensor([[0.1], [-0.3]]))
     corrector.normaliser.fit(found, target)
+    averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
+    corrector.normaliser.fit_averages(averages)
     return corrector
 
 

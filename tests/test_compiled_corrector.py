@@ -139,6 +139,23 @@ def test_the_share_outside_the_training_data_is_that_of_torch():
             assert torch.equal(compiled.outside(view, margin), made.outside(view, margin))
 
 
+def test_how_unlike_training_a_body_is_agrees_with_torch():
+    for view in views():
+        other = body(seed=7)
+        made = corrector(view=View(other, moving(other, 7)), node_features=REMEMBERING)
+        found = CompiledCorrector(made, view.bodies).unlike(view)
+        assert float(found) > 0.0
+        assert float(found) == pytest.approx(float(made.unlike(view)), rel=1e-9)
+
+
+def test_a_body_with_inputs_that_are_not_numbers_is_unlike_any():
+    view = next(views())
+    made = corrector(view=view)
+    view.snapshot.velocities[4, 0] = np.nan
+    for answers in (made, CompiledCorrector(made, view.bodies)):
+        assert float(answers.unlike(View(view.bodies, view.snapshot))) == np.inf
+
+
 def test_inputs_that_are_not_numbers_are_outside_the_training_data():
     view = next(views())
     made = corrector(view=view)
@@ -387,7 +404,9 @@ def test_edges_receive_in_groups_of_their_own():
 
 
 @pytest.mark.parametrize("placement", ["state", "force", "guess"])
-@pytest.mark.parametrize("gate", [None, Gate(), Gate(margin=0.0), Gate(margin=None, energy=0.0)])
+@pytest.mark.parametrize(
+    "gate", [None, Gate(), Gate(margin=0.0), Gate(margin=None, average=None, energy=0.0)]
+)
 def test_steps_and_decisions_are_those_of_torch(placement, gate, monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     made = fitted([problem], placement=placement, node_features=REMEMBERING)

@@ -28,13 +28,14 @@ from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate, Measured, Reason, refusals
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
+from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.solvers.resume import check_same_run
 
 CELL = 0.02
-OPEN = Gate(margin=None, volume=None, crushing=None, energy=None)
+OPEN = Gate(margin=None, average=None, volume=None, crushing=None, energy=None)
 
 
 def same(a, b):
@@ -165,7 +166,7 @@ def test_scenes_of_a_batch_are_corrected_as_each_alone(placement, element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
     names = (*preset("compact").node_features, "previous-correction")
     corrector = fitted(scenes, placement=placement, node_features=names)
-    gate = Gate(margin=None)
+    gate = Gate(margin=None, average=None)
     stepper = pc.BatchStepper(scenes, 1e-12)
     many = BatchHybrid(stepper, corrector, gate=gate)
     alone = [HybridStepper(pc.ProjectiveDynamics(p, 1e-12), corrector, gate=gate) for p in scenes]
@@ -663,8 +664,8 @@ CASES = {
         lambda p: 0.01 * bumped(p),
         True,
     ),
-    Reason.INVERSION: (Gate(margin=None, energy=None), folded, False),
-    Reason.ENERGY: (Gate(margin=None, volume=None, crushing=None), wild, False),
+    Reason.INVERSION: (Gate(margin=None, average=None, energy=None), folded, False),
+    Reason.ENERGY: (Gate(margin=None, average=None, volume=None, crushing=None), wild, False),
 }
 
 
@@ -723,8 +724,36 @@ def test_inputs_unlike_the_training_data_are_refused_in_a_batch():
     state = stepper.state([*states, scenes[1].rest_state()])
     result = BatchHybrid(stepper, corrector, gate=Gate(volume=None, energy=None))(state)
     assert result.reasons.tolist() == [Reason.FEATURES, 0]
-    wide = BatchHybrid(stepper, corrector, gate=Gate(margin=1e9, volume=None, energy=None))
+    wide = BatchHybrid(
+        stepper, corrector, gate=Gate(margin=1e9, average=1e9, volume=None, energy=None)
+    )
     assert wide(state).reasons.tolist() == [0, 0]
+
+
+def test_a_body_whose_mean_inputs_are_strange_is_refused_though_every_node_is_familiar():
+    """Fitted to two beams, of which one moves as it did, and one all of whose means are new."""
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector, averages = fitted(scenes), Moments()
+    stepper = pc.BatchStepper(scenes)
+    state = stepper.rest_state()
+    open_ = Gate(volume=None, energy=None)
+    assert BatchHybrid(stepper, corrector, gate=open_)(state).reasons.tolist() == [0, 0]
+    seen = []
+    answer, corrector.of_view = corrector.of_view, lambda view: seen.append(view) or answer(view)
+    BatchHybrid(stepper, corrector)(state)
+    corrector.of_view = answer
+    familiar = seen[0].bodies.body_means(corrector.inputs(seen[0])[0])[:1]
+    averages.add(familiar.detach())
+    corrector.normaliser.fit_averages(averages)
+    away = corrector.unlike(seen[0]).tolist()
+    assert away[0] < 1e-6 < 1.0 < away[1]
+    for average, reason in ((0.9 * away[1], Reason.FEATURES), (1.1 * away[1], 0), (None, 0)):
+        gate = open_.model_copy(update={"average": average})
+        assert BatchHybrid(stepper, corrector, gate=gate)(state).reasons.tolist() == [0, reason]
+    for scene, (problem, reason) in enumerate(zip(scenes, (0, Reason.FEATURES), strict=True)):
+        gate = open_.model_copy(update={"average": 0.5})
+        one = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+        assert one(problem.rest_state()).stats["gate"] == reason, scene
 
 
 def test_a_gate_lets_pass_what_it_has_no_objection_to():
@@ -739,7 +768,7 @@ def test_a_gate_lets_pass_what_it_has_no_objection_to():
 def test_a_limited_correction_is_scaled_back_until_it_passes():
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     corrector = prescribed(problem, folded(problem))
-    gate = Gate(margin=None, energy=None, limit=True)
+    gate = Gate(margin=None, average=None, energy=None, limit=True)
     coarse = pc.ProjectiveDynamics(problem)
     result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
     factor = result.stats["correction_factor"]
@@ -757,7 +786,7 @@ def test_a_limited_correction_is_scaled_back_until_it_passes():
 def test_a_limit_that_does_not_suffice_refuses():
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     corrector = prescribed(problem, 1e4 * folded(problem))
-    gate = Gate(margin=None, energy=None, limit=True)
+    gate = Gate(margin=None, average=None, energy=None, limit=True)
     coarse = pc.ProjectiveDynamics(problem)
     result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
     assert result.stats["gate"] == Reason.INVERSION
@@ -771,7 +800,7 @@ def test_a_correction_may_improve_what_the_coarse_step_inverted():
     answer = coarse(bad).state.positions
     corrector = prescribed(problem, 0.5 * (problem.positions - answer))
     ratio = problem.volume_ratios(answer).min()
-    gate = Gate(margin=None, energy=None, volume=float(ratio) + 10.0)
+    gate = Gate(margin=None, average=None, energy=None, volume=float(ratio) + 10.0)
     assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["refused"] == 0.0
     corrector.answer = -corrector.answer
     assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["gate"] == Reason.INVERSION
@@ -854,8 +883,8 @@ def test_a_crushed_cell_refuses_a_correction():
     corrector = prescribed(problem, flat * held_at)
     stepper = pc.BatchStepper([problem])
     for gate, reason in (
-        (Gate(margin=None, energy=None), Reason.INVERSION),
-        (Gate(margin=None, energy=None, crushing=None), Reason.NONE),
+        (Gate(margin=None, average=None, energy=None), Reason.INVERSION),
+        (Gate(margin=None, average=None, energy=None, crushing=None), Reason.NONE),
     ):
         hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
         assert hybrid(problem.rest_state()).stats["gate"] == reason
@@ -881,12 +910,36 @@ def test_the_bound_on_energy_does_not_grow_with_the_correction(placement, push, 
     way = np.zeros_like(problem.positions)
     way[:, 0] = push * problem.time_step * before.velocities[:, 0]
     corrector = prescribed(problem, way, placement=placement)
-    gate = Gate(margin=None, energy=3.0)
+    gate = Gate(margin=None, average=None, energy=3.0)
     result = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)(before)
     assert result.stats["gate"] == (Reason.ENERGY if refused else 0)
     stepper = pc.BatchStepper([problem], 1e-10)
     many = BatchHybrid(stepper, corrector, gate=gate)(stepper.state([before]))
     assert many.reasons.tolist() == [Reason.ENERGY if refused else 0]
+
+
+@pytest.mark.parametrize(
+    ("gate", "heavier", "refused"),
+    [
+        (Gate(margin=None, average=None), 4.0, False),
+        (Gate(margin=None, average=None), 4.46, False),
+        (Gate(margin=None, average=None), 4.47, True),
+        (Gate(margin=None, average=None, energy=1.0), 2.73, False),
+        (Gate(margin=None, average=None, energy=1.0), 2.74, True),
+    ],
+)
+def test_a_kick_s_right_answer_passes_where_the_coarse_mass_is_four_times_too_heavy(
+    gate, heavier, refused
+):
+    """From rest energy less work rises by (r - 1)^2/3 of the coarse step's energy and work."""
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2))
+    kick = np.zeros_like(problem.positions)
+    kick[:, 0] = 10.0 * problem.mass
+    result = pc.ProjectiveDynamics(problem, 1e-10)(problem.rest_state(), kick)
+    way = result.state.positions - problem.positions
+    corrector = prescribed(problem, (heavier - 1.0) * way)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)
+    assert hybrid(problem.rest_state(), kick).stats["refused"] == refused
 
 
 @pytest.mark.parametrize(
@@ -904,7 +957,7 @@ def test_the_plain_step_is_solved_only_where_energy_rises_beyond_the_loads_work(
             taken.append("plain" if forces is None else "forced")
             return super().__call__(state, forces, *args, **options)
 
-    gate = Gate(margin=None, energy=3.0)
+    gate = Gate(margin=None, average=None, energy=3.0)
     result = HybridStepper(Counting(problem), corrector, gate=gate)(before)
     assert taken == steps
     assert result.stats["refused"] == (push == 9.0)

@@ -380,11 +380,11 @@ def test_numbers_that_are_not_finite_are_refused(model):
 
 
 def test_other_versions_are_told_from_damage(model):
-    rewrite_json(model, put_json("version", value=2), seal=False)
-    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 2: expected 1.*newer"):
+    rewrite_json(model, put_json("version", value=3), seal=False)
+    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 3: expected 2.*newer"):
         load_model(model)
-    rewrite_json(model, put_json("version", value=0))
-    with pytest.raises(FileVersionError, match="format version 0: expected 1"):
+    rewrite_json(model, put_json("version", value=1))
+    with pytest.raises(FileVersionError, match="format version 1: expected 2"):
         load_model(model)
 
 

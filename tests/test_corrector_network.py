@@ -703,7 +703,7 @@ def test_moments_that_come_in_parts_are_those_of_the_whole():
 
 def fitted(**columns):
     """A normaliser of features given by their values, and targets of mean square 4."""
-    normaliser = Normaliser({name: x.shape[1] for name, x in columns.items()})
+    normaliser = Normaliser({name: x.shape[1] for name, x in columns.items()}, {})
     moments = {}
     for name, x in columns.items():
         moments[name] = Moments()
@@ -724,7 +724,7 @@ def test_normalised_features_have_zero_mean_and_unit_deviation():
     found = normaliser.joined({"a": a, "b": b}, None)
     assert largest(found.mean(0)) < 1e-9
     assert largest(found.std(0, correction=0) - 1.0) < 1e-9
-    assert not Normaliser({"a": 1}).fitted
+    assert not Normaliser({"a": 1}, {}).fitted
 
 
 @pytest.mark.parametrize("constant", [0.1, -3e5, 0.01, 1e-12, 0.0])
@@ -745,6 +745,38 @@ def test_what_never_changed_in_training_is_known_to_a_hundredth():
     assert normaliser.excess({"b": tensor([[0.0], [1.0]])}).flatten().tolist() == (
         pytest.approx([0.0, 100.0], abs=1e-12)
     )
+
+
+def averaged(*rows):
+    """A normaliser of two components that has seen bodies with these mean inputs."""
+    normaliser, averages = Normaliser({"a": 2}, {"b": 3}), Moments()
+    averages.add(tensor(rows))
+    normaliser.fit_averages(averages)
+    return normaliser
+
+
+def test_bodies_are_as_strange_as_deviations_of_their_mean_inputs():
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(4000, 2)) * [1.0, 3.0] + [5.0, -2.0]
+    normaliser = averaged(*rows)
+    found = normaliser.strangeness(tensor([[5.0, -2.0], [7.0, -2.0], [5.0, 10.0], [9.0, -11.0]]))
+    expected = [[0.0, 0.0], [2.0, 0.0], [0.0, 4.0], [4.0, 3.0]]
+    np.testing.assert_allclose(found.numpy(), expected, rtol=0.12, atol=0.1)
+
+
+def test_rare_extremes_of_mean_inputs_are_not_strange():
+    rows = np.zeros((1000, 2))
+    rows[0] = 30.0, -7.0
+    normaliser = averaged(*rows)
+    assert largest(normaliser.strangeness(tensor(rows[:1])) - 3.5) < 1e-9
+    beyond = normaliser.strangeness(tensor([[36.0, 0.0], [-6.0, 0.0]]))
+    assert 4.1 < float(beyond[0, 0]) < 4.3  # by a fifth
+    assert float(beyond[1, 0]) > 6.0  # on the other side, where none was
+
+
+def test_mean_inputs_that_cancelled_in_all_bodies_count_by_a_tenth_of_a_node_s_deviation():
+    normaliser = averaged([0.0, 0.0], [1e-9, -1e-9])
+    assert largest(normaliser.strangeness(tensor([[0.1, -0.3]])) - tensor([[1.0, 3.0]])) < 1e-6
 
 
 def test_rounding_of_stored_positions_is_not_enlarged():
@@ -785,7 +817,7 @@ def test_a_normaliser_needs_values_to_be_fitted_to():
         ({"a": full}, empty, "targets"),
         ({"a": full}, zero, "targets"),
     ):
-        normaliser = Normaliser({"a": 1})
+        normaliser = Normaliser({"a": 1}, {})
         with pytest.raises(InputError, match=words):
             normaliser.fit(found, target)
         assert not normaliser.fitted

@@ -20,6 +20,7 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
+from pdcorrect.corrector.features import View  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
@@ -385,6 +386,31 @@ def test_the_normaliser_has_zero_mean_and_unit_deviation_on_the_training_split(f
     )
     target = every.target[every.bodies.free.all(dim=1)]
     assert float(normaliser.output_scale) == pytest.approx(float(target.square().mean().sqrt()))
+
+
+def test_bodies_of_the_training_split_are_like_it(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector = samples.fitted(folder, settings)
+    fit_normaliser(corrector, windows, 10**6)
+    every = windows.batch(range(len(windows.dataset)))
+    view = View(every.bodies, every.snapshot)
+    averages = every.bodies.body_means(corrector.inputs(view)[0])
+    normaliser = corrector.normaliser
+    np.testing.assert_allclose(
+        normaliser.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
+    )
+    assert (
+        1.0
+        < float(corrector.unlike(view).max())
+        <= max(3.5, float((averages.amax(dim=0) - averages.mean(dim=0)).max()) / 0.1)
+    )
 
 
 def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):

@@ -20,8 +20,15 @@ MODEL = "tiny"
 FAR = Path(__file__).with_name("far.toml")
 SPLITS = ("evaluation", "stronger", "stiffer", "softer", "compressible", "half-step",
           "double-step", "long")  # fmt: skip
-MARGINS = (None, 3.0, 1.0, 0.3)
-"""Of the gate, in deviations; None: no gate."""
+GATES: dict[str, dict[str, float | None] | None] = {
+    "none": None,
+    "margin 3": {"margin": 3.0, "average": None},
+    "margin 1": {"average": None},
+    "margin 0.3": {"margin": 0.3, "average": None},
+    "average 3.7": {"margin": None},
+    "default": {},
+}
+"""Changes of the default gate, in deviations; None: no gate."""
 HARM = 1.05
 """Times the coarse model's RMS error: what is more counts as harm."""
 
@@ -39,8 +46,8 @@ class Held:
         return 100.0 * float((self.errors > HARM).mean())
 
 
-def held(data: Path, split: str) -> dict[float | None, Held]:
-    """Free rollouts of a split by margin."""
+def held(data: Path, split: str) -> dict[str, Held]:
+    """Free rollouts of a split by gate."""
     from pdcorrect.batch.stepper import BatchStepper
     from pdcorrect.corrector.batch_hybrid import BatchHybrid
     from pdcorrect.corrector.gate import Gate
@@ -51,8 +58,8 @@ def held(data: Path, split: str) -> dict[float | None, Held]:
     cases = read_cases(data, split, ["best"], skip_damaged=False).cases
     stepper = BatchStepper([case.problems["best"] for case in cases])
     found = {}
-    for margin in MARGINS:
-        gate = None if margin is None else Gate(margin=margin)
+    for name, changes in GATES.items():
+        gate = None if changes is None else Gate(**changes)
         hybrid = BatchHybrid(stepper, corrector, gate=gate)
         runs = roll_out(hybrid, stepper, [case.steps for case in cases])
         errors = [
@@ -61,29 +68,28 @@ def held(data: Path, split: str) -> dict[float | None, Held]:
             for run, case in zip(runs, cases, strict=True)
         ]
         refused = [run.refused.mean() for run in runs]
-        found[margin] = Held(np.array(errors), np.array(refused))
+        found[name] = Held(np.array(errors), np.array(refused))
     return found
 
 
 def outcome(split: str) -> common.Outcome:
     """One split, generated first."""
-    from pdcorrect.corrector.gate import Gate
     from pdcorrect.data.config import DatasetConfig
     from pdcorrect.data.generate import generate
 
     with tempfile.TemporaryDirectory() as folder:
         generate(DatasetConfig.load(FAR), folder, splits=[split])
         found = held(Path(folder), split)
-    chosen = found[Gate().margin]
+    chosen = found["default"]
     figures = {f"{split}, harmed, per cent": chosen.harmed}
     if split == SPLITS[0]:
         figures[f"{split}, refused, per cent"] = 100.0 * float(chosen.refused.mean())
     rows = tuple(
-        (split, "no gate" if margin is None else f"{margin:g}", float(np.median(one.errors)),
-         float(one.errors.max()), one.harmed, 100.0 * float(one.refused.mean()))
-        for margin, one in found.items()
+        (split, name, float(np.median(one.errors)), float(one.errors.max()), one.harmed,
+         100.0 * float(one.refused.mean()))
+        for name, one in found.items()
     )  # fmt: skip
-    headings = ("split", "margin", "median error", "largest error", "harmed, %", "refused, %")
+    headings = ("split", "gate", "median error", "largest error", "harmed, %", "refused, %")
     title = "RMS error of the hybrid over that of its coarse model alone"
     return common.Outcome(figures, (common.Table(title, headings, rows),))
 

@@ -67,12 +67,15 @@ class CompiledFeatures:
         See `View.deformation`.
     frames : (n, 3, 3)
         See `View.frames`.
+    of_nodes : (n, a)
+        Normalised features of nodes, as the network sees them.
     """
 
     def __init__(
         self, corrector: Corrector, bodies: BodyGraph, groups: Groups, x: Array, e: Array
     ) -> None:
         self._groups, self._x, self._e = groups, x, e
+        self.of_nodes = x[: len(bodies.rest)]
         n, place = len(bodies.rest), groups.place
         self.deformation, self.excess = 0.0, np.zeros(n)
         self.frames = np.zeros((n, 3, 3))

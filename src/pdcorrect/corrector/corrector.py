@@ -35,6 +35,9 @@ class Answers(Protocol):
     def outside(self, view: View, margin: float) -> Tensor:
         """Share of each body's nodes with inputs beyond a margin, (B,)."""
 
+    def unlike(self, view: View) -> Tensor:
+        """How far each body's mean inputs are from those of training bodies, (B,)."""
+
 
 class Corrector(nn.Module):
     """Displacements (n, 3), m, that are to be added to a coarse step.
@@ -58,7 +61,7 @@ class Corrector(nn.Module):
         self.config = config
         nodes = {name: NODE_FEATURES[name][0] for name in config.node_features}
         edges = {name: EDGE_FEATURES[name][0] for name in config.edge_features}
-        self.normaliser = Normaliser({**nodes, **edges})
+        self.normaliser = Normaliser(nodes, edges)
         self.network = MeshGraphNetwork(
             sum(nodes.values()), sum(edges.values()), layers=config.layers, width=config.width,
             mlp_layers=config.mlp_layers, norm=config.norm, shared=config.shared,
@@ -100,6 +103,18 @@ class Corrector(nn.Module):
         counts = torch.zeros_like(bodies.mass).index_add(0, view.receiver, edges.to(bodies.mass))
         nodes |= counts > 0.0
         return bodies.body_means(nodes.to(bodies.mass))
+
+    def unlike(self, view: View) -> Tensor:
+        """How far the mean inputs of each body's nodes are from those of training bodies, (B,).
+
+        The largest of all components, see `Normaliser.strangeness`; infinite where one is not a
+        number.
+        """
+        config = self.config
+        nodes = features.values(NODE_FEATURES, config.node_features, view)
+        averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
+        strangeness = self.normaliser.strangeness(averages)
+        return torch.where(strangeness.isnan(), torch.inf, strangeness).amax(dim=1)
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

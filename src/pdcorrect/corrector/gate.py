@@ -69,6 +69,10 @@ class Gate(Strict):
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data.
+    average
+        Refused if the mean of an input over a body's nodes is farther than this from its mean in
+        training, in deviations of such means there, of which the farthest of them counts as 3.5
+        at most: a body whose every node is somewhere in what was seen may yet move as none did.
     volume
         Refused if in any cell the smallest det F at the quadrature points, of the nodes'
         displacements, is not above this bound, unless it is no smaller than in the same cell
@@ -81,7 +85,9 @@ class Gate(Strict):
         higher than after the coarse step by more than this multiple of the step's energy:
         kinetic and elastic energy after the coarse step and the magnitude of the loads' work
         in it.  Nothing in the bound depends on the correction, and the forces of corrections
-        are no loads.
+        are no loads.  A bound against single jumps, and a wide one: where the coarse mass rule
+        makes nodes r times too heavy, the right answer to a kick rises by (r - 1)²/3, which
+        the published rule takes to 3 (r = 4).
     limit
         Whether a correction that fails by volume or energy is halved, up to six times, until it
         passes, and refused only then; for placement "state".
@@ -89,17 +95,21 @@ class Gate(Strict):
 
     margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
+    average: NonNegative | None = 3.7
     volume: Number | None = 0.0
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
-    energy: NonNegative | None = 1.0
+    energy: NonNegative | None = 4.0
     limit: bool = False
 
     def unknown(self, corrector: Answers, view: View) -> Tensor:
         """Whether the network's inputs are too far from its training data, (B,) bool."""
         bodies = view.bodies
-        if self.margin is None:
-            return torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
-        return corrector.outside(view, self.margin) > self.share
+        found = torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
+        if self.margin is not None:
+            found |= corrector.outside(view, self.margin) > self.share
+        if self.average is not None:
+            found |= corrector.unlike(view) > self.average
+        return found
 
     def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Tensor:
         """Reasons (B,) to refuse an answer beside another one, which is the coarse one.

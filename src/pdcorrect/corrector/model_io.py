@@ -45,7 +45,7 @@ from torch import Tensor  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 
 FORMAT = "pdcorrect-model"
-VERSION = 1
+VERSION = 2
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 _NORMALISER = "normaliser."
@@ -77,7 +77,7 @@ class _Description(Strict):
     """``model.json`` without its checksum."""
 
     format: Literal["pdcorrect-model"] = "pdcorrect-model"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     architecture: CorrectorConfig
     parameters: int
     dtype: Literal["float32"] = "float32"
@@ -367,7 +367,7 @@ def _check_values(where: str, state: dict[str, Tensor], error: type[InputError])
             raise error(f"{where}: {name} has type {tensor.dtype}: expected {dtype}.")
         if not bool(torch.isfinite(tensor).all()):
             raise error(f"{where}: {name} has values that are infinite or not a number.")
-        if name.endswith("__deviation") and not bool((tensor > 0.0).all()):
+        if name.endswith("_deviation") and not bool((tensor > 0.0).all()):
             raise error(f"{where}: {name} has values that are not positive.")
     if not float(state[f"{_NORMALISER}output_scale"]) > 0.0:
         raise error(f"{where}: its normaliser has not been fitted: it cannot be used.")

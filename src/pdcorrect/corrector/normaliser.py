@@ -19,6 +19,15 @@ Stored positions are rounded to single precision, which alone is 1e-7 of an edge
 
 _CONSTANT_UNIT = 0.01
 
+_LEAST_SPREAD = 0.1
+"""Deviation of bodies' mean inputs, in deviations of single nodes' inputs; less counts as this.
+
+Means that symmetry makes vanish in all training bodies would make any other look strange.
+"""
+
+_EXTREME = 3.5
+"""Deviations that the extremes of bodies' mean inputs count as, where they are farther out."""
+
 
 class Moments:
     """Mean, deviation and range of values that come in parts.
@@ -84,26 +93,36 @@ class Normaliser(nn.Module):
 
     Parameters
     ----------
-    widths : mapping of str to int
+    nodes, edges : mapping of str to int
         Components of each feature.
 
     Attributes
     ----------
     output_scale : () tensor
         Root mean square of the training targets, a component.
+    average_low, average_high, average_mean, average_deviation : (a,) tensors
+        Range, mean and deviation, over the training data, of the means over a body's nodes of
+        what the network sees of them.
     fitted : bool
         Whether it has seen data.
     """
 
     output_scale: Tensor
+    average_low: Tensor
+    average_high: Tensor
+    average_mean: Tensor
+    average_deviation: Tensor
 
-    def __init__(self, widths: Mapping[str, int]) -> None:
+    def __init__(self, nodes: Mapping[str, int], edges: Mapping[str, int]) -> None:
         super().__init__()
-        self.names = tuple(widths)
-        for name, k in widths.items():
+        self.names = (*nodes, *edges)
+        for name, k in {**nodes, **edges}.items():
             for part, value in (("mean", 0.0), ("deviation", 1.0), ("low", 0.0), ("high", 0.0)):
                 self.register_buffer(_key(name, part), torch.full((k,), value, dtype=torch.float64))
         self.register_buffer("output_scale", torch.zeros((), dtype=torch.float64))
+        for part, value in (("low", 0.0), ("high", 0.0), ("mean", 0.0), ("deviation", 1.0)):
+            full = torch.full((sum(nodes.values()),), value, dtype=torch.float64)
+            self.register_buffer(f"average_{part}", full)
 
     @property
     def fitted(self) -> bool:
@@ -136,13 +155,26 @@ class Normaliser(nn.Module):
             self._part(name, "high").copy_(moments.high)
         self.output_scale.copy_(target.square.mean().sqrt())
 
+    def fit_averages(self, averages: Moments) -> None:
+        """Take over range, mean and deviation of bodies' mean inputs (m, a), see `joined`."""
+        self.average_low.copy_(averages.low)
+        self.average_high.copy_(averages.high)
+        self.average_mean.copy_(averages.mean)
+        self.average_deviation.copy_(averages.deviation.clamp_min(_LEAST_SPREAD))
+
     def widen(self, features: Mapping[str, Moments]) -> None:
         """Widen the ranges by those of further values; nothing else changes."""
         for name in self.names:
-            moments = features[name]
-            for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
-                own = self._part(name, part)
-                own.copy_(of_both(own.cpu(), getattr(moments, part)))
+            self._widen(_key(name, ""), features[name])
+
+    def widen_averages(self, averages: Moments) -> None:
+        """Widen the ranges of bodies' mean inputs (m, a); nothing else changes."""
+        self._widen("average_", averages)
+
+    def _widen(self, prefix: str, moments: Moments) -> None:
+        for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
+            own: Tensor = getattr(self, prefix + part)
+            own.copy_(of_both(own.cpu(), getattr(moments, part)))
 
     def joined(self, values: Mapping[str, Tensor], clip: float | None) -> Tensor:
         """Normalised features (m, k1 + k2 + ...), bent towards -clip and clip."""
@@ -159,6 +191,19 @@ class Normaliser(nn.Module):
         low, high, deviation = (self._row(values, p, x) for p in ("low", "high", "deviation"))
         unit = _unit(low, high, deviation)
         return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
+
+    def strangeness(self, averages: Tensor) -> Tensor:
+        """How far bodies' mean inputs (B, a) are from their mean in training.
+
+        In deviations of such means; where their extremes are more than 3.5 away, these count as
+        3.5, since some inputs are large in few steps only.
+        """
+        low, high, mean, deviation = (
+            getattr(self, f"average_{part}").to(averages)
+            for part in ("low", "high", "mean", "deviation")
+        )
+        farthest = torch.where(averages < mean, mean - low, high - mean)
+        return (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
 
     def scale(self, name: str) -> Scale:
         """What is known of one feature."""

@@ -206,7 +206,7 @@ class Stage(Strict):
 class Fitting(Strict):
     """Of the normalisation: most windows taken from the training split."""
 
-    windows: PositiveCount = 2000
+    windows: PositiveCount = 10_000
 
 
 class TrainingConfig(TomlConfig):

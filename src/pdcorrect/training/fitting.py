@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -9,7 +11,7 @@ from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
 from pdcorrect.corrector.normaliser import Moments
-from pdcorrect.training.windows import StepWindows
+from pdcorrect.training.windows import StepBatch, StepWindows
 
 _AT_ONCE = 32
 """Windows."""
@@ -30,7 +32,9 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     most : int
         Windows; if there are more, so many are drawn without replacement by ``seed``.
     """
-    corrector.normaliser.fit(*_moments(corrector, windows, most, seed))
+    chosen = _chosen(windows, most, seed)
+    corrector.normaliser.fit(*_moments(corrector, windows, chosen))
+    corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
 
 
 @torch.no_grad()
@@ -40,22 +44,27 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
-    corrector.normaliser.widen(_moments(corrector, windows, most, seed)[0])
+    chosen = _chosen(windows, most, seed)
+    corrector.normaliser.widen(_moments(corrector, windows, chosen)[0])
+    corrector.normaliser.widen_averages(_averages(corrector, windows, chosen))
+
+
+def _chosen(windows: StepWindows, most: int, seed: int) -> list[int]:
+    count = len(windows.dataset)
+    if count <= most:
+        return list(range(count))
+    chosen = np.random.default_rng((seed, 1)).choice(count, most, replace=False)
+    return sorted(chosen.tolist())
 
 
 def _moments(
-    corrector: Corrector, windows: StepWindows, most: int, seed: int
+    corrector: Corrector, windows: StepWindows, chosen: list[int]
 ) -> tuple[dict[str, Moments], Moments]:
     """Of features by name, and of targets (m, 1)."""
-    count = len(windows.dataset)
-    chosen = np.arange(count)
-    if count > most:
-        chosen = np.sort(np.random.default_rng((seed, 1)).choice(count, most, replace=False))
     config = corrector.config
     moments = {name: Moments() for name in (*config.node_features, *config.edge_features)}
     target = Moments()
-    for first in range(0, len(chosen), _AT_ONCE):
-        batch = windows.batch(chosen[first : first + _AT_ONCE].tolist())
+    for batch in _batches(windows, chosen):
         view = View(batch.bodies, batch.snapshot)
         found = features.values(NODE_FEATURES, config.node_features, view)
         found |= features.values(EDGE_FEATURES, config.edge_features, view)
@@ -64,3 +73,17 @@ def _moments(
         wanted = corrector.target(view, batch.target)
         target.add(wanted[batch.bodies.free.all(dim=1)].reshape(-1, 1))
     return moments, target
+
+
+def _averages(corrector: Corrector, windows: StepWindows, chosen: list[int]) -> Moments:
+    """Of bodies' mean inputs (m, a), for which the normalisation has to be there."""
+    averages = Moments()
+    for batch in _batches(windows, chosen):
+        view = View(batch.bodies, batch.snapshot)
+        averages.add(batch.bodies.body_means(corrector.inputs(view)[0]))
+    return averages
+
+
+def _batches(windows: StepWindows, chosen: list[int]) -> Iterator[StepBatch]:
+    for first in range(0, len(chosen), _AT_ONCE):
+        yield windows.batch(chosen[first : first + _AT_ONCE])

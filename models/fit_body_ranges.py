@@ -1,0 +1,71 @@
+"""Fit the ranges of bodies' mean inputs (see `Gate.average`) to a model's own rollouts.
+
+python models/fit_body_ranges.py MODEL DATASET/config.toml [--device cuda] [--batch 20]
+
+For models that were trained before there were such ranges: trainings fit them to their data.
+One load is drawn for each mesh of the training split, as `pdcorrect dataset generate` does it,
+and the corrected coarse model rolled out from rest, without a gate; what the network sees on
+the way is what it knows.  That takes no reference.  The model is replaced by itself with these
+ranges.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+import pdcorrect as pc
+from pdcorrect.corrector.features import View
+from pdcorrect.corrector.model_io import LoadedModel, model_folder
+from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.data.config import TRAINING, DatasetConfig
+from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.evaluation.rollouts import roll_out
+
+
+def main() -> None:
+    """Fit one model."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("model", help="folder or name")
+    parser.add_argument("config", type=Path, help="of the data set that it was trained on")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--batch", type=int, default=20, help="rollouts at once")
+    options = parser.parse_args()
+    model = pc.load_model(options.model, options.device)
+    config = DatasetConfig.load(options.config)
+    averages, bodies = averages_of(model, config, options.device, options.batch)
+    model.corrector.normaliser.fit_averages(averages)
+    model.record.training["body_ranges"] = {"rollouts": bodies, "steps": averages.count}
+    print(pc.save_model(model.corrector, model_folder(options.model), record=model.record))
+
+
+def averages_of(
+    model: LoadedModel, config: DatasetConfig, device: str, batch: int
+) -> tuple[Moments, int]:
+    """Of bodies' mean inputs over all steps of all rollouts, and how many rollouts."""
+    plans = [plan for plan in make_plan(config) if plan.split == TRAINING]
+    scenes = [draw_scene(config, plan, 0) for plan in plans]
+    best = model.base == "best"
+    problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in scenes]
+    problems.sort(key=lambda problem: len(problem.positions))
+    corrector, averages = model.corrector, Moments()
+    answer = corrector.of_view
+
+    def watched(view: View) -> torch.Tensor:
+        averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
+        return answer(view)
+
+    corrector.of_view = watched  # type: ignore[method-assign]
+    for first in range(0, len(problems), batch):
+        stepper = pc.BatchStepper(problems[first : first + batch], device=device)
+        hybrid = pc.BatchHybrid(stepper, corrector, velocity=model.velocity)
+        roll_out(hybrid, stepper, [plans[0].frames] * len(stepper.node_counts))
+        print(f"{first + len(stepper.node_counts)} of {len(problems)}", flush=True)
+    del corrector.of_view
+    return averages, len(problems)
+
+
+if __name__ == "__main__":
+    main()
