@@ -83,9 +83,11 @@ def fitted(name: str, view: View) -> Corrector:
         for feature, values in features.values(table, names, view).items():
             found[feature] = Moments()
             found[feature].add(values)
-    target = Moments()
+    target, averages = Moments(), Moments()
     target.add(torch.ones(1, 1))
     corrector.normaliser.fit(found, target)
+    averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
+    corrector.normaliser.fit_averages(averages)
     return corrector.eval()
 
 
@@ -139,7 +141,8 @@ def steps(
     scene = scene_of(BODIES[body])
     state = pc.State(step.positions.numpy(), step.velocities.numpy())
     forces, times = step.forces.numpy(), {}
-    gate = pc.Gate(margin=1e3)  # other velocities than those that the normaliser has seen
+    # other velocities than those that the normaliser has seen
+    gate = pc.Gate(margin=1e3, average=1e3)
     for kind, model in (("", scene), ("best_", pc.best_coarse(scene))):
         coarse = pc.ProjectiveDynamics(pc.discretise(model))
         hybrid = pc.HybridStepper(coarse, corrector, gate=gate).prepare()

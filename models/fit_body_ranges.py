@@ -2,23 +2,34 @@
 
 python models/fit_body_ranges.py MODEL DATASET/config.toml [--device cuda] [--batch 20]
 
-For models that were trained before there were such ranges: trainings fit them to their data.
+For models of format version 1, from before there were such ranges; trainings fit them to their
+data.  Models of version 2 are fitted anew.
 One load is drawn for each mesh of the training split, as `pdcorrect dataset generate` does it,
 and the corrected coarse model rolled out from rest, without a gate; what the network sees on
-the way is what it knows.  That takes no reference.  The model is replaced by itself with these
-ranges.
+the way is what it knows.  That takes no reference; rollouts that fail are left out.  The model
+is replaced by itself with these ranges.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 
 import pdcorrect as pc
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import View
-from pdcorrect.corrector.model_io import LoadedModel, model_folder
+from pdcorrect.corrector.model_io import (
+    DESCRIPTION,
+    WEIGHTS,
+    LoadedModel,
+    ModelRecord,
+    model_folder,
+)
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
@@ -33,12 +44,25 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, default=20, help="rollouts at once")
     options = parser.parse_args()
-    model = pc.load_model(options.model, options.device)
+    folder = model_folder(options.model)
+    version = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["version"]
+    model = first_version(folder) if version == 1 else pc.load_model(folder)
+    model.corrector.to(options.device)
     config = DatasetConfig.load(options.config)
     averages, bodies = averages_of(model, config, options.device, options.batch)
     model.corrector.normaliser.fit_averages(averages)
-    model.record.training["body_ranges"] = {"rollouts": bodies, "steps": averages.count}
-    print(pc.save_model(model.corrector, model_folder(options.model), record=model.record))
+    model.record.training["body_ranges"] = {
+        "dataset": config.name, "rollouts": bodies, "steps": averages.count,
+    }  # fmt: skip
+    print(pc.save_model(model.corrector, folder, record=model.record))
+
+
+def first_version(folder: Path) -> LoadedModel:
+    """A model of format version 1, which has no ranges of bodies' means."""
+    found = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    corrector = Corrector(CorrectorConfig.model_validate(found["architecture"]))
+    corrector.load_state_dict(load_file(folder / WEIGHTS), strict=False)
+    return LoadedModel(corrector.eval(), ModelRecord.model_validate(found["record"]))
 
 
 def averages_of(
@@ -50,21 +74,26 @@ def averages_of(
     best = model.base == "best"
     problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in scenes]
     problems.sort(key=lambda problem: len(problem.positions))
-    corrector, averages = model.corrector, Moments()
-    answer = corrector.of_view
+    corrector, averages, bodies = model.corrector, Moments(), 0
+    answer, seen = corrector.of_view, []
 
     def watched(view: View) -> torch.Tensor:
-        averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
+        seen.append(view.bodies.body_means(corrector.inputs(view)[0]))
         return answer(view)
 
     corrector.of_view = watched  # type: ignore[method-assign]
     for first in range(0, len(problems), batch):
+        seen.clear()
         stepper = pc.BatchStepper(problems[first : first + batch], device=device)
         hybrid = pc.BatchHybrid(stepper, corrector, velocity=model.velocity)
-        roll_out(hybrid, stepper, [plans[0].frames] * len(stepper.node_counts))
-        print(f"{first + len(stepper.node_counts)} of {len(problems)}", flush=True)
+        runs = roll_out(hybrid, stepper, [plans[0].frames] * len(stepper.node_counts))
+        whole = [k for k, run in enumerate(runs) if run.failed is None]
+        for means in seen:
+            averages.add(means[whole])
+        bodies += len(whole)
+        print(f"{first + len(runs)} of {len(problems)}", flush=True)
     del corrector.of_view
-    return averages, len(problems)
+    return averages, bodies
 
 
 if __name__ == "__main__":

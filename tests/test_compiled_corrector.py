@@ -143,7 +143,9 @@ def test_how_unlike_training_a_body_is_agrees_with_torch():
     for view in views():
         other = body(seed=7)
         made = corrector(view=View(other, moving(other, 7)), node_features=REMEMBERING)
-        found = CompiledCorrector(made, view.bodies).unlike(view)
+        compiled = CompiledCorrector(made, view.bodies)
+        compiled.of_view(view)
+        found = compiled.unlike(view)
         assert float(found) > 0.0
         assert float(found) == pytest.approx(float(made.unlike(view)), rel=1e-9)
 

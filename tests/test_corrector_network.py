@@ -779,6 +779,20 @@ def test_mean_inputs_that_cancelled_in_all_bodies_count_by_a_tenth_of_a_node_s_d
     assert largest(normaliser.strangeness(tensor([[0.1, -0.3]])) - tensor([[1.0, 3.0]])) < 1e-6
 
 
+def test_mean_inputs_of_further_data_are_as_familiar_as_those_of_the_first():
+    normaliser = averaged([0.0, 0.0], [1.0, 1.0], [0.5, 0.2])
+    further, averages = tensor([[9.0, 0.5]]), Moments()
+    averages.add(further)
+    assert float(normaliser.strangeness(further)[0, 0]) > 10.0
+    normaliser.widen_averages(averages)
+    assert float(normaliser.strangeness(further)[0, 0]) <= 3.5 + 1e-12
+    assert float(normaliser.strangeness(-further)[0, 0]) > 10.0
+
+
+def test_nobody_is_familiar_before_averages_were_fitted():
+    assert Normaliser({"a": 1}, {}).strangeness(tensor([[0.0]])).isnan().all()
+
+
 def test_rounding_of_stored_positions_is_not_enlarged():
     rng = np.random.default_rng(0)
     x = tensor((1.0 + 1e-7 * rng.normal(size=1000))[:, None])

@@ -1,6 +1,7 @@
 """`models/table.py` and `models/fit_body_ranges.py`."""
 
 import importlib.util
+import json
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,10 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
+from safetensors.torch import load_file, save_file  # noqa: E402
+
 import pdcorrect as pc  # noqa: E402
+import pdcorrect.errors  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 
@@ -29,10 +33,22 @@ def test_the_page_of_results_has_the_table_of_the_records():
     assert script("table").table() in (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
 
 
-def test_the_body_ranges_of_a_model_are_those_of_its_own_rollouts(tmp_path):
+def as_version_1(folder):
+    """A model as it was before there were ranges of bodies' means."""
+    description = json.loads((folder / "model.json").read_text())
+    (folder / "model.json").write_text(json.dumps({**description, "version": 1}))
+    weights = {k: x for k, x in load_file(folder / "weights.safetensors").items()
+               if ".average_" not in k}  # fmt: skip
+    save_file(weights, folder / "weights.safetensors")
+
+
+def test_the_body_ranges_of_an_old_model_are_those_of_its_own_rollouts(tmp_path):
     folder = tmp_path / "tiny"
     shutil.copytree(ROOT / "models" / "tiny", folder)
     before = pc.load_model(folder).corrector.state_dict()
+    as_version_1(folder)
+    with pytest.raises(pc.errors.FileVersionError, match="version 1"):
+        pc.load_model(folder)
     config = ROOT / "datasets" / "tiny" / "config.toml"
     command = [sys.executable, ROOT / "models" / "fit_body_ranges.py", folder, config]
     subprocess.run([*command, "--batch", "4"], check=True, capture_output=True)

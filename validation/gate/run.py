@@ -25,7 +25,7 @@ GATES: dict[str, dict[str, float | None] | None] = {
     "margin 3": {"margin": 3.0, "average": None},
     "margin 1": {"average": None},
     "margin 0.3": {"margin": 0.3, "average": None},
-    "average 3.7": {"margin": None},
+    "average": {"margin": None},
     "default": {},
 }
 """Changes of the default gate, in deviations; None: no gate."""

@@ -73,6 +73,7 @@ class Gate(Strict):
         Refused if the mean of an input over a body's nodes is farther than this from its mean in
         training, in deviations of such means there, of which the farthest of them counts as 3.5
         at most: a body whose every node is somewhere in what was seen may yet move as none did.
+        For inputs that are large in few steps, as in kicks, that is a test of their range.
     volume
         Refused if in any cell the smallest det F at the quadrature points, of the nodes'
         displacements, is not above this bound, unless it is no smaller than in the same cell
@@ -86,8 +87,9 @@ class Gate(Strict):
         kinetic and elastic energy after the coarse step and the magnitude of the loads' work
         in it.  Nothing in the bound depends on the correction, and the forces of corrections
         are no loads.  A bound against single jumps, and a wide one: where the coarse mass rule
-        makes nodes r times too heavy, the right answer to a kick rises by (r - 1)²/3, which
-        the published rule takes to 3 (r = 4).
+        makes nodes r times too heavy, the right answer to a kick rises by (r - 1)²/3: with the
+        published rule 3.2 at most beside a 4x4x4 reference (r = 4.1 at corners), and more
+        beside finer ones.
     limit
         Whether a correction that fails by volume or energy is halved, up to six times, until it
         passes, and refused only then; for placement "state".

@@ -361,6 +361,8 @@ def _check_tensors(path: Path, state: dict[str, Tensor], expected: dict[str, Ten
 
 
 def _check_values(where: str, state: dict[str, Tensor], error: type[InputError]) -> None:
+    if not float(state[f"{_NORMALISER}output_scale"]) > 0.0:
+        raise error(f"{where}: its normaliser has not been fitted: it cannot be used.")
     for name, tensor in state.items():
         dtype = torch.float64 if name.startswith(_NORMALISER) else torch.float32
         if tensor.dtype != dtype:
@@ -369,8 +371,6 @@ def _check_values(where: str, state: dict[str, Tensor], error: type[InputError])
             raise error(f"{where}: {name} has values that are infinite or not a number.")
         if name.endswith("_deviation") and not bool((tensor > 0.0).all()):
             raise error(f"{where}: {name} has values that are not positive.")
-    if not float(state[f"{_NORMALISER}output_scale"]) > 0.0:
-        raise error(f"{where}: its normaliser has not been fitted: it cannot be used.")
 
 
 def _moved(state: dict[str, Tensor], device: str | torch.device) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ Stored positions are rounded to single precision, which alone is 1e-7 of an edge
 _CONSTANT_UNIT = 0.01
 
 _LEAST_SPREAD = 0.1
-"""Deviation of bodies' mean inputs, in deviations of single nodes' inputs; less counts as this.
+"""Deviation of bodies' mean inputs, as the network sees them; less counts as this.
 
 Means that symmetry makes vanish in all training bodies would make any other look strange.
 """
@@ -102,7 +102,7 @@ class Normaliser(nn.Module):
         Root mean square of the training targets, a component.
     average_low, average_high, average_mean, average_deviation : (a,) tensors
         Range, mean and deviation, over the training data, of the means over a body's nodes of
-        what the network sees of them.
+        what the network sees of them; not numbers before `fit_averages`.
     fitted : bool
         Whether it has seen data.
     """
@@ -120,9 +120,9 @@ class Normaliser(nn.Module):
             for part, value in (("mean", 0.0), ("deviation", 1.0), ("low", 0.0), ("high", 0.0)):
                 self.register_buffer(_key(name, part), torch.full((k,), value, dtype=torch.float64))
         self.register_buffer("output_scale", torch.zeros((), dtype=torch.float64))
-        for part, value in (("low", 0.0), ("high", 0.0), ("mean", 0.0), ("deviation", 1.0)):
-            full = torch.full((sum(nodes.values()),), value, dtype=torch.float64)
-            self.register_buffer(f"average_{part}", full)
+        for part in ("low", "high", "mean", "deviation"):
+            unknown = torch.full((sum(nodes.values()),), torch.nan, dtype=torch.float64)
+            self.register_buffer(f"average_{part}", unknown)
 
     @property
     def fitted(self) -> bool:
