@@ -22,6 +22,7 @@ from pdcorrect.cli import app  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
+from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
@@ -714,6 +715,9 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     """A saved model whose correction is zero."""
     corrector = Corrector(preset("compact", layers=1, width=8))
     corrector.normaliser.output_scale.fill_(1e-3)
+    averages = Moments()
+    averages.add(torch.zeros(1, len(corrector.normaliser.average_low)))
+    corrector.normaliser.fit_averages(averages)
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()
