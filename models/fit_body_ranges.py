@@ -35,6 +35,8 @@ from pdcorrect.data.config import TRAINING, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.evaluation.rollouts import roll_out
 
+_AVERAGES = "normaliser.average_"
+
 
 def main() -> None:
     """Fit one model."""
@@ -61,7 +63,9 @@ def first_version(folder: Path) -> LoadedModel:
     """A model of format version 1, which has no ranges of bodies' means."""
     found = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
     corrector = Corrector(CorrectorConfig.model_validate(found["architecture"]))
-    corrector.load_state_dict(load_file(folder / WEIGHTS), strict=False)
+    gaps = corrector.load_state_dict(load_file(folder / WEIGHTS), strict=False)
+    if gaps.unexpected_keys or not all(_AVERAGES in name for name in gaps.missing_keys):
+        raise SystemExit(f"{folder}: its weights are not those of its architecture.")
     return LoadedModel(corrector.eval(), ModelRecord.model_validate(found["record"]))
 
 

@@ -1,4 +1,4 @@
-"""Print the table of released models on unseen meshes, from the records of their evaluations.
+"""Print the table of a model of each data set on unseen meshes, from records of evaluations.
 
 python models/table.py
 
@@ -8,6 +8,7 @@ It is the table of ``docs/results.md``; a test holds the two equal.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,8 +72,8 @@ def _cells(row: Row) -> list[str]:
     exact = row.dataset.endswith("exact")
     return [
         f"`{row.dataset}`", f"({row.thesis:.1f})" if exact else f"{row.thesis:.1f}",
-        f"**{omega['mean']:.1f}**", f"{low:.1f} – {high:.1f}", f"{omega['median']:.1f}",
-        f"{omega['smallest']:.1f}", f"{found['rms_reduction']['mean']:.0f}",
+        f"**{omega['mean']:.1f}**", _signed(f"{low:.1f} – {high:.1f}"), f"{omega['median']:.1f}",
+        _signed(f"{omega['smallest']:.1f}"), f"{found['rms_reduction']['mean']:.0f}",
         f"{runs[base]['measures']['omega']['mean']:.1f}",
         f"{found['omega_base']['median']:.1f}",
         f"{heavy['measures']['omega']['mean']:.1f}" if heavy else "",
@@ -87,7 +88,11 @@ def _converged(runs: dict[str, Any], base: str, run: str) -> str:
     return "" if None in each else ", ".join(f"{1e3 * one['mean']:.1f}" for one in each)
 
 
-def _line(cells: Any) -> str:
+def _signed(text: str) -> str:
+    return text.replace("-", "−")
+
+
+def _line(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 

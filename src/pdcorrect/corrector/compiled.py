@@ -96,8 +96,8 @@ class CompiledCorrector:
         if view is not self._view and self._changed():
             self.refresh()
         averages = self._seen(view).of_nodes.mean(axis=0, dtype=np.float64)
-        strangeness = self._corrector.normaliser.strangeness(torch.from_numpy(averages)[None])
-        return torch.where(strangeness.isnan(), torch.inf, strangeness).amax(dim=1)
+        normaliser = self._corrector.normaliser
+        return normaliser.strangeness(torch.from_numpy(averages)[None]).amax(dim=1)
 
     def _seen(self, view: View) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""

@@ -107,14 +107,12 @@ class Corrector(nn.Module):
     def unlike(self, view: View) -> Tensor:
         """How far the mean inputs of each body's nodes are from those of training bodies, (B,).
 
-        The largest of all components, see `Normaliser.strangeness`; infinite where one is not a
-        number.
+        The largest of all components, see `Normaliser.strangeness`.
         """
         config = self.config
         nodes = features.values(NODE_FEATURES, config.node_features, view)
         averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
-        strangeness = self.normaliser.strangeness(averages)
-        return torch.where(strangeness.isnan(), torch.inf, strangeness).amax(dim=1)
+        return self.normaliser.strangeness(averages).amax(dim=1)
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

@@ -196,14 +196,15 @@ class Normaliser(nn.Module):
         """How far bodies' mean inputs (B, a) are from their mean in training.
 
         In deviations of such means; where their extremes are more than 3.5 away, these count as
-        3.5, since some inputs are large in few steps only.
+        3.5, since some inputs are large in few steps only.  Infinite where it is not a number.
         """
         low, high, mean, deviation = (
             getattr(self, f"average_{part}").to(averages)
             for part in ("low", "high", "mean", "deviation")
         )
         farthest = torch.where(averages < mean, mean - low, high - mean)
-        return (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
+        found = (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
+        return torch.where(found.isnan(), torch.inf, found)
 
     def scale(self, name: str) -> Scale:
         """What is known of one feature."""
