@@ -4,9 +4,10 @@
         [--batches 1,4,16] [--accuracy 1e-4] [--steps 20] [--quick]
 
 Scenes are the first ones of a data set's split, repeated where a batch is larger; the fine
-mesh is that of its reference.  Network and gate count to the corrected step.  Results go to
-``results/<machine>-hybrid.json``.  ``--quick`` is one scene and three steps, to see that it
-works.
+mesh is that of its reference.  DATA is its folder, or a configuration, whose scenes are drawn
+then: one load for each of ``--meshes``.  Network and gate count to the corrected step.  Results
+go to ``results/<machine>-hybrid-<model>.json``.  ``--quick`` is one scene and three steps, to
+see that it works.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import re
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import cycle, islice
 from pathlib import Path
@@ -23,13 +25,22 @@ from typing import Any
 
 import torch
 
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.gate import Gate
+from pdcorrect.corrector.model_io import load_model
+from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.rebuild import rebuilt_problems
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.simulate import models
 from pdcorrect.environment import environment
 from pdcorrect.evaluation.candidates import saved_candidates
 from pdcorrect.evaluation.speed import measure_speed
+from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.scene import best_coarse
 
 
 def options() -> argparse.Namespace:
@@ -42,8 +53,31 @@ def options() -> argparse.Namespace:
     parser.add_argument("--batches", default="1,4,16", help="numbers of scenes")
     parser.add_argument("--accuracy", type=float, default=1e-4, help="of the coarse cell size")
     parser.add_argument("--steps", type=int, default=20)
+    parser.add_argument("--meshes", type=int, default=4, help="of a configuration")
+    parser.add_argument("--recorded", action="store_true", help="see BatchHybrid")
     parser.add_argument("--quick", action="store_true")
     return parser.parse_args()
+
+
+def stored(data: Path, split: str, base: str) -> Iterator[tuple[Problem, Problem]]:
+    """Coarse and fine problems of a data set's simulations."""
+    for path in shard_paths(data, split):
+        shard = read_shard(path)
+        coarse, fine = (rebuilt_problems(shard, path, run) for run in (base, REFERENCE))
+        yield from zip(coarse, fine, strict=True)
+
+
+def drawn(path: Path, split: str, base: str) -> Iterator[tuple[Problem, Problem]]:
+    """The same of the first loads of a configuration's meshes."""
+    config = DatasetConfig.load(path)
+    for plan in make_plan(config):
+        if plan.split == split:
+            scene, runs = draw_scene(config, plan, 0), models(config, plan)
+            coarse, fine = (
+                discretise(best_coarse(scene) if run.best else scene, refine=run.refine)
+                for run in (runs[base], runs[REFERENCE])
+            )
+            yield coarse, fine
 
 
 def main() -> None:
@@ -52,20 +86,24 @@ def main() -> None:
     batches = [1] if chosen.quick else [int(count) for count in chosen.batches.split(",")]
     steps = 3 if chosen.quick else chosen.steps
     (saved,) = saved_candidates([chosen.model], chosen.device)
-    base = saved.candidate.base
-    pairs = []
-    for path in shard_paths(chosen.data, chosen.split):
-        shard = read_shard(path)
-        coarse, fine = (rebuilt_problems(shard, path, run) for run in (base, REFERENCE))
-        pairs += list(zip(coarse, fine, strict=True))
-        if len(pairs) >= max(batches):
-            break
+    base, model = saved.candidate.base, load_model(chosen.model)
+    corrector = model.corrector.to(chosen.device)
+
+    def hybrid(stepper: BatchStepper) -> BatchHybrid:
+        return BatchHybrid(
+            stepper, corrector, velocity=model.velocity, gate=Gate(), recorded=chosen.recorded
+        )
+
+    data = Path(chosen.data)
+    source = drawn(data, chosen.split, base) if data.is_file() else stored(data, chosen.split, base)
+    most = min(chosen.meshes, max(batches)) if data.is_file() else max(batches)
+    pairs = list(islice(source, most))
     rows: list[dict[str, Any]] = []
     for count in batches:
         scenes = list(islice(cycle(pairs), count))
         found = measure_speed(
             [coarse for coarse, _ in scenes], [fine for _, fine in scenes],
-            saved.candidate.hybrid, device=chosen.device, accuracy=chosen.accuracy, steps=steps,
+            hybrid, device=chosen.device, accuracy=chosen.accuracy, steps=steps,
         )  # fmt: skip
         rows.append({
             **asdict(found), "speed_up": found.speed_up, "network_share": found.network_share,
@@ -84,7 +122,7 @@ def main() -> None:
     slug = re.sub(r"[^a-z0-9]+", "-", device.lower()).strip("-")
     folder = Path(__file__).parent / "results"
     folder.mkdir(exist_ok=True)
-    path = folder / f"{slug}-hybrid.json"
+    path = folder / f"{slug}-hybrid-{Path(chosen.model).name}.json"
     if chosen.quick:
         print("--quick: no file was written")
         return

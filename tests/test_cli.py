@@ -176,7 +176,7 @@ def test_compare_writes_its_report(program, tmp_path):
     assert all(row["unusual_frames"] == 0 for row in record["rows"])
     assert record["environment"]["threads"]
     text = (folder / "report.md").read_text()
-    for name in ("comparison.png", "node.png", "energy.png", "error_over_time.png"):
+    for name in ("comparison.png", "overlay.png", "node.png", "energy.png", "error_over_time.png"):
         assert f"]({name})" in text
         assert (folder / name).stat().st_size > 5000
     assert "small cross" in out
@@ -206,6 +206,8 @@ def test_render_draws_runs_side_by_side(program, scene_file, tmp_path):
         status, _, err = program("render", *files, "-o", tmp_path / name)
         assert (status, err) == (0, "")
         assert (tmp_path / name).stat().st_size > 5000
+    assert program("render", *files, "-o", tmp_path / "over.png", "--overlay")[0] == 0
+    assert (tmp_path / "over.png").stat().st_size > 5000
     status, _, err = program("render", *files, "-o", tmp_path / "x.png", "--frame", 99)
     assert status == cli.BAD_INPUT
     status, _, err = program("render", *files, "-o", tmp_path / "x.bmp2")
@@ -328,6 +330,7 @@ def test_render_refuses_what_would_mislead(program, scene_file, tmp_path):
     for more, words in (
         (("--colour", "error", "-o", tmp_path / "x.png"), "two runs"),
         (("--frame", "1", "-o", tmp_path / "x.gif"), "all frames"),
+        (("--overlay", "-o", tmp_path / "x.png"), "two to"),
     ):
         status, _, err = program("render", tmp_path / "a.h5", *more)
         assert status == cli.BAD_INPUT

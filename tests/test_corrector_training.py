@@ -422,6 +422,22 @@ def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
     assert found[0]["output_scale"] != found[2]["output_scale"]
 
 
+def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector = samples.fitted(folder, settings)
+    _, _, steps = windows.dataset.places(range(len(windows.dataset)))
+    first, others = np.flatnonzero(steps == 0), np.flatnonzero(steps == 10)
+    fit_normaliser(corrector, windows, len(first))
+
+    def outside(numbers):
+        batch = windows.batch(numbers.tolist())
+        return corrector.outside(View(batch.bodies, batch.snapshot), 0.0)
+
+    assert not outside(first).any()
+    assert outside(others).any()  # so few windows do not hold all of the rest
+
+
 # --- steps of the optimiser --------------------------------------------------------------
 
 

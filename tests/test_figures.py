@@ -255,6 +255,41 @@ def test_bad_input_is_refused(run, fine, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_runs_over_each_other_are_seen_where_they_differ(run, fine, tmp_path):
+    """Blue and green alone where one body is, and a mixture of both where they are together."""
+    away = dataclasses.replace(run, positions=run.positions + np.array([0.0, 0.0, 0.05]))
+    pictures = [
+        drawn(figures.render_overlay(runs, tmp_path / "a.png", labels=["1", "2"], window=WIDTH))
+        for runs in ([run, run], [run, away])
+    ]
+    shades = [image[body_rows(image)].transpose(2, 0, 1) for image in pictures]
+    blue = [((b - r > 60) & (b - g > 25)).mean() for r, g, b in shades]
+    green = [((g - r > 60) & (g - b > 25)).mean() for r, g, b in shades]
+    for shares in (blue, green):
+        assert shares[0] < 0.01
+        assert shares[1] > 0.03
+    assert (~paper(pictures[0][-60:])).any()  # legend
+    # of a finer run, the coarse one's cells
+    assert figures.render_overlay([run, fine], tmp_path / "b.png", labels=["1", "2"]).exists()
+
+
+def test_bad_overlays_are_refused(run, fine, tmp_path):
+    png, two = tmp_path / "a.png", {"labels": ["a", "b"]}
+    for runs, output, named, words in (
+        ([run], png, {"labels": ["a"]}, "expected two to"),
+        ([run] * 7, png, {"labels": list("abcdefg")}, "7 runs: expected two to 6"),
+        ([run, run], png, {"labels": ["a"]}, "1 labels for 2 runs"),
+        ([run, run], tmp_path / "a.gif", two, r"\.png"),
+        ([run, run], png, {**two, "frame": 7}, "frame 7: expected -7 to 6"),
+    ):
+        with pytest.raises(InputError, match=words):
+            figures.render_overlay(runs, output, **named)
+    other = dataclasses.replace(fine, points=fine.points + 0.003)
+    with pytest.raises(MeshError, match="coincident"):
+        figures.render_overlay([run, other], png, **two)
+    assert not list(tmp_path.iterdir())
+
+
 def test_unwritable_outputs_are_named(run, tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.png").mkdir()

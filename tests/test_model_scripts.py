@@ -1,4 +1,4 @@
-"""`models/table.py` and `models/fit_body_ranges.py`."""
+"""The scripts in `models` that print tables, fit and widen ranges, and draw."""
 
 import importlib.util
 import json
@@ -17,6 +17,9 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 import pdcorrect as pc  # noqa: E402
 import pdcorrect.errors  # noqa: E402
+from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.data.config import DatasetConfig  # noqa: E402
+from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 
@@ -66,3 +69,64 @@ def test_the_body_ranges_of_an_old_model_are_those_of_its_own_rollouts(tmp_path)
     fitted = model.record.training["body_ranges"]
     assert fitted["steps"] == 20 * fitted["rollouts"] > 0
     assert np.isfinite(middle).all()
+
+
+def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
+    folder = tmp_path / "tiny"
+    shutil.copytree(ROOT / "models" / "tiny", folder)
+    path = ROOT / "datasets" / "tiny" / "config.toml"
+    model = pc.load_model(folder)
+    before = model.corrector.state_dict()
+    names = model.corrector.normaliser.names
+    with torch.no_grad():  # as if its ranges were those of a single value
+        for name in names:
+            key = name.replace("-", "_")
+            before[f"normaliser.{key}__low"].copy_(before[f"normaliser.{key}__mean"])
+            before[f"normaliser.{key}__high"].copy_(before[f"normaliser.{key}__mean"])
+    pc.save_model(model.corrector, folder, record=model.record)
+    narrow = tmp_path / "narrow"
+    shutil.copytree(folder, narrow)
+    first = first_step(path)
+    assert (first(pc.load_model(folder)) > 0.9).all()
+    command = [sys.executable, ROOT / "models" / "widen_ranges.py", folder, path]
+    subprocess.run([*command, "--batch", "4"], check=True, capture_output=True)
+    widened = pc.load_model(folder)
+    assert (first(widened) == 0.0).all()
+    after = widened.corrector.state_dict()
+    changed = {name for name in after if not torch.equal(before[name], after[name])}
+    assert all(
+        name.endswith(("__low", "__high", "average_low", "average_high")) for name in changed
+    )
+    assert widened.record.training["first_steps"] == {"dataset": "tiny", "steps": 10}
+    command = [sys.executable, ROOT / "models" / "unknown_first_steps.py"]
+    for model, unknown in ((folder, 0), (narrow, 6)):
+        counted = [*command, model, path, "--split", "training", "--loads", "1"]
+        told = subprocess.run(counted, check=True, capture_output=True, text=True).stdout
+        assert told == f"6 first steps: {unknown} unknown, {unknown} by nodes, 0 by bodies\n"
+
+
+def first_step(path):
+    """A function from models to the share of nodes outside their ranges in one first step."""
+    config = DatasetConfig.load(path)
+    plan = next(plan for plan in make_plan(config) if plan.split == "training")
+    problem = pc.discretise(pc.best_coarse(draw_scene(config, plan, 0)))
+    stepper = pc.BatchStepper([problem])
+
+    def outside(model):
+        parts = BatchParts(stepper, model.corrector, model.velocity)
+        step = BatchCoarseStep(parts, stepper.rest_state(), None)
+        return model.corrector.outside(step.view(step.solved()), 1e-6)
+
+    return outside
+
+
+def test_a_trajectory_of_a_data_set_is_drawn(tmp_path):
+    pytest.importorskip("pyvista")
+    command = [sys.executable, ROOT / "models" / "draw_first.py", tmp_path, "torsion-exact"]
+    subprocess.run([*command, "--frames", "2"], check=True, capture_output=True)
+    record = json.loads((tmp_path / "first.json").read_text())
+    rows = record["trajectories"]["torsion-exact"]
+    assert set(rows) == {"coarse PD", "hybrid torsion-exact"}
+    assert 0 < rows["hybrid torsion-exact"]["rms_mm"] < rows["coarse PD"]["rms_mm"]
+    for name in ("node", "overlay"):
+        assert (tmp_path / f"torsion-exact-{name}.png").stat().st_size > 5000

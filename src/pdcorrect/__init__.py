@@ -51,6 +51,7 @@ _HOME = {
     "TrajectoryWriter": "pdcorrect.io.trajectory",
     "write_vtu_series": "pdcorrect.io.vtk",
     "render": "pdcorrect.figures",
+    "render_overlay": "pdcorrect.figures",
     "compare": "pdcorrect.evaluate",
 }
 _NEEDS_TORCH = (
@@ -93,6 +94,7 @@ __all__ = [  # noqa: RUF022
     "TrajectoryWriter",
     "write_vtu_series",
     "render",
+    "render_overlay",
     "compare",
     "metrics",
     "errors",
@@ -115,7 +117,7 @@ if TYPE_CHECKING:
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
     from pdcorrect.fem.stress import stress
-    from pdcorrect.figures import render
+    from pdcorrect.figures import render, render_overlay
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
     from pdcorrect.io.vtk import write_vtu_series
     from pdcorrect.scene import Scene, best_coarse

@@ -163,6 +163,10 @@ def render(
     colour: Annotated[Colour, typer.Option(help="What to colour by.")] = Colour.displacement,
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a film.", min=0.1)] = 25.0,
+    overlay: Annotated[
+        bool,
+        typer.Option("--overlay", help="Draw runs over each other in a .png, each in a colour."),
+    ] = False,
 ) -> None:
     """Draw one run or several side by side; errors are against the last run given.
 
@@ -178,15 +182,24 @@ def render(
     loaded = [load_trajectory(path) for path in runs]
     by_value: figures.Colour = "error" if colour is Colour.error else "displacement"
     still = output.suffix.lower() == ".png"
-    figures.render(
-        loaded,
-        output,
-        labels=label or [path.stem for path in runs],
-        colour=None if colour is Colour.none else by_value,
-        reference=loaded[-1] if colour is Colour.error else None,
-        frame=(-1 if frame is None else frame) if still else None,
-        fps=fps,
-    )
+    number = -1 if frame is None else frame
+    names = label or [path.stem for path in runs]
+    if overlay:
+        if colour is Colour.error:
+            raise InputError(
+                "--colour error with --overlay: runs have a colour each; leave it out."
+            )
+        figures.render_overlay(loaded, output, labels=names, frame=number)
+    else:
+        figures.render(
+            loaded,
+            output,
+            labels=names,
+            colour=None if colour is Colour.none else by_value,
+            reference=loaded[-1] if colour is Colour.error else None,
+            frame=number if still else None,
+            fps=fps,
+        )
     _say(f"wrote {output}")
 
 

@@ -204,7 +204,7 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 
 
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
-    """comparison.png (bodies side by side) and three plots; returns their file names."""
+    """Bodies side by side and over each other, and four plots; returns their file names."""
     runs = [comparison.runs[row.label] for row in comparison.rows]
     labels = [row.label for row in comparison.rows]
     truth = comparison.on_coarse[comparison.reference]
@@ -216,6 +216,14 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
         frame=int(frame),
+    )
+    overlaid = overlaid_rows(comparison)
+    plain = comparison.on_coarse[overlaid[-1]]
+    figures.render_overlay(
+        [comparison.on_coarse[label] for label in overlaid],
+        folder / "overlay.png",
+        labels=overlaid,
+        frame=int(np.linalg.norm(plain.positions - truth.positions, axis=(1, 2)).argmax()),
     )
     figures.plot_node_trajectories(
         runs, folder / "node.png", node_point=truth.points[node], labels=labels
@@ -229,8 +237,18 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         folder / "error_against_time.png",
     )
     return [
-        "comparison.png", "error_against_time.png", "error_over_time.png", "node.png", "energy.png"
+        "comparison.png", "overlay.png", "error_against_time.png", "error_over_time.png",
+        "node.png", "energy.png",
     ]  # fmt: skip
+
+
+def overlaid_rows(comparison: Comparison) -> list[str]:
+    """The reference, what is nearest to it on the coarse mesh, and the coarse mesh alone."""
+    coarse = comparison.rows[0]
+    others = [r for r in comparison.rows[1:] if r.nodes == coarse.nodes]
+    nearest = min(others, key=lambda row: row.rms_error, default=coarse)
+    labels = [comparison.reference, nearest.label, coarse.label]
+    return list(dict.fromkeys(labels))
 
 
 def _panel_label(comparison: Comparison, row: Row) -> str:

@@ -16,13 +16,14 @@ from pdcorrect.batch.checks import check_nodal, start_times
 from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.batch.threads import one_thread
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts, WithNodes
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.decision import corrected_step
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.placements import Velocity
+from pdcorrect.corrector.recorded import RecordedCorrector, recordable
+from pdcorrect.errors import InputError
 from pdcorrect.torch_layer import OnFailure, PDLayer
 
 
@@ -73,11 +74,15 @@ class BatchHybrid(WithNodes):
     gate : Gate, optional
         What else is refused than corrections that are not finite, and those of scenes whose
         coarse step fails.
+    recorded : bool
+        Whether a GPU compiles the network and records its work, and the gate's, in the first step,
+        to replay it in the others (see `RecordedCorrector`).  Tested on the CPU only, where it
+        changes nothing: what it is worth on a GPU has not been measured.
 
     Raises
     ------
     InputError
-        If the parts do not fit each other.
+        If the parts do not fit each other, or a corrector's own code could not be recorded.
     """
 
     def __init__(
@@ -87,10 +92,19 @@ class BatchHybrid(WithNodes):
         *,
         velocity: Velocity = "recomputed",
         gate: Gate | None = None,
+        recorded: bool = False,
     ) -> None:
-        self._hybrid = BatchParts(stepper, corrector, velocity)
+        self._hybrid = BatchParts(stepper, corrector, velocity, recorded)
         self.stepper, self.corrector, self.gate = stepper, corrector, gate
         check_gate(gate, corrector)
+        self._answers: Answers = corrector
+        if recorded:
+            if not recordable(corrector):
+                raise InputError(
+                    "recorded = True with a corrector of another class, with hooks, or with a "
+                    "network that was changed: its own code would not run. Expected False."
+                )
+            self._answers = RecordedCorrector(corrector, None if gate is None else gate.margin)
 
     @torch.no_grad()
     def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
@@ -107,9 +121,9 @@ class BatchHybrid(WithNodes):
         InputError
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
-        with one_thread(self.stepper.device):
+        with self.stepper.alone():
             step = BatchCoarseStep(self._hybrid, state, previous)
-            answer, coarse, decision = corrected_step(step, self.corrector, self.gate)
+            answer, coarse, decision = corrected_step(step, self._answers, self.gate)
         return BatchHybridResult(
             answer.state, decision.correction, coarse, decision.reasons, decision.factors
         )

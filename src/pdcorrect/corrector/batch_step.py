@@ -16,18 +16,26 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Measured
 from pdcorrect.corrector.placements import Velocity, check_velocity, moved
+from pdcorrect.corrector.recorded import RecordedMeasures, stored_and_ratios
 from pdcorrect.errors import InputError
 
 
 class BatchParts:
     """What both forms of a hybrid of many scenes have: its parts, checked."""
 
-    def __init__(self, stepper: BatchStepper, corrector: Corrector, velocity: Velocity) -> None:
+    def __init__(
+        self,
+        stepper: BatchStepper,
+        corrector: Corrector,
+        velocity: Velocity,
+        recorded: bool = False,
+    ) -> None:
         self.nodes = BatchBodies(stepper)
         self.corrector = check_corrector(corrector, stepper.device)
         check_velocity(velocity, stepper.integrator)
         self.stepper, self.velocity = stepper, velocity
         self.placement = corrector.config.placement
+        self.measures = RecordedMeasures(stepper) if recorded else None
 
     def view(self, before: BatchState, coarse: Tensor | None, previous: Tensor | None) -> View:
         """What the network sees of a step."""
@@ -136,11 +144,11 @@ class BatchCoarseStep:
         return chosen(which, one, other)
 
     def _with_work(self, state: BatchState, y: Tensor, work: Tensor) -> Measured:
-        stepper = self._stepper
-        elastic, _ = stepper.cells.energy_and_forces(y)
-        v = stepper.staging.extended(state.velocities)
-        kinetic = 0.5 * dot(v, stepper.objective.mass(v))
-        return Measured(stepper.cells.volume_ratios(state.positions), elastic + kinetic, work)
+        recorded, motion = self._parts.measures, (state.positions, state.velocities, y)
+        if recorded is not None:
+            return recorded(*motion, work)
+        stored, ratios = stored_and_ratios(self._stepper, *motion)
+        return Measured(ratios, stored, work)
 
     def _configuration(self, answer: BatchResult) -> Tensor:
         """The end of the step, (B, U, 3)."""

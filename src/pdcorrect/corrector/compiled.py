@@ -6,8 +6,6 @@ their arithmetic on meshes of some hundred nodes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from operator import is_
 from typing import Any
 
 import numpy as np
@@ -20,6 +18,7 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled_features import KNOWN_OF_EDGES, KNOWN_OF_NODES, CompiledFeatures
 from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
 from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.contents import Contents
 from pdcorrect.corrector.corrector import Corrector, without_momentum
 from pdcorrect.corrector.features import View
 from pdcorrect.fem.decomposition import OPTIONS
@@ -59,13 +58,7 @@ class CompiledCorrector:
     def refresh(self) -> None:
         """Copy the corrector's weights and normaliser."""
         corrector = self._corrector
-        self.config = corrector.config
-        self._parts = list(_contents(corrector))
-        self._kept = [part for _, _, part in self._parts]
-        self._tensors = [part for _, _, part in self._parts if isinstance(part, Tensor)]
-        # of inference tensors torch does not count how often they are written
-        self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
-        self._writes = self._written()
+        self.config, self._contents = corrector.config, Contents(corrector)
         self.network = CompiledNetwork(corrector.network, self._groups)
         self.features = CompiledFeatures(
             corrector, self._bodies, self._groups, self.network.x, self.network.e
@@ -75,7 +68,7 @@ class CompiledCorrector:
 
     def of_view(self, view: View) -> Tensor:
         """The correction (n, 3), m."""
-        if self._changed():
+        if self._contents.changed:
             self.refresh()
         features = self._seen(view)
         answer = np.empty_like(features.frames[:, 0])
@@ -86,14 +79,14 @@ class CompiledCorrector:
 
     def outside(self, view: View, margin: float) -> Tensor:
         """See `Corrector.outside`."""
-        if view is not self._view and self._changed():
+        if view is not self._view and self._contents.changed:
             self.refresh()
         beyond = ~(self._seen(view).excess <= margin)
         return torch.tensor([np.count_nonzero(beyond) / len(beyond)], dtype=torch.float64)
 
     def unlike(self, view: View) -> Tensor:
         """See `Corrector.unlike`."""
-        if view is not self._view and self._changed():
+        if view is not self._view and self._contents.changed:
             self.refresh()
         averages = self._seen(view).of_nodes.mean(axis=0, dtype=np.float64)
         normaliser = self._corrector.normaliser
@@ -106,16 +99,6 @@ class CompiledCorrector:
             self._view = view
         return self.features
 
-    def _changed(self) -> bool:
-        if self._corrector.config is not self.config or self._written() != self._writes:
-            return True
-        there = (table.get(name) for table, name, _ in self._parts)
-        return not all(map(is_, there, self._kept))
-
-    def _written(self) -> list[int]:
-        """How often each tensor was written, and where they are."""
-        return [t._version for t in self._counted] + [t.data_ptr() for t in self._tensors]
-
 
 def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
     """Whether `CompiledCorrector` can take the place of a corrector.
@@ -127,7 +110,7 @@ def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
     known = KNOWN_OF_NODES.issuperset(config.node_features) and KNOWN_OF_EDGES.issuperset(
         config.edge_features
     )
-    plain = type(corrector) is Corrector and _usual(corrector)
+    plain = type(corrector) is Corrector and usual(corrector)
     dtypes = {weight.dtype for weight in corrector.network.parameters()}
     return (
         known and plain and config.output == "frame" and bodies.bodies == 1
@@ -136,8 +119,8 @@ def compilable(corrector: Corrector, bodies: BodyGraph) -> bool:
     )  # fmt: skip
 
 
-def _usual(corrector: Corrector) -> bool:
-    """Whether its network is as it was made, weights apart."""
+def usual(corrector: Corrector) -> bool:
+    """Whether its network is as it was made, weights apart, and without hooks."""
     with torch.device("meta"):
         new = Corrector(corrector.config)
     mine, made = (list(each.network.modules()) for each in (corrector, new))
@@ -147,14 +130,6 @@ def _usual(corrector: Corrector) -> bool:
         and not (one._forward_hooks or one._forward_pre_hooks)
         for one, other in zip(mine, made, strict=True)
     )
-
-
-def _contents(corrector: Corrector) -> Iterator[tuple[dict[str, Any], str, Any]]:
-    """All that a corrector is made of: where it is, its name there, and what it is."""
-    for part in corrector.modules():
-        for table in (part._parameters, part._buffers, part._modules):
-            for name, content in table.items():
-                yield table, name, content
 
 
 @njit(**OPTIONS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import torch
@@ -71,12 +72,13 @@ class Corrector(nn.Module):
         """The correction in the snapshot's precision; the network works in its own."""
         return self.of_view(View(bodies, snapshot))
 
-    def of_view(self, view: View) -> Tensor:
-        """The same for a view that exists already."""
+    def of_view(self, view: View, network: Callable[..., Tensor] | None = None) -> Tensor:
+        """The same for a view that exists already; ``network`` may be its own, compiled."""
         nodes, edges = self.inputs(view)
         weight = self.network.decoder[0].weight
         assert isinstance(weight, Tensor)
-        x = self.network(nodes.to(weight.dtype), edges.to(weight.dtype), view.bodies.edge_index)
+        answer = self.network if network is None else network
+        x = answer(nodes.to(weight.dtype), edges.to(weight.dtype), view.bodies.edge_index)
         return self.in_metres(view, x.to(view.bodies.rest.dtype))
 
     def inputs(self, view: View) -> tuple[Tensor, Tensor]:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.frames import node_gradients, turned_back
+from pdcorrect.corrector.frames import node_gradients, product, turned_back
 from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.errors import InputError
 
@@ -89,7 +89,7 @@ class View:
     @cached_property
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
-        return self.turns @ self.rest_frames
+        return product(self.turns, self.rest_frames)
 
     @cached_property
     def receiver_frames(self) -> Tensor:
@@ -100,8 +100,8 @@ class View:
     def strain(self) -> Tensor:
         """U - 1 in the node's frame, (n, 3, 3)."""
         identity = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
-        stretch = self.turns.transpose(1, 2) @ self.gradients - identity
-        return self.rest_frames.transpose(1, 2) @ stretch @ self.rest_frames
+        stretch = product(self.turns.transpose(1, 2), self.gradients) - identity
+        return product(product(self.rest_frames.transpose(1, 2), stretch), self.rest_frames)
 
     @cached_property
     def deformation(self) -> Tensor:

@@ -15,6 +15,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.fused import small_products
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 EDGE_MEANS = (2.0 * VTK_CORNERS - 1.0) / 4.0
@@ -46,7 +47,7 @@ def node_gradients(positions: Tensor, inverses: Tensor, cells: Tensor, counts: T
 
     ``inverses`` (c, 3, 3) are those of the cells' axes at rest, 1/m; ``counts`` as above.
     """
-    return _node_means(cell_axes(positions, cells) @ inverses, cells, counts)
+    return _node_means(product(cell_axes(positions, cells), inverses), cells, counts)
 
 
 def _node_means(values: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
@@ -58,9 +59,14 @@ def _node_means(values: Tensor, cells: Tensor, counts: Tensor) -> Tensor:
 
 def turned(R: Tensor, x: Tensor) -> Tensor:
     """R x for matrices (n, 3, 3) and vectors (n, 3)."""
-    return (R @ x[..., None])[..., 0]
+    return product(R, x[..., None])[..., 0]
 
 
 def turned_back(R: Tensor, x: Tensor) -> Tensor:
     """R^T x."""
-    return (R.transpose(1, 2) @ x[..., None])[..., 0]
+    return product(R.transpose(1, 2), x[..., None])[..., 0]
+
+
+def product(A: Tensor, B: Tensor) -> Tensor:
+    """A B for each node or edge; without derivatives by a kernel for small ones on a GPU."""
+    return A @ B if torch.is_grad_enabled() else small_products(A, B)

@@ -36,6 +36,7 @@ __all__ = [
     "plot_error_over_time",
     "plot_node_trajectories",
     "render",
+    "render_overlay",
 ]
 
 Colour = Literal["displacement", "error"]
@@ -45,6 +46,15 @@ _COLOURINGS = {
     "error": ("distance to the reference", "YlOrRd"),
 }
 """Title of the colour bar, and colour map."""
+_OVERLAID = (
+    ("#8fc3ee", "#0058a0"),
+    ("#7fdcb5", "#00774f"),
+    ("#f6b38d", "#b84a00"),
+    ("#e3a6cb", "#96457a"),
+    ("#efd06c", "#946f00"),
+    ("#cccccc", "#555555"),
+)
+"""Of faces and edges: blue, green, red, and three more."""
 _STILL, _FILM = 1600, 1000
 """Default widths of pictures and films, pixels."""
 
@@ -126,6 +136,70 @@ def render(
                 write_png(part, picture.whole())
     finally:
         picture.close()
+    return output
+
+
+def render_overlay(
+    trajectories: Sequence[Trajectory],
+    output: str | Path,
+    *,
+    labels: Sequence[str],
+    frame: int = -1,
+    window: int = 1200,
+) -> Path:
+    """Draw runs over each other in one picture, each in a colour of its own.
+
+    All are drawn with the cells of the coarsest run, so that the same cells compare.
+
+    Parameters
+    ----------
+    trajectories : sequence of Trajectory
+        Two to six, on meshes that hold the nodes of the coarsest.
+    output : path
+        ``.png``.
+    labels : sequence of str
+        One for each run.
+    frame : int
+        Which of the common frames; negative ones count from the end.
+    window : int
+        Width of the picture, pixels.
+
+    Returns
+    -------
+    Path
+        ``output``.
+
+    Raises
+    ------
+    InputError
+        If labels, frame, suffix, times or meshes do not fit.
+    OutputError
+        If the file cannot be written.
+    MissingExtraError
+        Without the extra "view".
+    """
+    runs, output = list(trajectories), Path(output)
+    if _check_arguments(runs, output, labels, None, None):
+        raise InputError(f"{output}: expected a name ending in .png.")
+    if not 2 <= len(runs) <= len(_OVERLAID):
+        raise InputError(f"{len(runs)} runs: expected two to {len(_OVERLAID)}.")
+    shared = _common_frames(runs)
+    (place,) = _choose(frame, shared.shape[1], film=False)
+    coarsest = min(runs, key=lambda run: len(run.points))
+    bodies = [
+        Body(_on_nodes_of(run, coarsest), frames[[place]], None)
+        for run, frames in zip(runs, shared, strict=True)
+    ]
+    view, colours = View.fitted(shown_points(bodies, rest=False), window), _OVERLAID[: len(runs)]
+    time = float(runs[0].times[shared[0, place]])
+    key = [(label, edges) for label, (_, edges) in zip(labels, colours, strict=True)]
+    sheet = Sheet(view, [""], 1, None, _font(window, 2), longest=time, key=key)
+    painter = Painter(bodies, view, "viridis", 1.0, rest=False, colours=colours)
+    try:
+        with replacing(output) as part:
+            write_png(part, sheet.page([painter.overlay(0)], [time]))
+    finally:
+        painter.close()
     return output
 
 
@@ -240,15 +314,21 @@ def _body(
     if colour != "error" or reference is None:
         moved = run.positions[frames] - run.points
         return Body(run, frames, np.linalg.norm(moved, axis=2) if colour else None)
-    if len(run.points) > len(reference.points):  # its nodes at those of the reference
-        nodes = coincident_nodes(run.points, reference.points, _tolerance(reference))
-        run = replace(
-            run, positions=run.positions[:, nodes], velocities=run.velocities[:, nodes],
-            points=reference.points, cells=reference.cells,
-        )  # fmt: skip
+    run = _on_nodes_of(run, reference)
     nodes = coincident_nodes(reference.points, run.points, _tolerance(run))
     difference = run.positions[frames] - reference.positions[reference_frames][:, nodes]
     return Body(run, frames, np.linalg.norm(difference, axis=2))
+
+
+def _on_nodes_of(run: Trajectory, other: Trajectory) -> Trajectory:
+    """A run at the nodes of another one, with its cells, where it has more nodes."""
+    if len(run.points) <= len(other.points):
+        return run
+    nodes = coincident_nodes(run.points, other.points, _tolerance(other))
+    return replace(
+        run, positions=run.positions[:, nodes], velocities=run.velocities[:, nodes],
+        points=other.points, cells=other.cells,
+    )  # fmt: skip
 
 
 def _tolerance(run: Trajectory) -> float:

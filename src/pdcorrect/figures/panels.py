@@ -24,7 +24,7 @@ _SHAPES = 0.42, 1.25  # smallest and largest height of a panel, in widths
 _OVERSAMPLING = 2
 _LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
 """Places (right, up, towards the camera) and strengths."""
-_PLAIN = "#7f9fc4"
+_PLAIN, _INK = "#7f9fc4", "#202020"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +125,18 @@ class Painter:
         Value of its upper end; the lower one is 0.
     rest : bool
         Whether to draw the edges of the shape at rest behind the body.
+    colours : sequence of (str, str), optional
+        Of bodies without values, and of their cells' edges, one pair each.
     """
 
     def __init__(
-        self, bodies: Sequence[Body], view: View, palette: str, limit: float, rest: bool
+        self,
+        bodies: Sequence[Body],
+        view: View,
+        palette: str,
+        limit: float,
+        rest: bool,
+        colours: Sequence[tuple[str, str]] | None = None,
     ) -> None:
         self._pv = _pyvista()
         self._view = view
@@ -145,7 +153,10 @@ class Painter:
         self._bodies = list(bodies)
         self._palette, self._limit = palette, limit
         self._actors: list[list[Any]] = []
-        self._surfaces = [self._add(body, rest) for body in bodies]
+        self._surfaces = [
+            self._add(body, rest, *(colours[number] if colours else (_PLAIN, _INK)))
+            for number, body in enumerate(bodies)
+        ]
         view.aim(self._plotter.camera)
 
     def image(self, body: int, time: int) -> NDArray[np.uint8]:
@@ -164,15 +175,24 @@ class Painter:
         raw = raw.reshape(raw.shape[0] // k, k, raw.shape[1] // k, k, 3).mean(axis=(1, 3))
         return np.rint(raw).astype(np.uint8)
 
+    def overlay(self, time: int) -> NDArray[np.uint8]:
+        """The same of all bodies at one time, laid over each other as on transparencies."""
+        images = np.array([self.image(body, time) for body in range(len(self._bodies))])
+        covers = (images < 255).any(axis=3, keepdims=True)
+        mean = (covers * images).sum(axis=0) / np.maximum(covers.sum(axis=0), 1)
+        return np.where(covers.any(axis=0), np.rint(mean), 255).astype(np.uint8)
+
     def close(self) -> None:
         """Free the window."""
         self._plotter.close()
 
-    def _add(self, body: Body, rest: bool) -> tuple[Any, NDArray[np.int64]]:
+    def _add(
+        self, body: Body, rest: bool, colour: str, edges: str
+    ) -> tuple[Any, NDArray[np.int64]]:
         """Add a body's surface; returns it and the node of each of its points."""
         nodes, faces = _surface(body.run)
         surface = self._pv.PolyData.from_regular_faces(body.run.points[nodes], faces)
-        style: dict[str, Any] = {"color": _PLAIN}
+        style: dict[str, Any] = {"color": colour}
         if body.values is not None:
             surface["value"] = np.zeros(len(nodes))
             style = {
@@ -184,7 +204,7 @@ class Painter:
         actors = [
             self._plotter.add_mesh(surface, ambient=0.5, diffuse=0.55, specular=0.0, **style),
         ]
-        actors[0].prop.edge_color = "#202020"
+        actors[0].prop.edge_color = edges
         cell = self._view.pixels_a_metre * _edge_length(body.run)
         if cell > 4:
             actors[0].prop.show_edges = True

@@ -49,6 +49,8 @@ class Sheet:
         As many as labels by default.
     longest : float
         The last time on any page, s: chooses the unit of times.
+    key : sequence of (str, str), optional
+        Names and their colours, in place of a bar.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Sheet:
         font: float,
         columns: int | None = None,
         longest: float = 1.0,
+        key: Sequence[tuple[str, str]] = (),
     ) -> None:
         self._longest = longest
         figure = require_extra("matplotlib.figure", "view")
@@ -83,6 +86,7 @@ class Sheet:
         self._add_axes()
         if bar:
             self._add_bar(bar)
+        self._add_key(key)
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
@@ -179,6 +183,14 @@ class Sheet:
         axes.tick_params(labelsize=0.72 * 0.9 * font, length=0.25 * font, width=1, pad=2)
         drawn.outline.set_visible(False)
         self._text(left, height - 2.75 * font, bar.title, font, va="bottom")
+
+    def _add_key(self, key: Sequence[tuple[str, str]]) -> None:
+        """Names in their colours, from the right of the scale on."""
+        x, y = max(0.3 * self.size[0], 15.5 * self._font), self.size[1] - 1.7 * self._font
+        for name, colour in key:
+            self._line([x, x + 1.6 * self._font], [y, y], colour, 0.3 * self._font)
+            text = self._text(x + 2.1 * self._font, y, name, self._font, va="center")
+            x += 3.6 * self._font + text.get_window_extent().width
 
 
 def round_limit(largest: float) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
@@ -22,7 +23,8 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     """Set means, deviations, ranges and the output's scale from windows of one step.
 
     Inputs are what the network sees in a step from the reference, targets what it should
-    give there, on free components.
+    give there, on free components.  Ranges hold the first steps of simulations besides: of a
+    kick, that is the only one with its load.
 
     Parameters
     ----------
@@ -30,11 +32,14 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     windows : StepWindows
         Of the training split.
     most : int
-        Windows; if there are more, so many are drawn without replacement by ``seed``.
+        Windows; if there are more, so many are drawn without replacement by ``seed``.  So for
+        first steps.
     """
-    chosen = _chosen(windows, most, seed)
+    every = np.arange(len(windows.dataset))
+    chosen = _chosen(every, most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
+    _widen(corrector, windows, _chosen(_first_steps(windows), most, seed))
 
 
 @torch.no_grad()
@@ -44,17 +49,29 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
-    chosen = _chosen(windows, most, seed)
+    every = np.arange(len(windows.dataset))
+    for numbers in (every, _first_steps(windows)):
+        _widen(corrector, windows, _chosen(numbers, most, seed))
+
+
+def _widen(corrector: Corrector, windows: StepWindows, chosen: list[int]) -> None:
     corrector.normaliser.widen(_moments(corrector, windows, chosen)[0])
     corrector.normaliser.widen_averages(_averages(corrector, windows, chosen))
 
 
-def _chosen(windows: StepWindows, most: int, seed: int) -> list[int]:
-    count = len(windows.dataset)
-    if count <= most:
-        return list(range(count))
-    chosen = np.random.default_rng((seed, 1)).choice(count, most, replace=False)
-    return sorted(chosen.tolist())
+def _first_steps(windows: StepWindows) -> NDArray[np.int64]:
+    """Numbers of the windows with which simulations begin."""
+    every = np.arange(len(windows.dataset))
+    _, _, steps = windows.dataset.places(every)
+    return every[steps == 0]
+
+
+def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
+    """At most so many of some windows."""
+    if len(numbers) > most:
+        numbers = np.random.default_rng((seed, 1)).choice(numbers, most, replace=False)
+    found: list[int] = np.sort(numbers).tolist()
+    return found
 
 
 def _moments(

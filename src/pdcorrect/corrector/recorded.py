@@ -1,0 +1,164 @@
+"""A corrector's answers, and what a gate measures, as work that a GPU replays.
+
+Features, network, energies and volumes are hundreds of small operations, whose launches take
+longer than they do.  They are the same in every step of the same bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.objective import dot
+from pdcorrect.batch.recording import Recorder
+from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.compiled import usual
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.contents import Contents
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import Snapshot, View
+from pdcorrect.corrector.gate import Measured
+
+
+def recordable(corrector: Corrector) -> bool:
+    """Whether a corrector's answers are operations on tensors alone: no hooks, no other code."""
+    own = any(callable(value) for value in vars(corrector).values())
+    return type(corrector) is Corrector and not own and usual(corrector)
+
+
+class RecordedCorrector:
+    """Answers as of a `Corrector`, without derivatives, with what a gate asks of it.
+
+    On a GPU the network is compiled, which changes its rounding, and all is recorded at the first
+    call and replayed; elsewhere it is run.  Recorded anew for other bodies, and where modules or
+    tensors of the corrector are replaced.  Values of weights are always those of now.
+
+    Parameters
+    ----------
+    corrector : Corrector
+        One that `recordable` accepts.
+    margin : float or None
+        Of `outside`; others are computed apart.
+
+    Attributes
+    ----------
+    config : CorrectorConfig
+
+    Notes
+    -----
+    For one thread at a time.
+    """
+
+    config: CorrectorConfig
+
+    def __init__(self, corrector: Corrector, margin: float | None) -> None:
+        self._corrector, self._margin = corrector, margin
+        self.config = corrector.config
+        self._forget()
+
+    def _forget(self) -> None:
+        self._bodies: BodyGraph | None = None
+        self._view: View | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_corrector": self._corrector, "_margin": self._margin, "config": self.config}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._forget()
+
+    def of_view(self, view: View) -> Tensor:
+        """The correction (n, 3), m."""
+        if view.bodies is not self._bodies or self._contents.replaced:
+            self._record(view.bodies)
+        for field in fields(Snapshot):
+            given, own = (getattr(x, field.name) for x in (view.snapshot, self._snapshot))
+            own.zero_() if given is None else own.copy_(given)
+        self._replay()
+        self._view = view
+        return self._answer.clone()
+
+    def outside(self, view: View, margin: float) -> Tensor:
+        """See `Corrector.outside`."""
+        if view is not self._view or margin != self._margin:
+            return self._corrector.outside(view, margin)
+        return self._outside.clone()
+
+    def unlike(self, view: View) -> Tensor:
+        """See `Corrector.unlike`."""
+        return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
+
+    def _record(self, bodies: BodyGraph) -> None:
+        self._forget()
+        corrector, rest = self._corrector, bodies.rest
+        with torch.inference_mode(False), torch.no_grad():
+            self.config, self._contents = corrector.config, Contents(corrector)
+            self._snapshot = Snapshot(*(rest.clone() for _ in fields(Snapshot)))
+            self._answer = torch.zeros_like(rest)
+            self._outside, self._unlike = (torch.zeros_like(bodies.cell_size) for _ in range(2))
+            self._network: Callable[..., Tensor] = corrector.network
+            if rest.is_cuda:
+                self._network = torch.compile(corrector.network, dynamic=True)
+            self._bodies = bodies
+            self._replay = Recorder(rest.device)(self._compute)
+
+    def _compute(self) -> None:
+        corrector, bodies = self._corrector, self._bodies
+        assert bodies is not None
+        view = View(bodies, self._snapshot)
+        self._answer.copy_(corrector.of_view(view, self._network))
+        if self._margin is not None:
+            self._outside.copy_(corrector.outside(view, self._margin))
+        self._unlike.copy_(corrector.unlike(view))
+
+
+class RecordedMeasures:
+    """Volumes and energies of states of a `BatchStepper`'s scenes, recorded likewise."""
+
+    def __init__(self, stepper: BatchStepper) -> None:
+        self._stepper = stepper
+        self._replay: Callable[[], None] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"_stepper": self._stepper, "_replay": None}
+
+    def __call__(self, positions: Tensor, velocities: Tensor, y: Tensor, work: Tensor) -> Measured:
+        """Of positions and velocities (B, N, 3) and configurations y (B, U, 3)."""
+        if self._replay is None:
+            self._record(positions, y)
+        assert self._replay is not None
+        self._positions.copy_(positions)
+        self._velocities.copy_(velocities)
+        self._y.copy_(y)
+        self._replay()
+        return Measured(self._ratios.clone(), self._stored.clone(), work)
+
+    def _record(self, positions: Tensor, y: Tensor) -> None:
+        sizes = self._stepper.cells.sizes
+        self._positions, self._y = positions.clone(), y.clone()
+        self._velocities = torch.zeros_like(positions)
+        self._ratios = positions.new_zeros(sizes.scenes, sizes.cells)
+        self._stored = positions.new_zeros(sizes.scenes)
+        self._replay = Recorder(self._stepper.device)(self._compute)
+
+    def _compute(self) -> None:
+        stored, ratios = stored_and_ratios(
+            self._stepper, self._positions, self._velocities, self._y
+        )
+        self._stored.copy_(stored)
+        self._ratios.copy_(ratios)
+
+
+def stored_and_ratios(
+    stepper: BatchStepper, positions: Tensor, velocities: Tensor, y: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Kinetic and elastic energy (B,), J, and smallest det F of each cell (B, C)."""
+    elastic, _ = stepper.cells.energy_and_forces(y)
+    v = stepper.staging.extended(velocities)
+    kinetic = 0.5 * dot(v, stepper.objective.mass(v))
+    return elastic + kinetic, stepper.cells.volume_ratios(positions)

@@ -1,0 +1,243 @@
+"""`RecordedCorrector` and `RecordedMeasures`: the same answers, whatever changes between them."""
+
+import copy
+import pickle
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import pdcorrect as pc  # noqa: E402
+from hybrid_samples import fitted, problems  # noqa: E402
+from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.corrector.features import View  # noqa: E402
+from pdcorrect.corrector.recorded import RecordedCorrector, recordable  # noqa: E402
+from pdcorrect.errors import InputError  # noqa: E402
+
+DEVICES = [
+    "cpu",
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    ),
+]
+CELLS = ((3, 1, 1), (2, 2, 1))
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    return request.param
+
+
+@pytest.fixture
+def made(device):
+    corrector = fitted(problems(*CELLS), size=0.01, node_features=FEATURES)
+    return corrector.to(device)
+
+
+FEATURES = ("node-type", "stiffness", "strain", "acceleration", "load", "previous-correction")
+
+
+class Motion:
+    """Views of a batch that moves, and its step."""
+
+    def __init__(self, device, corrector, steps=4):
+        self.stepper = pc.BatchStepper(problems(*CELLS), device=device)
+        self.parts = BatchParts(self.stepper, corrector, "recomputed", recorded=True)
+        state, self.steps = self.stepper.rest_state(), []
+        for number in range(steps):
+            previous = None
+            if number:
+                previous = 1e-4 * torch.sin(100.0 * self.parts.nodes.flat(state.positions))
+            step = BatchCoarseStep(self.parts, state, previous)
+            coarse = step.solved()
+            self.steps.append((step, coarse, step.view(coarse)))
+            state = coarse.state
+
+    @property
+    def views(self):
+        return [view for _, _, view in self.steps]
+
+
+def assert_same(answers, corrector, view, margin=1.0):
+    """Corrections, shares outside and distances, at rounding of single precision at most."""
+    with torch.no_grad():
+        anew = View(view.bodies, view.snapshot)
+        expected = corrector.of_view(anew)
+        found = answers.of_view(view)
+        size = expected.abs().max()
+        assert size > 1e-8
+        assert (found - expected).abs().max() < 1e-5 * size
+        assert torch.equal(answers.outside(view, margin), corrector.outside(anew, margin))
+        torch.testing.assert_close(answers.unlike(view), corrector.unlike(anew))
+
+
+def test_answers_are_those_of_the_corrector_step_by_step(device, made):
+    motion = Motion(device, made)
+    answers = RecordedCorrector(made, 1.0)
+    for view in (*motion.views, *motion.views[::-1]):
+        assert_same(answers, made, view)
+
+
+def test_answers_stay_when_others_are_asked_for(device, made):
+    first, second, *_ = Motion(device, made).views
+    answers = RecordedCorrector(made, 1.0)
+    with torch.no_grad():
+        kept = answers.of_view(first)
+        before = kept.clone()
+        answers.of_view(second)
+    assert torch.equal(kept, before)
+
+
+@pytest.mark.parametrize("margin", [None, 0.0, 3.0])
+def test_other_margins_and_views_are_not_taken_for_those_recorded(device, made, margin):
+    first, second, *_ = Motion(device, made).views
+    answers = RecordedCorrector(made, margin)
+    with torch.no_grad():
+        answers.of_view(first)
+        for view in (first, second):
+            for asked in (0.0, 0.1, 3.0):
+                assert torch.equal(answers.outside(view, asked), made.outside(view, asked))
+            torch.testing.assert_close(answers.unlike(view), made.unlike(view))
+
+
+def written(corrector):
+    with torch.no_grad():
+        corrector.network.decoder[-1].weight.mul_(2.0)
+
+
+def loaded(corrector):
+    weights = {name: 2 * x for name, x in corrector.network.state_dict().items()}
+    corrector.network.load_state_dict(weights)
+
+
+def replaced(corrector):
+    last = corrector.network.decoder[-1]
+    last.weight = torch.nn.Parameter(3.0 * last.weight.detach())
+
+
+def moved(corrector):
+    last = corrector.network.decoder[-1]
+    last.weight.data = 3.0 * last.weight.detach()
+
+
+def layered(corrector):
+    corrector.network.decoder[0] = torch.nn.Linear(16, 16, dtype=torch.float64).to(
+        corrector.network.decoder[0].weight
+    )
+
+
+def scaled(corrector):
+    corrector.normaliser.output_scale.mul_(2.0)
+
+
+def clipped(corrector):
+    corrector.config = corrector.config.model_copy(update={"clip": 0.5})
+
+
+@pytest.mark.parametrize("change", [written, loaded, replaced, moved, layered, scaled, clipped])
+def test_changes_of_the_corrector_count_at_once(device, made, change):
+    motion = Motion(device, made)
+    view = motion.views[-1]
+    answers = RecordedCorrector(made, 1.0)
+    with torch.no_grad():
+        before = answers.of_view(view)
+    change(made)
+    again = View(view.bodies, view.snapshot)
+    assert_same(answers, made, again)
+    with torch.no_grad():
+        assert (answers.of_view(again) - before).abs().max() > 1e-3 * before.abs().max()
+
+
+def test_other_bodies_and_materials_are_recorded_anew(device, made):
+    motion = Motion(device, made)
+    answers = RecordedCorrector(made, 1.0)
+    assert_same(answers, made, motion.views[1])
+    motion.stepper.set_material(young=8e4)
+    state = motion.stepper.rest_state()
+    step = BatchCoarseStep(motion.parts, state, None)
+    assert_same(answers, made, step.view(step.solved()))
+    assert_same(answers, made, Motion(device, made).views[2])
+
+
+def test_measures_are_energies_and_volumes_of_the_material_of_now(device, made):
+    motion = Motion(device, made)
+    for young in (None, 2e5):
+        if young:
+            motion.stepper.set_material(young=young, density=500.0)
+        for step, coarse, _ in motion.steps[1:]:
+            measured = step.measured(coarse)
+            for i, state in enumerate(motion.stepper.states(coarse.state)):
+                problem = motion.stepper.problem_now(i)
+                kinetic = 0.5 * (state.velocities * problem.mass_times(state.velocities)).sum()
+                expected = kinetic + problem.energy(state.positions)
+                assert float(measured.stored[i]) == pytest.approx(float(expected), rel=1e-9)
+                ratios = problem.volume_ratios(state.positions)
+                assert float(measured.ratios[i].min()) == pytest.approx(ratios.min(), rel=1e-12)
+
+
+def hooked(corrector):
+    corrector.network.decoder.register_forward_hook(lambda *_: None)
+
+
+def patched(corrector):
+    corrector.of_view = lambda view: torch.zeros_like(view.bodies.rest)
+
+
+def tanh(corrector):
+    corrector.network.node_encoder[1] = torch.nn.Tanh()
+
+
+@pytest.mark.parametrize("change", [hooked, patched, tanh])
+def test_code_that_would_not_run_is_not_recorded(device, made, change):
+    stepper = pc.BatchStepper(problems(*CELLS), device=device)
+    assert recordable(made)
+    assert pc.BatchHybrid(stepper, made, recorded=True)(stepper.rest_state()).correction.any()
+    change(made)
+    assert not recordable(made)
+    assert not pc.BatchHybrid(stepper, made)(stepper.rest_state()).refused.any()
+    with pytest.raises(InputError, match="own code would not run"):
+        pc.BatchHybrid(stepper, made, recorded=True)
+
+
+@pytest.mark.parametrize("placement", ["state", "force", "guess"])
+def test_rollouts_are_those_without_recording(device, placement):
+    corrector = fitted(problems(*CELLS), size=0.01, placement=placement).to(device)
+    gate = pc.Gate(margin=0.05)
+    stepper = pc.BatchStepper(problems(*CELLS), device=device)
+    runs = []
+    for recorded in (False, True):
+        hybrid = pc.BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)
+        state, reasons = stepper.rest_state(), []
+        for _ in range(6):
+            result = hybrid(state)
+            state = result.state
+            reasons.append(result.reasons)
+        runs.append((state.positions, torch.stack(reasons)))
+    (one, refused), (two, refused_too) = runs
+    assert torch.equal(refused, refused_too)
+    assert (one - two).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_copies_of_a_hybrid_in_use_record_for_themselves(device, made, copied):
+    stepper = pc.BatchStepper(problems(*CELLS), device=device)
+    gate = pc.Gate(margin=100.0, average=None)
+    hybrid = pc.BatchHybrid(stepper, made, gate=gate, recorded=True)
+    first = hybrid(stepper.rest_state())
+    other = copied(hybrid)
+    written(other.corrector)
+    anew = pc.BatchHybrid(stepper, other.corrector, gate=gate, recorded=True)
+    one, two, three = (h(h.stepper.rest_state()).correction for h in (hybrid, other, anew))
+    assert torch.equal(one, first.correction)
+    assert torch.equal(two, three)
+    assert (two - one).abs().max() > 0.1 * one.abs().max()
+
+
+def test_inference_mode_makes_no_difference(device, made):
+    motion = Motion(device, made)
+    hybrid = pc.BatchHybrid(motion.stepper, made, recorded=True)
+    state = motion.steps[2][1].state
+    with torch.inference_mode():
+        found = hybrid(state).correction
+    assert torch.equal(found, hybrid(state).correction)
