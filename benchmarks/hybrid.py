@@ -117,12 +117,15 @@ def main() -> None:
         "environment": {**machine, "device": device, "torch_threads": torch.get_num_threads()},
         "model": saved.record(),
         "data": chosen.data,
+        "distinct_scenes": len(pairs),
+        "recorded": chosen.recorded,
         "results": rows,
     }
     slug = re.sub(r"[^a-z0-9]+", "-", device.lower()).strip("-")
     folder = Path(__file__).parent / "results"
     folder.mkdir(exist_ok=True)
-    path = folder / f"{slug}-hybrid-{Path(chosen.model).name}.json"
+    recorded = "-recorded" if chosen.recorded else ""
+    path = folder / f"{slug}-hybrid-{Path(chosen.model).name}{recorded}.json"
     if chosen.quick:
         print("--quick: no file was written")
         return

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,12 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     found = {name: draw(name, options.output, options.frames) for name in options.names}
-    record = {"trajectories": found, "environment": environment()}
+    record = {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": " ".join(["python", "models/draw_first.py", *sys.argv[1:]]),
+        "environment": environment(),
+        "trajectories": found,
+    }
     write_text(options.output / "first.json", json.dumps(record, indent=2) + "\n")
 
 
@@ -70,9 +77,12 @@ def draw(name: str, output: Path, frames: int | None) -> dict[str, Any]:
     plot_node_trajectories(curves, output / f"{name}-node.png", node_point=place, labels=titles)
     print(f"{name}: frame {frame} of {len(away) - 1}", flush=True)
     return {
-        row.label: {"rms_mm": 1e3 * row.rms_error, "omega": row.omega,
-                    "refused": row.refused_frames}
-        for row in found.rows if row.label != found.reference
+        "mesh": plan.number, "load": 0, "frame drawn": frame, "model": found.models[corrected],
+        "runs": {
+            row.label: {"rms_mm": 1e3 * row.rms_error, "omega": row.omega,
+                        "refused": row.refused_frames}
+            for row in found.rows if row.label != found.reference
+        },
     }  # fmt: skip
 
 

@@ -17,6 +17,7 @@ import json
 from pathlib import Path
 
 import torch
+from first_steps import scenes_of
 from safetensors.torch import load_file
 
 import pdcorrect as pc
@@ -32,7 +33,6 @@ from pdcorrect.corrector.model_io import (
 )
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
-from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.evaluation.rollouts import roll_out
 
 _AVERAGES = "normaliser.average_"
@@ -73,8 +73,7 @@ def averages_of(
     model: LoadedModel, config: DatasetConfig, device: str, batch: int
 ) -> tuple[Moments, int]:
     """Of bodies' mean inputs over all steps of all rollouts, and how many rollouts."""
-    plans = [plan for plan in make_plan(config) if plan.split == TRAINING]
-    scenes = [draw_scene(config, plan, 0) for plan in plans]
+    scenes = scenes_of(config, TRAINING, loads=1)
     best = model.base == "best"
     problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in scenes]
     problems.sort(key=lambda problem: len(problem.positions))
@@ -90,7 +89,7 @@ def averages_of(
         seen.clear()
         stepper = pc.BatchStepper(problems[first : first + batch], device=device)
         hybrid = pc.BatchHybrid(stepper, corrector, velocity=model.velocity)
-        runs = roll_out(hybrid, stepper, [plans[0].frames] * len(stepper.node_counts))
+        runs = roll_out(hybrid, stepper, [config.frames] * len(stepper.node_counts))
         whole = [k for k, run in enumerate(runs) if run.failed is None]
         for means in seen:
             averages.add(means[whole])

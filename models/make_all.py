@@ -1,13 +1,15 @@
 """Generate data, train recipes on them and evaluate the models; start again to go on.
 
-python models/make_all.py WORK [RECIPE ...] [--device cuda] [--generators 8] [--together 4]
-    [--measurers 16] [--seconds 1000]
+python models/make_all.py WORK [RECIPE | MODEL ...] [--device cuda] [--generators 8]
+    [--together 4] [--measurers 16] [--seconds 1000] [--split evaluation ...]
 
-A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  WORK gets
+A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  MODEL is the name of a
+released model, which is evaluated only, beside what is trained for its data set.  WORK gets
 
     data/DATASET                 splits as needed, by ``pdcorrect dataset generate``
     trainings/DATASET/NAME       by ``pdcorrect train``
-    evaluations/DATASET          all recipes' best models side by side, by ``pdcorrect evaluate``
+    evaluations/DATASET          all models side by side, by ``pdcorrect evaluate``
+    evaluations/DATASET-SPLIT    the same of other splits than "evaluation"
     logs/                        what these commands said
 
 Data are generated in the order of the recipes, unless ``--generators 0`` says that they are
@@ -29,6 +31,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
 from pdcorrect.data.workers import visible_gpus
@@ -141,43 +144,65 @@ class Machine:
         print(f"{time.monotonic() - started:7.1f} s  {job.name} {what}", flush=True)
 
 
-def plan(work: Path, recipes: Sequence[Path], options: argparse.Namespace) -> list[Job]:
-    """All jobs for some recipes."""
+def plan(
+    work: Path, recipes: Sequence[Path], released: Sequence[str], options: argparse.Namespace
+) -> list[Job]:
+    """All jobs for some recipes and released models."""
     until = None if options.seconds is None else time.time() + options.seconds
-    jobs: list[Job] = []
-    names = list(dict.fromkeys(recipe.parent.name for recipe in recipes))
-    ready, judged = (
-        {name: [_generation(work, name, splits, options)] if options.generators else []
-         for name in names}
-        for splits in (LEARNT, (EVALUATION,))
-    )  # fmt: skip
-    jobs += [job for made in (ready, judged) for name in names for job in made[name]]
+    known = {model: load_model(HERE / model).record.dataset for model in released}
+    names = list(dict.fromkeys([*(recipe.parent.name for recipe in recipes), *known.values()]))
+    learnt = {recipe.parent.name for recipe in recipes}
+    before: dict[str, list[Job]] = {name: [] for name in names}
+    ready: dict[str, list[Job]] = {name: [] for name in names}
+    if options.generators:
+        for name in (name for name in names if name in learnt):
+            ready[name] = before[name] = [_generation(work, name, LEARNT, options, [])]
+    jobs = [job for name in names for job in ready[name]]
+    judged: dict[tuple[str, str], list[Job]] = {}
+    for name in names:  # one after the other: they write to the same folder
+        for split in options.split:
+            if options.generators:
+                before[name] = [_generation(work, name, (split,), options, before[name])]
+                jobs += before[name]
+            judged[name, split] = before[name]
     for name in names:
         own = [recipe for recipe in recipes if recipe.parent.name == name]
         trainings = [_training(work, recipe, ready[name], until, options) for recipe in own]
-        models = [str(work / "trainings" / name / recipe.stem / MODEL) for recipe in own]
-        output = work / "evaluations" / name
-        shutil.rmtree(output, ignore_errors=True)
-        evaluation = Job(
-            f"evaluate-{name}",
-            ["evaluate", *models, str(work / "data" / name), "--device", options.device,
-             "--batch", "100", "--workers", str(options.measurers), "-o", str(output),
-             "--no-figures"],
-            [*trainings, *judged[name]],
-            "evaluate",
-        )  # fmt: skip
-        jobs += [*trainings, evaluation]
+        models = [work / "trainings" / name / recipe.stem / MODEL for recipe in own]
+        models += [HERE / model for model in released if known[model] == name]
+        jobs += trainings
+        jobs += [
+            _evaluation(work, name, split, models, [*trainings, *judged[name, split]], options)
+            for split in options.split
+        ]
     return jobs
 
 
-def _generation(work: Path, name: str, splits: Sequence[str], options: argparse.Namespace) -> Job:
+def _evaluation(
+    work: Path, name: str, split: str, models: Sequence[Path], after: Sequence[Job],
+    options: argparse.Namespace,
+) -> Job:  # fmt: skip
+    label = name if split == EVALUATION else f"{name}-{split}"
+    output = work / "evaluations" / label
+    shutil.rmtree(output, ignore_errors=True)
+    arguments = [
+        "evaluate", *map(str, models), str(work / "data" / name), "--split", split,
+        "--device", options.device, "--batch", "100", "--workers", str(options.measurers),
+        "-o", str(output), "--no-figures",
+    ]  # fmt: skip
+    return Job(f"evaluate-{label}", arguments, after, "evaluate")
+
+
+def _generation(
+    work: Path, name: str, splits: Sequence[str], options: argparse.Namespace, after: Sequence[Job]
+) -> Job:
     chosen = [part for split in splits for part in ("--split", split)]
     return Job(
         f"generate-{name}-{splits[0]}",
         ["dataset", "generate", str(DATASETS / name / CONFIG), "-o", str(work / "data" / name),
          "--workers", str(options.generators), "--device", options.device,
          "--batch", str(options.batch), *chosen],
-        [],
+        after,
         "generate",
     )  # fmt: skip
 
@@ -197,7 +222,7 @@ def _training(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("work", type=Path)
-    parser.add_argument("recipes", nargs="*", type=Path, metavar="RECIPE")
+    parser.add_argument("sources", nargs="*", metavar="RECIPE | MODEL")
     parser.add_argument("--device", default="cpu")
     parser.add_argument(
         "--generators", type=int, default=1, help="processes that generate data; 0: it is there"
@@ -206,12 +231,17 @@ def main() -> None:
     parser.add_argument("--together", type=int, default=1, help="trainings at a time on a GPU")
     parser.add_argument("--measurers", type=int, default=1, help="processes that measure")
     parser.add_argument("--seconds", type=float, default=None, help="when trainings are stopped")
+    parser.add_argument("--split", action="append", help=f"to evaluate on; {EVALUATION} by default")
     options = parser.parse_args()
-    recipes = options.recipes or sorted((HERE / "recipes").glob("*/*.toml"))
+    options.split = options.split or [EVALUATION]
+    recipes = [Path(source) for source in options.sources if source.endswith(".toml")]
+    released = [source for source in options.sources if not source.endswith(".toml")]
+    if not options.sources:
+        recipes = sorted((HERE / "recipes").glob("*/*.toml"))
     gpus = visible_gpus() if options.device == "cuda" else []
     places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
     machine = Machine(options.work / "logs", gpus, places)
-    sys.exit(0 if machine.run(plan(options.work, recipes, options)) else 1)
+    sys.exit(0 if machine.run(plan(options.work, recipes, released, options)) else 1)
 
 
 if __name__ == "__main__":

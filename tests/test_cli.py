@@ -331,6 +331,7 @@ def test_render_refuses_what_would_mislead(program, scene_file, tmp_path):
         (("--colour", "error", "-o", tmp_path / "x.png"), "two runs"),
         (("--frame", "1", "-o", tmp_path / "x.gif"), "all frames"),
         (("--overlay", "-o", tmp_path / "x.png"), "two to"),
+        (("--overlay", "--colour", "error", tmp_path / "a.h5", "-o", tmp_path / "x.png"), "leave"),
     ):
         status, _, err = program("render", tmp_path / "a.h5", *more)
         assert status == cli.BAD_INPUT

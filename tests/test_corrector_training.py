@@ -242,13 +242,22 @@ def test_a_window_asks_for_what_the_base_model_lacks(folder):
     assert batch.snapshot.correction is None
 
 
-def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder):
-    names = ("node-type", "previous-correction", "strain")
+def remembering():
+    """A configuration whose network sees the correction of the step before."""
+    names = ("node-type", "previous-correction", "strain", "load", "acceleration")
     changes = {**samples.SMALL["changes"], "node_features": names}
-    architecture = {"preset": "compact", "changes": changes}
-    settings = samples.config(samples.one_step(), corrector=architecture)
-    windows, _ = samples.windows(folder, settings)
+    return samples.config(samples.one_step(), corrector={"preset": "compact", "changes": changes})
+
+
+@pytest.mark.parametrize("resident", [False, True])
+def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder, resident):
+    windows, _ = samples.windows(folder, remembering(), resident=resident)
     plain, _ = samples.windows(folder, samples.config(samples.one_step()))
+    first, begins = windows.batch([3], last=False), plain.batch([3])
+    assert first.snapshot.correction is None
+    for name in ("positions", "velocities", "proposed", "forces"):
+        torch.testing.assert_close(getattr(first.snapshot, name), getattr(begins.snapshot, name))
+    torch.testing.assert_close(first.target, begins.target)
     found, before, now = windows.batch([3]), plain.batch([3]), plain.batch([4])
     torch.testing.assert_close(found.snapshot.correction, before.target)
     torch.testing.assert_close(found.target, now.target)
@@ -422,13 +431,15 @@ def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
     assert found[0]["output_scale"] != found[2]["output_scale"]
 
 
-def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder):
-    settings = samples.config(samples.one_step())
-    windows, _ = samples.windows(folder, settings)
+@pytest.mark.parametrize("remembers", [False, True])
+def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers):
+    settings = remembering() if remembers else samples.config(samples.one_step())
+    # windows of one step, whatever the network asks for: what it sees when it begins
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
     corrector = samples.fitted(folder, settings)
     _, _, steps = windows.dataset.places(range(len(windows.dataset)))
     first, others = np.flatnonzero(steps == 0), np.flatnonzero(steps == 10)
-    fit_normaliser(corrector, windows, len(first))
+    fit_normaliser(corrector, samples.windows(folder, settings)[0], len(first))
 
     def outside(numbers):
         batch = windows.batch(numbers.tolist())

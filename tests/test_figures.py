@@ -268,7 +268,12 @@ def test_runs_over_each_other_are_seen_where_they_differ(run, fine, tmp_path):
     for shares in (blue, green):
         assert shares[0] < 0.01
         assert shares[1] > 0.03
-    assert (~paper(pictures[0][-60:])).any()  # legend
+    for label in ("1", "a run with quite a long name", "x" * 90):
+        path = figures.render_overlay([run, run], tmp_path / "c.png", labels=[label, "last"])
+        legend = drawn(path)[-60:]
+        inked = np.flatnonzero((np.ptp(legend, axis=-1) > 100).any(axis=0))  # the key's strokes
+        assert inked.max() > 0.3 * legend.shape[1]
+        assert paper(legend[:, -5:]).all()
     # of a finer run, the coarse one's cells
     assert figures.render_overlay([run, fine], tmp_path / "b.png", labels=["1", "2"]).exists()
 

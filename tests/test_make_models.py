@@ -21,7 +21,9 @@ sys.modules["make_models"] = make
 SPEC.loader.exec_module(make)
 
 FINE, REFUSED = ["--help"], ["train", "nowhere.toml"]
-OPTIONS = Namespace(device="cpu", generators=1, batch=60, measurers=1, seconds=None)
+OPTIONS = Namespace(
+    device="cpu", generators=1, batch=60, measurers=1, seconds=None, split=["evaluation"]
+)
 
 
 def machine(folder, together=2):
@@ -74,7 +76,7 @@ def test_no_more_trainings_run_than_there_are_places(tmp_path):
 def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_path):
     recipes = [ROOT / "models/recipes/torsion-exact" / f"{n}.toml" for n in ("force", "plain")]
     recipes.append(ROOT / "models/recipes/torsion-as-published/force.toml")
-    jobs = {job.name: job for job in make.plan(tmp_path, recipes, OPTIONS)}
+    jobs = {job.name: job for job in make.plan(tmp_path, recipes, [], OPTIONS)}
     assert len(jobs) == 2 * 2 + 3 + 2
     last = jobs["evaluate-torsion-exact"]
     assert {job.name for job in last.after} == {
@@ -89,10 +91,36 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
 
 def test_data_that_are_there_are_not_generated(tmp_path):
     recipe = ROOT / "models/recipes/torsion-exact/force.toml"
-    jobs = make.plan(tmp_path, [recipe], Namespace(**{**vars(OPTIONS), "generators": 0}))
+    jobs = make.plan(tmp_path, [recipe], [], Namespace(**{**vars(OPTIONS), "generators": 0}))
     assert [job.name for job in jobs] == ["train-torsion-exact-force", "evaluate-torsion-exact"]
     assert list(jobs[0].after) == []
     assert jobs[1].after == [jobs[0]]
+
+
+def test_released_models_are_evaluated_and_nothing_is_trained_for_them(tmp_path):
+    recipe = ROOT / "models/recipes/torsion-exact/force.toml"
+    released = ["torsion-exact", "torsion-exact-compact", "impulse-exact"]
+    options = Namespace(**{**vars(OPTIONS), "split": ["evaluation", "other-family"]})
+    jobs = {job.name: job for job in make.plan(tmp_path, [recipe], released, options)}
+    assert list(jobs) == [
+        "generate-torsion-exact-training", "generate-torsion-exact-evaluation",
+        "generate-torsion-exact-other-family", "generate-impulse-exact-evaluation",
+        "generate-impulse-exact-other-family", "train-torsion-exact-force",
+        "evaluate-torsion-exact", "evaluate-torsion-exact-other-family",
+        "evaluate-impulse-exact", "evaluate-impulse-exact-other-family",
+    ]  # fmt: skip
+    # splits of one data set one after the other, for they share a folder
+    chain = [
+        jobs[f"generate-torsion-exact-{s}"] for s in ("training", "evaluation", "other-family")
+    ]
+    assert [list(job.after) for job in chain] == [[], [chain[0]], [chain[1]]]
+    last = jobs["evaluate-torsion-exact-other-family"]
+    models = [Path(a).parts[-2:] for a in last.arguments[1:4]]
+    assert models == [("force", "model"), ("models", "torsion-exact"),
+                      ("models", "torsion-exact-compact")]  # fmt: skip
+    assert list(last.after) == [jobs["train-torsion-exact-force"], chain[2]]
+    assert last.arguments[last.arguments.index("--split") + 1] == "other-family"
+    assert list(jobs["evaluate-impulse-exact"].after) == [jobs["generate-impulse-exact-evaluation"]]
 
 
 def test_trainings_are_spread_over_the_gpus_that_are_visible(tmp_path):

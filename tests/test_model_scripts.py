@@ -17,9 +17,11 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 
 import pdcorrect as pc  # noqa: E402
 import pdcorrect.errors  # noqa: E402
+from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.data.config import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
+from pdcorrect.evaluation.cases import read_cases  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 
@@ -88,7 +90,7 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
     shutil.copytree(folder, narrow)
     first = first_step(path)
     assert (first(pc.load_model(folder)) > 0.9).all()
-    command = [sys.executable, ROOT / "models" / "widen_ranges.py", folder, path]
+    command = [sys.executable, ROOT / "models" / "add_first_steps.py", folder, path]
     subprocess.run([*command, "--batch", "4"], check=True, capture_output=True)
     widened = pc.load_model(folder)
     assert (first(widened) == 0.0).all()
@@ -99,10 +101,14 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
     )
     assert widened.record.training["first_steps"] == {"dataset": "tiny", "steps": 10}
     command = [sys.executable, ROOT / "models" / "unknown_first_steps.py"]
-    for model, unknown in ((folder, 0), (narrow, 6)):
-        counted = [*command, model, path, "--split", "training", "--loads", "1"]
-        told = subprocess.run(counted, check=True, capture_output=True, text=True).stdout
-        assert told == f"6 first steps: {unknown} unknown, {unknown} by nodes, 0 by bodies\n"
+    pairs = [f"{narrow}={path}", f"{folder}={path}"]
+    output = tmp_path / "record.json"
+    counted = [*command, *pairs, "--split", "training", "--loads", "1", "-o", output]
+    subprocess.run(counted, check=True, capture_output=True)
+    found = json.loads(output.read_text())["models"]
+    assert [row["model"] for row in found] == ["narrow", "tiny"]
+    counts = [[row[name] for name in ("first steps", "unknown", "by nodes")] for row in found]
+    assert counts == [[6, 6, 6], [6, 0, 0]]
 
 
 def first_step(path):
@@ -125,8 +131,34 @@ def test_a_trajectory_of_a_data_set_is_drawn(tmp_path):
     command = [sys.executable, ROOT / "models" / "draw_first.py", tmp_path, "torsion-exact"]
     subprocess.run([*command, "--frames", "2"], check=True, capture_output=True)
     record = json.loads((tmp_path / "first.json").read_text())
-    rows = record["trajectories"]["torsion-exact"]
+    rows = record["trajectories"]["torsion-exact"]["runs"]
     assert set(rows) == {"coarse PD", "hybrid torsion-exact"}
     assert 0 < rows["hybrid torsion-exact"]["rms_mm"] < rows["coarse PD"]["rms_mm"]
     for name in ("node", "overlay"):
         assert (tmp_path / f"torsion-exact-{name}.png").stat().st_size > 5000
+
+
+def test_baselines_are_steps_of_changed_problems():
+    baselines, data = script("baselines"), ROOT / "datasets" / "tiny"
+    cases = read_cases(data, "evaluation", skip_damaged=False).cases[:2]
+
+    def omega(change):
+        return baselines.mean_omega(cases, change, "cpu", 10)
+
+    best = [metrics.error_corrected(*(case.runs[r] for r in ("best", "plain")), case.reference)
+            for case in cases]  # fmt: skip
+    # solver tolerances apart: stored runs are another engine's
+    assert omega(lambda problem: problem) == pytest.approx(0.0, abs=0.1)
+    assert omega(baselines.with_stiffness(1.0)) == pytest.approx(0.0, abs=0.1)
+    same = baselines.with_solver(element="hex8-bubble-mean", mass="averaged")
+    assert omega(same) == pytest.approx(np.mean(best), abs=0.1)
+    assert omega(baselines.with_stiffness(0.5)) < -50
+
+
+def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
+    command = [sys.executable, ROOT / "models" / "baselines.py", ROOT / "datasets" / "tiny"]
+    subprocess.run([*command, "-o", tmp_path, "--fit", "2"], check=True, capture_output=True)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {"hex8-mean", "consistent mass", "fitted stiffness", "best"} < set(summary["runs"])
+    assert 0.5 < summary["stiffness_factor"] < 1.5
+    assert "fitted to 2 simulations of training" in summary["notes"][0]

@@ -8,10 +8,16 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
+from torch._subclasses.fake_tensor import (  # noqa: E402
+    DataDependentOutputException,
+    FakeTensorMode,
+)
+
 import pdcorrect as pc  # noqa: E402
 from hybrid_samples import fitted, problems  # noqa: E402
+from pdcorrect.corrector import recorded  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
-from pdcorrect.corrector.features import View  # noqa: E402
+from pdcorrect.corrector.features import Snapshot, View  # noqa: E402
 from pdcorrect.corrector.recorded import RecordedCorrector, recordable  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 
@@ -127,6 +133,10 @@ def layered(corrector):
     )
 
 
+def grown(corrector):
+    corrector.network.register_buffer("unused", torch.zeros(1))
+
+
 def scaled(corrector):
     corrector.normaliser.output_scale.mul_(2.0)
 
@@ -135,18 +145,94 @@ def clipped(corrector):
     corrector.config = corrector.config.model_copy(update={"clip": 0.5})
 
 
-@pytest.mark.parametrize("change", [written, loaded, replaced, moved, layered, scaled, clipped])
+IN_PLACE, ANEW = [written, loaded, scaled], [replaced, moved, layered, grown, clipped]
+
+
+@pytest.mark.parametrize("change", [*IN_PLACE, *ANEW])
 def test_changes_of_the_corrector_count_at_once(device, made, change):
     motion = Motion(device, made)
     view = motion.views[-1]
-    answers = RecordedCorrector(made, 1.0)
+    answers = Counted(made, 1.0)
     with torch.no_grad():
+        answers.of_view(motion.views[-2])
         before = answers.of_view(view)
+    assert answers.recorded == 1
     change(made)
     again = View(view.bodies, view.snapshot)
     assert_same(answers, made, again)
+    assert answers.recorded == (1 if change in IN_PLACE else 2)
+    if change is not grown:
+        with torch.no_grad():
+            assert (answers.of_view(again) - before).abs().max() > 1e-3 * before.abs().max()
+
+
+class Counted(RecordedCorrector):
+    """Knows how often it recorded."""
+
+    recorded = 0
+
+    def _record(self, bodies):
+        self.recorded += 1
+        super()._record(bodies)
+
+
+def test_a_recording_that_fails_leaves_nothing_behind(device, made, monkeypatch):
+    motion = Motion(device, made)
+    answers = RecordedCorrector(made, 1.0)
+    assert_same(answers, made, motion.views[1])
+    replaced(made)
+
+    def failing(device):
+        raise MemoryError
+
+    monkeypatch.setattr(recorded, "Recorder", failing)
+    for _ in range(2):
+        with pytest.raises(MemoryError):
+            answers.of_view(motion.views[1])
+    monkeypatch.undo()
+    assert_same(answers, made, motion.views[1])
+
+
+def test_what_is_recorded_stays_where_it_is(device, made):
+    """A GPU replays work on addresses."""
+    motion = Motion(device, made)
+    answers = Counted(made, 1.0)
+
+    def places():
+        kept = [answers._answer, answers._outside, answers._unlike]
+        kept += [getattr(answers._snapshot, name) for name in ("positions", "correction")]
+        measures, stepper = motion.parts.measures, motion.stepper
+        kept += [measures._positions, measures._velocities, measures._y]
+        kept += [measures._stored, measures._ratios, stepper.cells._weights]
+        kept += [stepper.objective.mass.nodal, stepper.objective.mass.density]
+        return [x.data_ptr() for x in kept]
+
+    seen = []
+    for number, (step, coarse, view) in enumerate(motion.steps):
+        answers.of_view(view)
+        step.measured(coarse)
+        seen.append(places())
+        if number == 1:
+            motion.stepper.set_material(young=6e4, density=700.0)
+    assert all(found == seen[0] for found in seen)
+    assert answers.recorded == 1
+
+
+def test_nothing_that_is_recorded_asks_for_a_value(made):
+    """On tensors without values, as those of a graph that is being recorded."""
+    motion = Motion("cpu", made.to("cpu"))
+    view = motion.views[2]
     with torch.no_grad():
-        assert (answers.of_view(again) - before).abs().max() > 1e-3 * before.abs().max()
+        made.of_view(view)  # what is known of the bodies at rest is there before
+    with FakeTensorMode(allow_non_fake_inputs=True) as fake, torch.no_grad():
+        snapshot = Snapshot(*(fake.from_tensor(x) for x in vars(view.snapshot).values()))
+        found = View(view.bodies, snapshot)
+        vars(found)["turns"] = fake.from_tensor(view.turns)  # compiled loops on the CPU
+        corrections = made.of_view(found)
+        assert corrections.shape == view.bodies.rest.shape
+        assert made.outside(found, 1.0).shape == made.unlike(found).shape == (2,)
+        with pytest.raises(DataDependentOutputException):
+            float(corrections.sum())
 
 
 def test_other_bodies_and_materials_are_recorded_anew(device, made):
@@ -188,7 +274,11 @@ def tanh(corrector):
     corrector.network.node_encoder[1] = torch.nn.Tanh()
 
 
-@pytest.mark.parametrize("change", [hooked, patched, tanh])
+def neutral(corrector):
+    corrector.config = corrector.config.model_copy(update={"momentum_neutral": True})
+
+
+@pytest.mark.parametrize("change", [hooked, patched, tanh, neutral])
 def test_code_that_would_not_run_is_not_recorded(device, made, change):
     stepper = pc.BatchStepper(problems(*CELLS), device=device)
     assert recordable(made)
@@ -196,7 +286,10 @@ def test_code_that_would_not_run_is_not_recorded(device, made, change):
     change(made)
     assert not recordable(made)
     assert not pc.BatchHybrid(stepper, made)(stepper.rest_state()).refused.any()
-    with pytest.raises(InputError, match="own code would not run"):
+    if change is not neutral:
+        with pytest.raises(InputError, match="would not be recorded"):
+            RecordedCorrector(made, 1.0).of_view(Motion(device, made).views[0])
+    with pytest.raises(InputError, match="would not be recorded"):
         pc.BatchHybrid(stepper, made, recorded=True)
 
 
@@ -206,8 +299,8 @@ def test_rollouts_are_those_without_recording(device, placement):
     gate = pc.Gate(margin=0.05)
     stepper = pc.BatchStepper(problems(*CELLS), device=device)
     runs = []
-    for recorded in (False, True):
-        hybrid = pc.BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)
+    for replayed in (False, True):
+        hybrid = pc.BatchHybrid(stepper, corrector, gate=gate, recorded=replayed)
         state, reasons = stepper.rest_state(), []
         for _ in range(6):
             result = hybrid(state)

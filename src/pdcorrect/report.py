@@ -217,14 +217,15 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         colour="displacement",
         frame=int(frame),
     )
-    overlaid = overlaid_rows(comparison)
-    plain = comparison.on_coarse[overlaid[-1]]
-    figures.render_overlay(
-        [comparison.on_coarse[label] for label in overlaid],
-        folder / "overlay.png",
-        labels=overlaid,
-        frame=int(np.linalg.norm(plain.positions - truth.positions, axis=(1, 2)).argmax()),
-    )
+    overlaid = overlaid_labels(comparison)
+    if len(overlaid) > 1:
+        last = comparison.on_coarse[overlaid[-1]]
+        figures.render_overlay(
+            [comparison.on_coarse[label] for label in overlaid],
+            folder / "overlay.png",
+            labels=overlaid,
+            frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
+        )
     figures.plot_node_trajectories(
         runs, folder / "node.png", node_point=truth.points[node], labels=labels
     )
@@ -236,19 +237,24 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         {r.label: (r.seconds_a_frame, r.rms_error) for r in comparison.rows if r.rms_error > 0},
         folder / "error_against_time.png",
     )
-    return [
+    names = (
         "comparison.png", "overlay.png", "error_against_time.png", "error_over_time.png",
         "node.png", "energy.png",
-    ]  # fmt: skip
+    )  # fmt: skip
+    return [name for name in names if name != "overlay.png" or len(overlaid) > 1]
 
 
-def overlaid_rows(comparison: Comparison) -> list[str]:
-    """The reference, what is nearest to it on the coarse mesh, and the coarse mesh alone."""
-    coarse = comparison.rows[0]
-    others = [r for r in comparison.rows[1:] if r.nodes == coarse.nodes]
-    nearest = min(others, key=lambda row: row.rms_error, default=coarse)
-    labels = [comparison.reference, nearest.label, coarse.label]
-    return list(dict.fromkeys(labels))
+def overlaid_labels(comparison: Comparison) -> list[str]:
+    """The reference, the nearest of its correctors and better coarse models, and the coarse mesh.
+
+    Without the first two of a kind the intermediate mesh is in between; what there is of these.
+    """
+    cases, errors = comparison.cases, {row.label: row.rms_error for row in comparison.rows}
+    plain = [c.label for c in cases if c.plain and c.solver == "pd"]
+    finer = [c.label for c in cases if c.refine > 1 and c.label != comparison.reference]
+    better = [c.label for c in cases if c.refine == 1 and (c.model or c.better)] or finer
+    nearest = sorted(better, key=lambda label: errors[label])[:1]
+    return list(dict.fromkeys([comparison.reference, *nearest, *plain[:1]]))
 
 
 def _panel_label(comparison: Comparison, row: Row) -> str:

@@ -17,12 +17,12 @@ from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts, WithNodes
-from pdcorrect.corrector.corrector import Answers, Corrector
+from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.decision import corrected_step
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.corrector.recorded import RecordedCorrector, recordable
+from pdcorrect.corrector.recorded import UNRECORDABLE, RecordedCorrector, recordable
 from pdcorrect.errors import InputError
 from pdcorrect.torch_layer import OnFailure, PDLayer
 
@@ -82,7 +82,7 @@ class BatchHybrid(WithNodes):
     Raises
     ------
     InputError
-        If the parts do not fit each other, or a corrector's own code could not be recorded.
+        If the parts do not fit each other, or the corrector cannot be recorded.
     """
 
     def __init__(
@@ -97,14 +97,11 @@ class BatchHybrid(WithNodes):
         self._hybrid = BatchParts(stepper, corrector, velocity, recorded)
         self.stepper, self.corrector, self.gate = stepper, corrector, gate
         check_gate(gate, corrector)
-        self._answers: Answers = corrector
+        self._recorded: RecordedCorrector | None = None
         if recorded:
             if not recordable(corrector):
-                raise InputError(
-                    "recorded = True with a corrector of another class, with hooks, or with a "
-                    "network that was changed: its own code would not run. Expected False."
-                )
-            self._answers = RecordedCorrector(corrector, None if gate is None else gate.margin)
+                raise InputError(UNRECORDABLE)
+            self._recorded = RecordedCorrector(corrector, None if gate is None else gate.margin)
 
     @torch.no_grad()
     def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
@@ -123,7 +120,8 @@ class BatchHybrid(WithNodes):
         """
         with self.stepper.alone():
             step = BatchCoarseStep(self._hybrid, state, previous)
-            answer, coarse, decision = corrected_step(step, self._answers, self.gate)
+            answers = self.corrector if self._recorded is None else self._recorded
+            answer, coarse, decision = corrected_step(step, answers, self.gate)
         return BatchHybridResult(
             answer.state, decision.correction, coarse, decision.reasons, decision.factors
         )

@@ -26,7 +26,10 @@ class Contents:
 
     def __init__(self, corrector: Corrector) -> None:
         self._corrector, self.config = corrector, corrector.config
-        self._parts = list(_parts(corrector))
+        self._tables = [(table, tuple(table)) for table in _tables(corrector)]
+        self._parts = [
+            (table, name, table[name]) for table, names in self._tables for name in names
+        ]
         self._kept = [part for _, _, part in self._parts]
         self._tensors = [part for _, _, part in self._parts if isinstance(part, Tensor)]
         # of inference tensors torch does not count how often they are written
@@ -38,7 +41,9 @@ class Contents:
         """Whether there are other modules, tensors or storage than there were."""
         if self._corrector.config is not self.config or self._where() != self._places:
             return True
-        there = (table.get(name) for table, name, _ in self._parts)
+        if any(tuple(table) != names for table, names in self._tables):
+            return True
+        there = (table[name] for table, name, _ in self._parts)
         return not all(map(is_, there, self._kept))
 
     @property
@@ -53,9 +58,7 @@ class Contents:
         return [tensor._version for tensor in self._counted]
 
 
-def _parts(corrector: Corrector) -> Iterator[tuple[dict[str, Any], str, Any]]:
-    """Where each part is, its name there, and what it is."""
+def _tables(corrector: Corrector) -> Iterator[dict[str, Any]]:
+    """Where its modules keep what they are made of."""
     for module in corrector.modules():
-        for table in (module._parameters, module._buffers, module._modules):
-            for name, content in table.items():
-                yield table, name, content
+        yield from (module._parameters, module._buffers, module._modules)

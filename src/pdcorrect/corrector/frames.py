@@ -10,12 +10,15 @@ R does not depend on how a mesh orders the corners of its cells; the frame at re
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.fused import small_products
+from pdcorrect.batch.fused import as_kernel
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 EDGE_MEANS = (2.0 * VTK_CORNERS - 1.0) / 4.0
@@ -68,5 +71,33 @@ def turned_back(R: Tensor, x: Tensor) -> Tensor:
 
 
 def product(A: Tensor, B: Tensor) -> Tensor:
-    """A B for each node or edge; without derivatives by a kernel for small ones on a GPU."""
-    return A @ B if torch.is_grad_enabled() else small_products(A, B)
+    """A B of each node or edge, matrices (n, 3, 3) and (n, 3, k).
+
+    Libraries treat such matrices on a GPU as if they were large: see `unrolled_products`.
+    """
+    if A.is_cuda and _unrolled.get():
+        quick: Tensor = as_kernel(_product, True)(A.contiguous(), B.contiguous())
+        return quick
+    return A @ B
+
+
+@contextmanager
+def unrolled_products() -> Iterator[None]:
+    """Within it a GPU multiplies small matrices by code that is compiled for them.
+
+    For work without derivatives that is recorded: call by call a compiled function takes longer
+    to be called than the library's.
+    """
+    before = _unrolled.set(True)
+    try:
+        yield
+    finally:
+        _unrolled.reset(before)
+
+
+_unrolled: ContextVar[bool] = ContextVar("unrolled", default=False)
+
+
+def _product(A: Tensor, B: Tensor) -> Tensor:
+    first, second, third = (A[:, :, i, None] * B[:, i, None] for i in range(3))
+    return first + second + third

@@ -22,21 +22,35 @@ from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.contents import Contents
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot, View
+from pdcorrect.corrector.frames import unrolled_products
 from pdcorrect.corrector.gate import Measured
+from pdcorrect.errors import InputError
+
+UNRECORDABLE = (
+    "recorded = True with a corrector of another class, with hooks, with a network that was "
+    "changed or with momentum_neutral: what it does would not be recorded. Expected False."
+)
 
 
 def recordable(corrector: Corrector) -> bool:
-    """Whether a corrector's answers are operations on tensors alone: no hooks, no other code."""
+    """Whether a corrector's answers can be recorded.
+
+    Not where it has code of its own, such as hooks, nor with ``momentum_neutral``, whose solution
+    of linear systems a GPU does not record for a single body.
+    """
     own = any(callable(value) for value in vars(corrector).values())
-    return type(corrector) is Corrector and not own and usual(corrector)
+    plain = type(corrector) is Corrector and not own and usual(corrector)
+    return plain and not corrector.config.momentum_neutral
 
 
 class RecordedCorrector:
     """Answers as of a `Corrector`, without derivatives, with what a gate asks of it.
 
     On a GPU the network is compiled, which changes its rounding, and all is recorded at the first
-    call and replayed; elsewhere it is run.  Recorded anew for other bodies, and where modules or
-    tensors of the corrector are replaced.  Values of weights are always those of now.
+    call and replayed; elsewhere it is run.  Recorded anew for other bodies, so also for each
+    change of material, and where modules or tensors of the corrector are replaced.  Values of
+    weights are those of the last `of_view`.  What is recorded holds memory for all intermediate
+    results.
 
     Parameters
     ----------
@@ -64,6 +78,7 @@ class RecordedCorrector:
     def _forget(self) -> None:
         self._bodies: BodyGraph | None = None
         self._view: View | None = None
+        self._replay: Callable[[], None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {"_corrector": self._corrector, "_margin": self._margin, "config": self.config}
@@ -72,10 +87,12 @@ class RecordedCorrector:
         self.__dict__.update(state)
         self._forget()
 
+    @torch.no_grad()
     def of_view(self, view: View) -> Tensor:
         """The correction (n, 3), m."""
         if view.bodies is not self._bodies or self._contents.replaced:
             self._record(view.bodies)
+        assert self._replay is not None
         for field in fields(Snapshot):
             given, own = (getattr(x, field.name) for x in (view.snapshot, self._snapshot))
             own.zero_() if given is None else own.copy_(given)
@@ -83,19 +100,24 @@ class RecordedCorrector:
         self._view = view
         return self._answer.clone()
 
+    @torch.no_grad()
     def outside(self, view: View, margin: float) -> Tensor:
         """See `Corrector.outside`."""
         if view is not self._view or margin != self._margin:
             return self._corrector.outside(view, margin)
         return self._outside.clone()
 
+    @torch.no_grad()
     def unlike(self, view: View) -> Tensor:
         """See `Corrector.unlike`."""
         return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
 
     def _record(self, bodies: BodyGraph) -> None:
+        """Until it has succeeded nothing is known."""
         self._forget()
         corrector, rest = self._corrector, bodies.rest
+        if not recordable(corrector):
+            raise InputError(UNRECORDABLE)
         with torch.inference_mode(False), torch.no_grad():
             self.config, self._contents = corrector.config, Contents(corrector)
             self._snapshot = Snapshot(*(rest.clone() for _ in fields(Snapshot)))
@@ -104,17 +126,17 @@ class RecordedCorrector:
             self._network: Callable[..., Tensor] = corrector.network
             if rest.is_cuda:
                 self._network = torch.compile(corrector.network, dynamic=True)
-            self._bodies = bodies
+            self._recorded = bodies
             self._replay = Recorder(rest.device)(self._compute)
+        self._bodies = bodies
 
     def _compute(self) -> None:
-        corrector, bodies = self._corrector, self._bodies
-        assert bodies is not None
-        view = View(bodies, self._snapshot)
-        self._answer.copy_(corrector.of_view(view, self._network))
-        if self._margin is not None:
-            self._outside.copy_(corrector.outside(view, self._margin))
-        self._unlike.copy_(corrector.unlike(view))
+        corrector, view = self._corrector, View(self._recorded, self._snapshot)
+        with unrolled_products():
+            self._answer.copy_(corrector.of_view(view, self._network))
+            if self._margin is not None:
+                self._outside.copy_(corrector.outside(view, self._margin))
+            self._unlike.copy_(corrector.unlike(view))
 
 
 class RecordedMeasures:

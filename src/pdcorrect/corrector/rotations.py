@@ -8,7 +8,6 @@ symmetric, and the axial vector w of R^T dR, (tr U - U) w is that of R^T dM - dM
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -16,7 +15,6 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from pdcorrect.batch.fused import as_kernel
 from pdcorrect.fem.decomposition import OPTIONS
 
 _NEWTON_STEPS = 8
@@ -65,34 +63,16 @@ class _Polar(torch.autograd.Function):
 
 
 def together(matrices: Tensor) -> Tensor:
-    """`polar_rotations` of all matrices at once, on a GPU as one kernel; without derivatives."""
-    found: Tensor = as_kernel(_together, matrices.is_cuda)(matrices)
-    return found
-
-
-def _together(matrices: Tensor) -> Tensor:
-    nine = matrices.flatten(1).unbind(dim=1)
-    squares = _sum_of_squares(nine)
-    size = torch.where(squares > 0.0, squares, 1.0).sqrt()
-    X = [x / size for x in nine]
-    C = _cofactors_of.py_func(*X)
-    usable = X[0] * C[0] + X[1] * C[1] + X[2] * C[2] > _FLATTEST
-    X = [torch.where(usable, x, float(k in (0, 4, 8))) for k, x in enumerate(X)]
+    """`polar_rotations` by operations on all matrices, without derivatives."""
+    X, _, usable = _unit(matrices.permute(1, 2, 0).contiguous())  # long rows are quicker
+    identity = _identity(X)
+    X = torch.where(usable, X, identity)
     for _ in range(_NEWTON_STEPS):
-        C = _cofactors_of.py_func(*X)
-        by = 1.0 / (X[0] * C[0] + X[1] * C[1] + X[2] * C[2])
-        scale = (_sum_of_squares(C) * by * by / _sum_of_squares(X)).sqrt().sqrt()
-        p, q = 0.5 * scale, 0.5 * by / scale
-        X = [p * x + q * c for x, c in zip(X, C, strict=True)]
-    return torch.stack(X, dim=1).reshape(matrices.shape)
-
-
-def _sum_of_squares(nine: Sequence[Tensor]) -> Tensor:
-    first, *others = nine
-    total = first * first
-    for x in others:
-        total = total + x * x
-    return total
+        C = _cofactors(X)
+        inverse = C / _determinants(X, C)
+        scale = (inverse.square().sum(dim=(0, 1)) / X.square().sum(dim=(0, 1))).sqrt().sqrt()
+        X = (0.5 * scale) * X + inverse / (2.0 * scale)
+    return torch.where(usable, X, identity).permute(2, 0, 1).contiguous()
 
 
 def _unit(X: Tensor) -> tuple[Tensor, Tensor, Tensor]:

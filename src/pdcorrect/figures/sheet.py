@@ -185,12 +185,18 @@ class Sheet:
         self._text(left, height - 2.75 * font, bar.title, font, va="bottom")
 
     def _add_key(self, key: Sequence[tuple[str, str]]) -> None:
-        """Names in their colours, from the right of the scale on."""
-        x, y = max(0.3 * self.size[0], 15.5 * self._font), self.size[1] - 1.7 * self._font
-        for name, colour in key:
-            self._line([x, x + 1.6 * self._font], [y, y], colour, 0.3 * self._font)
-            text = self._text(x + 2.1 * self._font, y, name, self._font, va="center")
-            x += 3.6 * self._font + text.get_window_extent().width
+        """Names in their colours, from the right of the scale on, smaller if they are long."""
+        left, y = max(0.3 * self.size[0], 15.5 * self._font), self.size[1] - 1.7 * self._font
+        texts = [self._text(0.0, y, name, self._font, va="center") for name, _ in key]
+        widths = [text.get_window_extent().width + 3.6 * self._font for text in texts]
+        room = self.size[0] - left - self._font
+        factor = min(1.0, room / max(1.0, sum(widths)))
+        font = factor * self._font
+        for (_, colour), text, width in zip(key, texts, widths, strict=True):
+            self._line([left, left + 1.6 * font], [y, y], colour, 0.3 * font)
+            text.set_x((left + 2.1 * font) / self.size[0])
+            text.set_fontsize(0.72 * font)
+            left += factor * width
 
 
 def round_limit(largest: float) -> float:

@@ -32,14 +32,14 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     windows : StepWindows
         Of the training split.
     most : int
-        Windows; if there are more, so many are drawn without replacement by ``seed``.  So for
-        first steps.
+        Windows; if there are more, so many are drawn without replacement by ``seed``.  The same
+        limit holds for first steps.
     """
     every = np.arange(len(windows.dataset))
     chosen = _chosen(every, most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
-    _widen(corrector, windows, _chosen(_first_steps(windows), most, seed))
+    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
 @torch.no_grad()
@@ -50,16 +50,18 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
     every = np.arange(len(windows.dataset))
-    for numbers in (every, _first_steps(windows)):
-        _widen(corrector, windows, _chosen(numbers, most, seed))
+    _widen(corrector, windows, _chosen(every, most, seed))
+    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
-def _widen(corrector: Corrector, windows: StepWindows, chosen: list[int]) -> None:
-    corrector.normaliser.widen(_moments(corrector, windows, chosen)[0])
-    corrector.normaliser.widen_averages(_averages(corrector, windows, chosen))
+def _widen(
+    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+) -> None:
+    corrector.normaliser.widen(_moments(corrector, windows, chosen, last)[0])
+    corrector.normaliser.widen_averages(_averages(corrector, windows, chosen, last))
 
 
-def _first_steps(windows: StepWindows) -> NDArray[np.int64]:
+def _beginnings(windows: StepWindows) -> NDArray[np.int64]:
     """Numbers of the windows with which simulations begin."""
     every = np.arange(len(windows.dataset))
     _, _, steps = windows.dataset.places(every)
@@ -75,13 +77,13 @@ def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
 
 
 def _moments(
-    corrector: Corrector, windows: StepWindows, chosen: list[int]
+    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
 ) -> tuple[dict[str, Moments], Moments]:
     """Of features by name, and of targets (m, 1)."""
     config = corrector.config
     moments = {name: Moments() for name in (*config.node_features, *config.edge_features)}
     target = Moments()
-    for batch in _batches(windows, chosen):
+    for batch in _batches(windows, chosen, last):
         view = View(batch.bodies, batch.snapshot)
         found = features.values(NODE_FEATURES, config.node_features, view)
         found |= features.values(EDGE_FEATURES, config.edge_features, view)
@@ -92,15 +94,17 @@ def _moments(
     return moments, target
 
 
-def _averages(corrector: Corrector, windows: StepWindows, chosen: list[int]) -> Moments:
+def _averages(
+    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+) -> Moments:
     """Of bodies' mean inputs (m, a), for which the normalisation has to be there."""
     averages = Moments()
-    for batch in _batches(windows, chosen):
+    for batch in _batches(windows, chosen, last):
         view = View(batch.bodies, batch.snapshot)
         averages.add(batch.bodies.body_means(corrector.inputs(view)[0]))
     return averages
 
 
-def _batches(windows: StepWindows, chosen: list[int]) -> Iterator[StepBatch]:
+def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:
     for first in range(0, len(chosen), _AT_ONCE):
-        yield windows.batch(chosen[first : first + _AT_ONCE])
+        yield windows.batch(chosen[first : first + _AT_ONCE], last=last)

@@ -112,10 +112,14 @@ class StepWindows:
         }
         self._known: dict[int, BodyGraph] = {}
 
-    def batch(self, indices: Sequence[int]) -> StepBatch:
-        """Chosen windows."""
+    def batch(self, indices: Sequence[int], *, last: bool = True) -> StepBatch:
+        """The last steps of chosen windows, or their first ones.
+
+        These differ where the correction of the step before is known, by one that has to be:
+        of a first step it counts as none, as in a simulation that begins there.
+        """
         source = self._tables if self.resident else self.dataset
-        return self.step_batch(source.batch(indices))
+        return self.step_batch(source.batch(indices), last=last)
 
     @cached_property
     def _tables(self) -> ResidentWindows:
@@ -138,17 +142,19 @@ class StepWindows:
         loader = TrajectoryLoader(self.dataset, size, shuffle, drop_last=whole, **options)
         return EndlessBatches(self, loader)
 
-    def step_batch(self, found: Any) -> StepBatch:
-        """What `StoredWindows`, or a batch of samples on the CPU, say about their last step."""
-        stored = found if isinstance(found, StoredWindows) else self._stored(found)
-        bodies, coarse, target = stored.bodies, stored.predictions[-1], stored.targets[-1]
+    def step_batch(self, found: Any, *, last: bool = True) -> StepBatch:
+        """What `StoredWindows`, or a batch of samples on the CPU, say about a step of theirs."""
+        stored, step = found if isinstance(found, StoredWindows) else self._stored(found), 0
         positions, velocities, previous = stored.positions, stored.velocities, None
-        if self._history:
+        bodies = stored.bodies
+        if self._history and last:
+            step = 1
             before, positions = positions, stored.targets[0]
             previous = positions - stored.predictions[0]
             velocities = (positions - before) / bodies.by_node(bodies.time_step)[:, None]
-        state = Snapshot(positions, velocities, coarse, stored.forces[-1], previous)
-        target = target - coarse
+        coarse = stored.predictions[step]
+        state = Snapshot(positions, velocities, coarse, stored.forces[step], previous)
+        target = stored.targets[step] - coarse
         if self.config.placement != "state":
             h: Any = bodies.by_node(bodies.time_step)[:, None]
             # the clamps of the stored coarse step are where they are prescribed

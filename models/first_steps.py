@@ -1,0 +1,56 @@
+"""First steps of the scenes of a data set's configuration, as a model's network sees them.
+
+For the scripts beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+import pdcorrect as pc
+from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts
+from pdcorrect.corrector.features import View
+from pdcorrect.corrector.model_io import LoadedModel
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.scene import Scene
+
+
+def scenes_of(config: DatasetConfig, split: str, loads: int | None = None) -> list[Scene]:
+    """The scenes of a split, mesh by mesh; at most so many loads of each, all by default.
+
+    Loads are those that are drawn first: `pdcorrect dataset generate` replaces the ones that it
+    rejects.
+    """
+    return [
+        draw_scene(config, plan, number)
+        for plan in make_plan(config)
+        if plan.split == split
+        for number in range(plan.simulations if loads is None else min(loads, plan.simulations))
+    ]
+
+
+@torch.no_grad()
+def first_views(
+    model: LoadedModel, scenes: list[Scene], device: str, batch: int
+) -> Iterator[tuple[View, Tensor]]:
+    """What the network is shown in one step from rest, so many scenes at a time.
+
+    Second: of which of them (B,) the coarse step converged; all where none is shown.
+    """
+    best = model.base == "best"
+    for first in range(0, len(scenes), batch):
+        some = scenes[first : first + batch]
+        problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in some]
+        stepper = pc.BatchStepper(problems, device=device)
+        parts = BatchParts(stepper, model.corrector, model.velocity)
+        step = BatchCoarseStep(parts, stepper.rest_state(), None)
+        if model.corrector.config.placement == "state":
+            answer = step.solved()
+            yield step.view(answer), step.ok(answer)
+        else:
+            view = step.view(None)
+            yield view, torch.ones_like(view.bodies.cell_size, dtype=torch.bool)
