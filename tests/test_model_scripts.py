@@ -162,3 +162,18 @@ def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
     assert {"hex8-mean", "consistent mass", "fitted stiffness", "best"} < set(summary["runs"])
     assert 0.5 < summary["stiffness_factor"] < 1.5
     assert "fitted to 2 simulations of training" in summary["notes"][0]
+
+
+def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
+    script_, config = (
+        ROOT / "models" / "with_and_without_gate.py",
+        ROOT / "datasets/tiny/config.toml",
+    )
+    record = tmp_path / "record.json"
+    command = [sys.executable, script_, "tiny", config, "0/0", "-o", record, "--frames", "2"]
+    subprocess.run(command, check=True, capture_output=True)
+    (row,) = json.loads(record.read_text())["simulations"]
+    assert (row["mesh"], row["load"]) == (0, 0)
+    if not row["refused"]:
+        assert row["with gate"] == row["without"]
+    assert row["without"] > 0
