@@ -28,7 +28,6 @@ import torch
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.plan import draw_scene, make_plan
@@ -86,13 +85,13 @@ def main() -> None:
     batches = [1] if chosen.quick else [int(count) for count in chosen.batches.split(",")]
     steps = 3 if chosen.quick else chosen.steps
     (saved,) = saved_candidates([chosen.model], chosen.device)
-    base, model = saved.candidate.base, load_model(chosen.model)
-    corrector = model.corrector.to(chosen.device)
+    base, model = saved.candidate.base, saved.model
 
     def hybrid(stepper: BatchStepper) -> BatchHybrid:
         return BatchHybrid(
-            stepper, corrector, velocity=model.velocity, gate=Gate(), recorded=chosen.recorded
-        )
+            stepper, model.corrector, velocity=model.velocity, gate=Gate(),
+            recorded=chosen.recorded,
+        )  # fmt: skip
 
     data = Path(chosen.data)
     source = drawn(data, chosen.split, base) if data.is_file() else stored(data, chosen.split, base)

@@ -10,7 +10,7 @@ import pytest
 from motion import trajectory
 from pdcorrect import figures
 from pdcorrect.errors import InputError, MeshError, MissingExtraError, OutputError
-from pdcorrect.figures import curves
+from pdcorrect.figures import curves, offscreen
 
 pytest.importorskip("pyvista")
 pytest.importorskip("matplotlib")
@@ -410,9 +410,9 @@ def test_plotting_leaves_the_users_backend_alone(run, tmp_path):
 
 def test_drawing_is_probed_in_another_process(monkeypatch):
     assert figures.check_offscreen().startswith("ok (")
-    monkeypatch.setattr(figures, "_PROBE", "import os; os.abort()")
+    monkeypatch.setattr(offscreen, "_PROBE", "import os; os.abort()")
     assert "libegl1" in figures.check_offscreen()
-    monkeypatch.setattr(figures, "_PROBE", "import time; time.sleep(30)")
+    monkeypatch.setattr(offscreen, "_PROBE", "import time; time.sleep(30)")
     assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)
 
 

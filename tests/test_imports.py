@@ -120,6 +120,7 @@ ORDER = [
     "figures.files",
     "figures.curves",
     "figures.learning",
+    "figures.offscreen",
     "figures",
     "toml_config",
     "data",

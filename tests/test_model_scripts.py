@@ -165,13 +165,10 @@ def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
 
 
 def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
-    script_, config = (
-        ROOT / "models" / "with_and_without_gate.py",
-        ROOT / "datasets/tiny/config.toml",
-    )
-    record = tmp_path / "record.json"
-    command = [sys.executable, script_, "tiny", config, "0/0", "-o", record, "--frames", "2"]
-    subprocess.run(command, check=True, capture_output=True)
+    config, record = ROOT / "datasets" / "tiny" / "config.toml", tmp_path / "record.json"
+    command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", "tiny", config]
+    options = ["0/0", "-o", record, "--frames", "2"]
+    subprocess.run([*command, *options], check=True, capture_output=True)
     (row,) = json.loads(record.read_text())["simulations"]
     assert (row["mesh"], row["load"]) == (0, 0)
     if not row["refused"]:

@@ -245,9 +245,10 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def overlaid_labels(comparison: Comparison) -> list[str]:
-    """The reference, the nearest of its correctors and better coarse models, and the coarse mesh.
+    """Which runs are drawn over each other: the reference, what is near it, and the coarse mesh.
 
-    Without the first two of a kind the intermediate mesh is in between; what there is of these.
+    What is near it is the nearest corrector or better coarse model; without any, the nearest finer
+    mesh.  Runs that the comparison does not have are left out.
     """
     cases, errors = comparison.cases, {row.label: row.rms_error for row in comparison.rows}
     plain = [c.label for c in cases if c.plain and c.solver == "pd"]

@@ -115,8 +115,8 @@ class StepWindows:
     def batch(self, indices: Sequence[int], *, last: bool = True) -> StepBatch:
         """The last steps of chosen windows, or their first ones.
 
-        These differ where the correction of the step before is known, by one that has to be:
-        of a first step it counts as none, as in a simulation that begins there.
+        A window has two steps where the network sees the correction of the step before, else one.
+        Of a window's first step that correction is None, as where a simulation begins.
         """
         source = self._tables if self.resident else self.dataset
         return self.step_batch(source.batch(indices), last=last)
