@@ -38,6 +38,7 @@ from pdcorrect.data.simulate import models
 from pdcorrect.environment import environment
 from pdcorrect.evaluation.candidates import saved_candidates
 from pdcorrect.evaluation.speed import measure_speed
+from pdcorrect.fem.coarse_models import coarse_model
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import best_coarse
 
@@ -71,12 +72,9 @@ def drawn(path: Path, split: str, base: str) -> Iterator[tuple[Problem, Problem]
     config = DatasetConfig.load(path)
     for plan in make_plan(config):
         if plan.split == split:
-            scene, runs = draw_scene(config, plan, 0), models(config, plan)
-            coarse, fine = (
-                discretise(best_coarse(scene) if run.best else scene, refine=run.refine)
-                for run in (runs[base], runs[REFERENCE])
-            )
-            yield coarse, fine
+            scene, reference = draw_scene(config, plan, 0), models(config, plan)[REFERENCE]
+            truth = best_coarse(scene) if reference.best else scene
+            yield coarse_model(scene, base, plan.refine), discretise(truth, refine=plan.refine)
 
 
 def main() -> None:

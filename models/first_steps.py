@@ -19,14 +19,16 @@ from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.scene import Scene
 
 
-def scenes_of(config: DatasetConfig, split: str, loads: int | None = None) -> list[Scene]:
-    """The scenes of a split, mesh by mesh; at most so many loads of each, all by default.
+def scenes_of(
+    config: DatasetConfig, split: str, loads: int | None = None
+) -> list[tuple[Scene, int]]:
+    """The scenes of a split, mesh by mesh, and how often the reference cuts their cells.
 
-    Loads are those that are drawn first: `pdcorrect dataset generate` replaces the ones that it
-    rejects.
+    At most so many loads of each, all by default.  Loads are those that are drawn first:
+    `pdcorrect dataset generate` replaces the ones that it rejects.
     """
     return [
-        draw_scene(config, plan, number)
+        (draw_scene(config, plan, number), plan.refine)
         for plan in make_plan(config)
         if plan.split == split
         for number in range(plan.simulations if loads is None else min(loads, plan.simulations))
@@ -35,22 +37,28 @@ def scenes_of(config: DatasetConfig, split: str, loads: int | None = None) -> li
 
 @torch.no_grad()
 def first_views(
-    model: LoadedModel, scenes: list[Scene], device: str, batch: int
+    model: LoadedModel, scenes: list[tuple[Scene, int]], device: str, batch: int
 ) -> Iterator[tuple[View, Tensor]]:
     """What the network is shown in one step from rest, so many scenes at a time.
 
     Second: of which of them (B,) the coarse step converged; all where none is shown.
     """
-    best = model.base == "best"
-    for first in range(0, len(scenes), batch):
-        some = scenes[first : first + batch]
-        problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in some]
-        stepper = pc.BatchStepper(problems, device=device)
-        parts = BatchParts(stepper, model.corrector, model.velocity)
-        step = BatchCoarseStep(parts, stepper.rest_state(), None)
+    for step in first_steps(model, scenes, device, batch):
         if model.corrector.config.placement == "state":
             answer = step.solved()
             yield step.view(answer), step.ok(answer)
         else:
             view = step.view(None)
             yield view, torch.ones_like(view.bodies.cell_size, dtype=torch.bool)
+
+
+def first_steps(
+    model: LoadedModel, scenes: list[tuple[Scene, int]], device: str, batch: int
+) -> Iterator[BatchCoarseStep]:
+    """Steps from rest of the coarse model that a network corrects, so many scenes at a time."""
+    for first in range(0, len(scenes), batch):
+        some = scenes[first : first + batch]
+        problems = [pc.coarse_model(scene, model.base, refine) for scene, refine in some]
+        stepper = pc.BatchStepper(problems, device=device)
+        parts = BatchParts(stepper, model.corrector, model.velocity)
+        yield BatchCoarseStep(parts, stepper.rest_state(), None)

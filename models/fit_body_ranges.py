@@ -74,8 +74,7 @@ def averages_of(
 ) -> tuple[Moments, int]:
     """Of bodies' mean inputs over all steps of all rollouts, and how many rollouts."""
     scenes = scenes_of(config, TRAINING, loads=1)
-    best = model.base == "best"
-    problems = [pc.discretise(pc.best_coarse(scene) if best else scene) for scene in scenes]
+    problems = [pc.coarse_model(scene, model.base, refine) for scene, refine in scenes]
     problems.sort(key=lambda problem: len(problem.positions))
     corrector, averages, bodies = model.corrector, Moments(), 0
     answer, seen = corrector.of_view, []

@@ -1,10 +1,13 @@
-"""Repeat simulations of an evaluation split with and without a gate, and tell what it refused.
+"""Repeat simulations of an evaluation split on the CPU, corrected with and without a gate.
 
-python models/with_and_without_gate.py MODEL DATASET/config.toml MESH/LOAD ... -o RECORD.json
+python models/with_and_without_gate.py DATASET/config.toml --model MODEL ... [MESH/LOAD ...]
+    -o RECORD.json
 
-On the CPU: the reference, the plain coarse mesh, and the corrected coarse model with the default
-gate and without one.  Loads are those that are drawn first; where `pdcorrect dataset generate`
-has rejected one, this is another simulation than the data set's.
+The reference, the plain coarse mesh, each model's own base, and that corrected, with the default
+gate and without one: Omega of each, and what the gate refused.  Without MESH/LOAD it is one load of
+each mesh.  Loads are those that are drawn first; where `pdcorrect dataset generate` has rejected
+one, this is another simulation than the data set's.  The record is written after each simulation; the
+same command goes on where it ended.
 """
 
 from __future__ import annotations
@@ -30,54 +33,96 @@ from pdcorrect.replacement import write_text
 def main() -> None:
     """Repeat each."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("model", help="folder or name")
     parser.add_argument("config", type=Path, help="of a data set")
-    parser.add_argument("cases", nargs="+", metavar="MESH/LOAD")
+    parser.add_argument("cases", nargs="*", metavar="MESH/LOAD")
+    parser.add_argument("--model", action="append", required=True, help="folder or name")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=None, help="all of the data set by default")
     options = parser.parse_args()
-    config, model = DatasetConfig.load(options.config), pc.load_model(options.model)
+    config = DatasetConfig.load(options.config)
+    models = {model_folder(name).name: pc.load_model(name) for name in options.model}
     plans = {plan.number: plan for plan in make_plan(config) if plan.split == EVALUATION}
-    rows = []
-    for case in options.cases:
-        mesh, load = map(int, case.split("/"))
-        rows.append(repeated(model, config, plans[mesh], load, options.frames))
-        print(rows[-1], flush=True)
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", "models/with_and_without_gate.py", *sys.argv[1:]]),
-        "environment": environment(),
-        "dataset": config.name,
-        "weights_sha256": weights_digest(model_folder(options.model)),
-        "simulations": rows,
+    digests = {
+        model_folder(name).name: weights_digest(model_folder(name)) for name in options.model
     }
-    write_text(options.output, json.dumps(record, indent=2) + "\n")
+    about = {
+        "dataset": config.name, "frames": options.frames, "gate": pc.Gate().model_dump(),
+        "weights_sha256": digests,
+    }  # fmt: skip
+    rows = known_rows(options.output, about)
+    for case in options.cases or [f"{number}/0" for number in plans]:
+        mesh, load = map(int, case.split("/"))
+        if any((row["mesh"], row["load"]) == (mesh, load) for row in rows):
+            continue
+        rows.append(repeated(models, config, plans[mesh], load, options.frames))
+        print(json.dumps(rows[-1]), flush=True)
+        record = {
+            "date": time.strftime("%Y-%m-%d"),
+            "command": " ".join(["python", "models/with_and_without_gate.py", *sys.argv[1:]]),
+            "environment": environment(),
+            **about,
+            "omega": {name: summary(rows, name) for name in models},
+            "simulations": rows,
+        }
+        write_text(options.output, json.dumps(record, indent=2) + "\n")
+
+
+def known_rows(path: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
+    """Simulations of a record that was begun with the same models, gate, data set and frames."""
+    if not path.exists():
+        return []
+    record = json.loads(path.read_text(encoding="utf-8"))
+    if any(record.get(key) != value for key, value in about.items()):
+        raise SystemExit(f"{path}: of other models, another gate, data set or number of frames.")
+    rows: list[dict[str, Any]] = record["simulations"]
+    return rows
+
+
+def summary(rows: list[dict[str, Any]], name: str) -> dict[str, dict[str, float]]:
+    """Mean, median and least Omega over the simulations, per cent."""
+    return {
+        label: {
+            "mean": float(np.mean(found)), "median": float(np.median(found)),
+            "least": float(np.min(found)),
+        }
+        for label in ("own_base", "with_gate", "without")
+        if (found := [row["models"][name][label] for row in rows])
+    }  # fmt: skip
 
 
 def repeated(
-    model: LoadedModel, config: DatasetConfig, plan: MeshPlan, load: int, frames: int | None
-) -> dict[str, Any]:
+    models: dict[str, LoadedModel], config: DatasetConfig, plan: MeshPlan, load: int,
+    frames: int | None,
+) -> dict[str, Any]:  # fmt: skip
     """Omega with and without a gate, per cent, and the steps that it refused."""
     scene, frames = draw_scene(config, plan, load), frames or plan.frames
-    better = pc.best_coarse(scene)
     plain = pc.discretise(scene)
-    fine = pc.discretise(better if config.setting == "exact" else scene, refine=plan.refine)
-    coarse = pc.discretise(better) if model.base == "best" else plain
-    truth = pc.restrict(pc.rollout(pc.ProjectiveDynamics(fine), frames), to=plain)
+    truth = pc.best_coarse(scene) if config.setting == "exact" else scene
+    fine = pc.discretise(truth, refine=plan.refine)
+    reference = pc.restrict(pc.rollout(pc.ProjectiveDynamics(fine), frames), to=plain)
     zero = pc.rollout(pc.ProjectiveDynamics(plain), frames)
-    found: dict[str, Any] = {"mesh": plan.number, "load": load}
-    for label, gate in (("with gate", pc.Gate()), ("without", None)):
-        steps = pc.ProjectiveDynamics(coarse)
-        hybrid = pc.HybridStepper(steps, model.corrector, velocity=model.velocity, gate=gate)
-        run = pc.rollout(hybrid, frames)
-        found[label] = pc.metrics.error_corrected(run, zero, truth)
-        if gate:
-            reasons = np.asarray(run.stats["gate"])
-            found["refused"] = {
-                str(step + 1): Reason(int(reasons[step])).name.lower()
-                for step in np.flatnonzero(reasons)
-            }
-    return found
+    found: dict[str, Any] = {}
+    for name, model in models.items():
+        coarse = pc.coarse_model(scene, model.base, plan.refine)
+        base = pc.rollout(pc.ProjectiveDynamics(coarse), frames)
+        row = {"own_base": pc.metrics.error_corrected(base, zero, reference)}
+        for label, gate in (("with_gate", pc.Gate()), ("without", None)):
+            steps = pc.ProjectiveDynamics(coarse)
+            hybrid = pc.HybridStepper(steps, model.corrector, velocity=model.velocity, gate=gate)
+            run = pc.rollout(hybrid, frames)
+            row[label] = pc.metrics.error_corrected(run, zero, reference)
+            row[f"rms_mm_{label}"] = 1e3 * pc.metrics.rms_error(run, reference)
+            if gate:
+                reasons = np.asarray(run.stats["gate"])
+                row["refused"] = {
+                    str(step + 1): Reason(int(reasons[step])).name.lower()
+                    for step in np.flatnonzero(reasons)
+                }
+        found[name] = row
+    return {
+        "mesh": plan.number, "load": load, "nodes": len(plain.positions),
+        "rms_mm_plain": 1e3 * pc.metrics.rms_error(zero, reference), "models": found,
+    }  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -820,6 +820,20 @@ def test_excess_counts_deviations_outside_the_range_seen():
     assert torch.equal(found, tensor([[0.0, 0.0], [1.5, 0.0], [0.5, 0.5], [0.0, 2.0]]))
 
 
+def test_the_farthest_value_seen_counts_as_three_and_a_half_deviations_at_most():
+    kicks = torch.zeros(100, 1).double()
+    kicks[0] = 7.0  # ten deviations from the mean
+    normaliser = fitted(a=kicks)
+    unit = (7.0 - 0.07) / 3.5
+    usual = float(kicks.std(correction=0))
+    assert usual < 0.4 * unit
+    assert normaliser.excess({"a": tensor([[7.0 + unit], [-usual]])}).flatten().tolist() == (
+        pytest.approx([1.0, 1.0])
+    )
+    scale = normaliser.scale("a")
+    assert [float(scale.below), float(scale.above)] == pytest.approx([usual, unit])
+
+
 def test_a_normaliser_needs_values_to_be_fitted_to():
     full, empty, zero = Moments(), Moments(), Moments()
     full.add(torch.ones(3, 1))

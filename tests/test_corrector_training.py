@@ -98,6 +98,8 @@ FORCED = '[corrector]\nchanges = {placement = "force"}\n'
         (BASIC.replace("one-step", "two-step"), 'stages.0.kind = "two-step"'),
         (BASIC + "[stages.loss]\nkind = 'absolute'\nbend = 1.0\n", "loss .*bend has no meaning"),
         (BASIC + "teacher = 'tiny'\n", "stages.0 .*teacher has no meaning"),
+        (BASIC + "at_rest = 0.5\n", "stages.0 .*at_rest has no meaning"),
+        (UNROLLED + "at_rest = 1.5\n", "stages.0.at_rest = 1.5"),
         (UNROLLED + "teacher = 'tiny'\nthrough_solver = true\n", "teacher: .*step by step"),
         (FORCED + UNROLLED + "teacher = 'tiny'\n", "stages.0: a teacher teaches"),
         ("stages = []\n", "stages"),
@@ -655,6 +657,19 @@ def test_a_pool_goes_on_where_it_was(folder):
     for iteration in range(2):
         always.loss(corrector, iteration, 2)
         assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_states_of_the_reference_is_at_rest(folder, share):
+    recordings = load_recordings(folder, "training", "plain")
+    groups = SceneGroups(recordings, "plain")
+    batches = UnrolledBatches(groups, samples.unrolled(at_rest=share, steps=2))
+    group = groups(recordings)
+    starts = np.concatenate([
+        batches._start(0, group, 2, np.random.default_rng(k)).frames for k in range(100)
+    ])  # fmt: skip
+    expected = share + (1.0 - share) / 19  # of the frames 0 to 18 in any case
+    assert np.mean(starts == 0) == pytest.approx(expected, abs=0.08)
 
 
 def test_rollouts_that_are_lost_go_back_to_the_reference(folder):

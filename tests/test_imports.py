@@ -51,6 +51,7 @@ ORDER = [
     "fem.assembly",
     "fem.elastic_body",
     "fem.problem",
+    "fem.coarse_models",
     "fem.sensitivities",
     "fem.stress",
     "fem.modes",

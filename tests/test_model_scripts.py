@@ -34,8 +34,10 @@ def script(name):
     return module
 
 
-def test_the_page_of_results_has_the_table_of_the_records():
-    assert script("table").table() in (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+def test_the_page_of_results_has_the_tables_of_the_records():
+    page, tables = (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), script("table")
+    assert tables.table() in page
+    assert tables.heavy_table() in page
 
 
 def as_version_1(folder):
@@ -100,15 +102,19 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
         name.endswith(("__low", "__high", "average_low", "average_high")) for name in changed
     )
     assert widened.record.training["first_steps"] == {"dataset": "tiny", "steps": 10}
-    command = [sys.executable, ROOT / "models" / "unknown_first_steps.py"]
+    command = [sys.executable, ROOT / "models" / "refused_first_steps.py"]
     pairs = [f"{narrow}={path}", f"{folder}={path}"]
     output = tmp_path / "record.json"
-    counted = [*command, *pairs, "--split", "training", "--loads", "1", "-o", output]
+    counted = [*command, *pairs, "--split", "training", "--loads", "1", "--reference", "-o", output]
     subprocess.run(counted, check=True, capture_output=True)
     found = json.loads(output.read_text())["models"]
     assert [row["model"] for row in found] == ["narrow", "tiny"]
-    counts = [[row[name] for name in ("first steps", "unknown", "by nodes")] for row in found]
+    counts = [[row["first_steps"], row["refused"]["features"], row["unknown_by_nodes"]]
+              for row in found]  # fmt: skip
     assert counts == [[6, 6, 6], [6, 0, 0]]
+    rises = found[0]["rise_of_energy"]
+    assert rises["corrected"] == found[1]["rise_of_energy"]["corrected"]  # without a gate
+    assert -1.0 < rises["reference"]["most"] < 1.0  # best masses are right
 
 
 def first_step(path):
@@ -166,11 +172,16 @@ def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
 
 def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
     config, record = ROOT / "datasets" / "tiny" / "config.toml", tmp_path / "record.json"
-    command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", "tiny", config]
-    options = ["0/0", "-o", record, "--frames", "2"]
+    command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", config]
+    options = ["0/0", "--model", "tiny", "-o", record, "--frames", "2"]
     subprocess.run([*command, *options], check=True, capture_output=True)
-    (row,) = json.loads(record.read_text())["simulations"]
-    assert (row["mesh"], row["load"]) == (0, 0)
+    found = json.loads(record.read_text())
+    (simulation,) = found["simulations"]
+    assert (simulation["mesh"], simulation["load"]) == (0, 0)
+    row = simulation["models"]["tiny"]
     if not row["refused"]:
-        assert row["with gate"] == row["without"]
-    assert row["without"] > 0
+        assert row["with_gate"] == row["without"]
+    assert row["without"] > row["own_base"]
+    assert found["omega"]["tiny"]["without"] == dict.fromkeys(
+        ("mean", "median", "least"), row["without"]
+    )

@@ -27,6 +27,7 @@ _HOME = {
     "Trajectory": "pdcorrect.state",
     "Problem": "pdcorrect.fem.problem",
     "discretise": "pdcorrect.fem.problem",
+    "coarse_model": "pdcorrect.fem.coarse_models",
     "stress": "pdcorrect.fem.stress",
     "modes": "pdcorrect.fem.modes",
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
@@ -70,6 +71,7 @@ __all__ = [  # noqa: RUF022
     "Trajectory",
     "Problem",
     "discretise",
+    "coarse_model",
     "stress",
     "modes",
     "ProjectiveDynamics",
@@ -114,6 +116,7 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.evaluate import compare
+    from pdcorrect.fem.coarse_models import coarse_model
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
     from pdcorrect.fem.stress import stress

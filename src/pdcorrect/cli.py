@@ -110,8 +110,8 @@ def compare(
 ) -> None:
     """Run coarse, intermediate and fine PD and Newton; report error and run time.
 
-    With a corrector of the best coarse model, the fine run has that model's element, and the
-    best coarse model itself is compared too.
+    With a corrector, the coarse model that it corrects is compared too; with one of the best
+    coarse model, the fine run has that model's element.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console

@@ -10,7 +10,8 @@ import numpy as np
 
 from pdcorrect import metrics
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import discretise
+from pdcorrect.fem.coarse_models import BASES
+from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -36,6 +37,8 @@ class Case:
         With the element and mass of `best_coarse`, on any mesh.
     model : str or None
         Name or folder of a corrector of the steps.
+    mass_of : int or None
+        The density is scaled so that the total mass is that of the scene refined so often.
     """
 
     label: str
@@ -43,11 +46,13 @@ class Case:
     refine: int
     better: bool = False
     model: str | None = None
+    mass_of: int | None = None
 
     @property
     def plain(self) -> bool:
         """Whether it is the scene itself on the coarse mesh."""
-        return self.refine == 1 and not self.better and self.model is None
+        changed = self.better or self.model is not None or self.mass_of is not None
+        return self.refine == 1 and not changed
 
 
 CASES = (
@@ -132,17 +137,21 @@ class Comparison:
 
 def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
     """A stepper by name, ``"pd"`` or ``"newton"``, factorised and with its kernels compiled."""
+    return _stepper(discretise(scene, refine=refine), solver)
+
+
+def _stepper(problem: Problem, solver: str) -> Stepper:
     kinds = {"pd": ProjectiveDynamics, "newton": Newton}
     if solver not in kinds:
         raise InputError(f"solver {solver!r}: expected one of {', '.join(kinds)}.")
-    return kinds[solver](discretise(scene, refine=refine)).prepare()
+    return kinds[solver](problem).prepare()
 
 
 def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
     """The default comparison with correctors of one coarse model.
 
     Those of the best coarse model have learned references with its element: all errors
-    are then distances from such a one, and the best coarse model is among the cases.
+    are then distances from such a one.  The coarse model that they correct is among the cases.
 
     Parameters
     ----------
@@ -152,8 +161,7 @@ def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
     Raises
     ------
     InputError
-        If there is no such model, or they do not all correct the plain mesh or all the best
-        coarse model.
+        If there is no such model, or they do not all correct one coarse model.
     """
     if not models:
         return CASES
@@ -166,16 +174,22 @@ def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
             f"models {', '.join(names)}: correctors of {', '.join(sorted(bases))}: expected of one "
             "coarse model, as their references have its element; compare the others apart."
         )
-    if not bases <= {"plain", "best"}:
-        raise InputError(f"{names[0]}: corrects {bases.pop()!r}: expected 'plain' or 'best'.")
+    (base,) = bases
+    if base not in BASES:
+        raise InputError(f"{names[0]}: corrects {base!r}: expected one of {', '.join(BASES)}.")
     reference, *others = CASES
-    better = bases == {"best"}
+    corrected = Case("coarse PD", "pd", 1)
+    if base == "best":
+        reference = replace(reference, label="fine best PD", better=True)
+        corrected = Case("best coarse PD", "pd", 1, better=True)
+    elif base == "total-mass":
+        corrected = Case("coarse PD, total mass", "pd", 1, mass_of=reference.refine)
     return (
-        replace(reference, label="fine best PD", better=True) if better else reference,
+        reference,
         *others,
-        *([Case("best coarse PD", "pd", 1, better=True)] if better else []),
+        *([] if corrected.plain else [corrected]),
         *(
-            Case(f"hybrid {name}", "pd", 1, better, model)
+            replace(corrected, label=f"hybrid {name}", model=model)
             for name, model in zip(names, models, strict=True)
         ),
     )
@@ -191,14 +205,17 @@ def case_stepper(scene: Scene, case: Case) -> Stepper:
     """
     if case.better:
         scene = best_coarse(scene)
+    problem = discretise(scene, case.refine)
+    if case.mass_of is not None:
+        problem = problem.with_total_mass(float(discretise(scene, case.mass_of).mass.sum()))
     if case.model is None:
-        return make_stepper(scene, case.solver, case.refine)
+        return _stepper(problem, case.solver)
     from pdcorrect.corrector.gate import Gate
     from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model
 
     model = load_model(case.model)
-    coarse = ProjectiveDynamics(discretise(scene, refine=case.refine))
+    coarse = ProjectiveDynamics(problem)
     hybrid = HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=Gate())
     return hybrid.prepare()
 
@@ -239,7 +256,9 @@ def compare(
     truth = on_coarse[cases[0].label]
     base = next((on_coarse[c.label] for c in cases[::-1] if c.plain and c.solver == "pd"), None)
     rows = []
-    for case in sorted(cases, key=lambda c: (c.refine, c.better, c.solver != "pd")):
+    for case in sorted(
+        cases, key=lambda c: (c.refine, c.better, bool(c.mass_of), c.solver != "pd")
+    ):
         run, here = runs[case.label], on_coarse[case.label]
         has_base = base is not None and metrics.mean_squared_error(base, truth) > 0
         rows.append(

@@ -253,7 +253,9 @@ def overlaid_labels(comparison: Comparison) -> list[str]:
     cases, errors = comparison.cases, {row.label: row.rms_error for row in comparison.rows}
     plain = [c.label for c in cases if c.plain and c.solver == "pd"]
     finer = [c.label for c in cases if c.refine > 1 and c.label != comparison.reference]
-    better = [c.label for c in cases if c.refine == 1 and (c.model or c.better)] or finer
+    better = [
+        c.label for c in cases if c.refine == 1 and (c.model or c.better or c.mass_of)
+    ] or finer
     nearest = sorted(better, key=lambda label: errors[label])[:1]
     return list(dict.fromkeys([comparison.reference, *nearest, *plain[:1]]))
 

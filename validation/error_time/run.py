@@ -35,6 +35,8 @@ MODELS: Mapping[tuple[str, str], Sequence[str]] = {
     ("torsion", "exact"): ("torsion-exact", "torsion-exact-compact"),
 }
 """Released correctors that were trained on such scenes, by motion and setting."""
+ROWS = {"plain": "plain", "best": "best", "total-mass": "right mass"}
+"""Methods that correctors are added to, by the name of their base."""
 OTHERS = ("plain", "best", "plain 2×2×2", "hex27")
 """Named in figures, besides those on the front."""
 FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
@@ -162,15 +164,12 @@ class Comparison:
 
     def _hybrid(self, name: str) -> Any:
         model = released(name)
-        scene = self.best if model.base == "best" else self.scene
-        coarse = pc.ProjectiveDynamics(pc.discretise(scene))
+        coarse = pc.ProjectiveDynamics(pc.coarse_model(self.scene, model.base))
         return pc.HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=pc.Gate())
 
     def _right_mass(self) -> pc.ProjectiveDynamics:
-        problem = self.points
-        ratio = self.reference.problem.mass.sum() / problem.mass.sum()
-        density = ratio * problem.materials.density
-        return pc.ProjectiveDynamics(problem.with_material(density=density))
+        mass = self.reference.problem.mass.sum()
+        return pc.ProjectiveDynamics(self.points.with_total_mass(mass))
 
     def _fitted(self) -> pc.ProjectiveDynamics:
         """With the modulus that suits this very scene best: more than one can have elsewhere."""
@@ -288,7 +287,7 @@ def outcome(motion: str, setting: str, quick: bool) -> common.Outcome:
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
     for row in (row for row in rows if row.family == "hybrid"):
-        base = by_name[released(row.name.removeprefix("hybrid, ")).base]
+        base = by_name[ROWS[released(row.name.removeprefix("hybrid, ")).base]]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
     for name in ("plain", "best"):
         if f"{name}, 1e-06" in by_name:

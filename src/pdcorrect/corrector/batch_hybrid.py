@@ -76,8 +76,8 @@ class BatchHybrid(WithNodes):
         coarse step fails.
     recorded : bool
         Whether a GPU compiles the network and records its work, and the gate's, in the first step,
-        to replay it in the others (see `RecordedCorrector`).  Tested on the CPU only, where it
-        changes nothing: what it is worth on a GPU has not been measured.
+        to replay it in the others (see `RecordedCorrector`).  On the CPU it changes nothing.  On
+        an H200 25 of its 28 tests passed and none failed; batches were not timed.
 
     Raises
     ------

@@ -138,9 +138,9 @@ def _columns(
 ) -> tuple[Array, Array]:
     """Of the components that change: number among all and column, and a row for each of them.
 
-    The rows (k, 5) are mean, deviation, low, high and unit of excess.
+    The rows (k, 6) are those of `Scale`.
     """
-    places, rows, column = [], [np.zeros((0, 5))], 0
+    places, rows, column = [], [np.zeros((0, 6))], 0
     for name in names:
         scale = corrector.normaliser.scale(name)
         width = len(scale.mean)
@@ -266,9 +266,8 @@ def _write(values, places, scales, clip, out):  # type: ignore[no-untyped-def]
     worst = 0.0
     for k in range(len(places)):
         value = values[places[k, 0]]
-        outside = max(scales[k, 2] - value, value - scales[k, 3])
+        outside = max((scales[k, 2] - value) / scales[k, 4], (value - scales[k, 3]) / scales[k, 5])
         if not outside <= 0.0:
-            outside /= scales[k, 4]
             worst = max(worst, outside) if outside == outside else np.inf
         value = (value - scales[k, 0]) / scales[k, 1]
         out[places[k, 1]] = value if clip == np.inf else clip * _tanh(value / clip)

@@ -92,7 +92,7 @@ class Corrector(nn.Module):
     def outside(self, view: View, margin: float) -> Tensor:
         """Share of each body's nodes with inputs, or an edge with inputs, beyond a margin, (B,).
 
-        The margin is in deviations outside the range of the training data.
+        The margin is in the unit of `Normaliser.excess`, outside the range of the training data.
         """
         bodies, config = view.bodies, self.config
 

@@ -68,7 +68,9 @@ class Gate(Strict):
     ----------
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
-        that lie more than ``margin`` deviations outside the range of the training data.
+        that lie more than ``margin`` deviations outside the range of the training data, of which
+        the farthest value on that side counts as 3.5 at most: where one is farther from the mean,
+        as of inputs that are large in few steps, a margin of 1 is 2/7 of its distance.
     average
         Refused if the mean of an input over a body's nodes is farther than this from its mean in
         training, in deviations of such means there, of which the farthest of them counts as 3.5
@@ -87,9 +89,9 @@ class Gate(Strict):
         kinetic and elastic energy after the coarse step and the magnitude of the loads' work
         in it.  Nothing in the bound depends on the correction, and the forces of corrections
         are no loads.  A bound against single jumps, and a wide one: where the coarse mass rule
-        makes nodes r times too heavy, the right answer to a kick rises by (r - 1)²/3: with the
-        published rule 3.2 at most beside a 4x4x4 reference (r = 4.1 at corners), and more
-        beside finer ones.
+        makes nodes r times too heavy, the right answer to a kick rises by (r - 1)²/3, if all are,
+        and single nodes may move farther still: with the published rule 6.4 was measured beside a
+        4x4x4 reference (r = 4.1 at corners).
     limit
         Whether a correction that fails by volume or energy is halved, up to six times, until it
         passes, and refused only then; for placement "state".
@@ -100,7 +102,7 @@ class Gate(Strict):
     average: NonNegative | None = 3.7
     volume: Number | None = 0.0
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
-    energy: NonNegative | None = 4.0
+    energy: NonNegative | None = 8.0
     limit: bool = False
 
     def unknown(self, corrector: Answers, view: View) -> Tensor:

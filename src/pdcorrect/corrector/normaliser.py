@@ -25,8 +25,14 @@ _LEAST_SPREAD = 0.1
 Means that symmetry makes vanish in all training bodies would make any other look strange.
 """
 
+_PARTS = ("mean", "deviation", "low", "high")
+"""What is known of each feature, by the names of the buffers."""
+
 _EXTREME = 3.5
-"""Deviations that the extremes of bodies' mean inputs count as, where they are farther out."""
+"""Deviations that the extremes of inputs, and of bodies' means, count as where they are farther.
+
+Some inputs are large in few steps only, as in kicks: their deviation over all steps is little.
+"""
 
 
 class Moments:
@@ -79,13 +85,14 @@ class Moments:
 
 
 class Scale(NamedTuple):
-    """Of the components of a feature, (k,) each: ``unit`` is that of its excess."""
+    """Of the components of a feature, (k,) each; the last two are the units of its excess."""
 
     mean: Tensor
     deviation: Tensor
     low: Tensor
     high: Tensor
-    unit: Tensor
+    below: Tensor
+    above: Tensor
 
 
 class Normaliser(nn.Module):
@@ -117,10 +124,10 @@ class Normaliser(nn.Module):
         super().__init__()
         self.names = (*nodes, *edges)
         for name, k in {**nodes, **edges}.items():
-            for part, value in (("mean", 0.0), ("deviation", 1.0), ("low", 0.0), ("high", 0.0)):
+            for part, value in zip(_PARTS, (0.0, 1.0, 0.0, 0.0), strict=True):
                 self.register_buffer(_key(name, part), torch.full((k,), value, dtype=torch.float64))
         self.register_buffer("output_scale", torch.zeros((), dtype=torch.float64))
-        for part in ("low", "high", "mean", "deviation"):
+        for part in _PARTS:
             unknown = torch.full((sum(nodes.values()),), torch.nan, dtype=torch.float64)
             self.register_buffer(f"average_{part}", unknown)
 
@@ -163,12 +170,12 @@ class Normaliser(nn.Module):
         self.average_deviation.copy_(averages.deviation.clamp_min(_LEAST_SPREAD))
 
     def widen(self, features: Mapping[str, Moments]) -> None:
-        """Widen the ranges by those of further values; nothing else changes."""
+        """Widen the ranges by those of further values; means and deviations do not change."""
         for name in self.names:
             self._widen(_key(name, ""), features[name])
 
     def widen_averages(self, averages: Moments) -> None:
-        """Widen the ranges of bodies' mean inputs (m, a); nothing else changes."""
+        """Widen the ranges of bodies' mean inputs (m, a); as of `widen`."""
         self._widen("average_", averages)
 
     def _widen(self, prefix: str, moments: Moments) -> None:
@@ -185,22 +192,22 @@ class Normaliser(nn.Module):
     def excess(self, values: Mapping[str, Tensor]) -> Tensor:
         """How far components (m, k1 + k2 + ...) lie outside the range seen, at least 0.
 
-        In deviations, or where a component was constant in hundredths of its value, or of one.
+        In deviations, of which the farthest value seen on the same side counts as 3.5 at most, or
+        where a component was constant in hundredths of its value, or of one.
         """
         x = torch.cat(list(values.values()), dim=1)
-        low, high, deviation = (self._row(values, p, x) for p in ("low", "high", "deviation"))
-        unit = _unit(low, high, deviation)
-        return (torch.maximum(low - x, x - high) / unit).clamp_min(0.0)
+        mean, deviation, low, high = (self._row(values, part, x) for part in _PARTS)
+        below, above = _units(mean, deviation, low, high)
+        return torch.maximum((low - x) / below, (x - high) / above).clamp_min(0.0)
 
     def strangeness(self, averages: Tensor) -> Tensor:
         """How far bodies' mean inputs (B, a) are from their mean in training.
 
-        In deviations of such means; where their extremes are more than 3.5 away, these count as
-        3.5, since some inputs are large in few steps only.  Infinite where it is not a number.
+        In deviations of such means, of which the farthest on the same side counts as 3.5 at most.
+        Infinite where it is not a number.
         """
-        low, high, mean, deviation = (
-            getattr(self, f"average_{part}").to(averages)
-            for part in ("low", "high", "mean", "deviation")
+        mean, deviation, low, high = (
+            getattr(self, f"average_{part}").to(averages) for part in _PARTS
         )
         farthest = torch.where(averages < mean, mean - low, high - mean)
         found = (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
@@ -208,10 +215,8 @@ class Normaliser(nn.Module):
 
     def scale(self, name: str) -> Scale:
         """What is known of one feature."""
-        mean, deviation, low, high = (
-            self._part(name, part) for part in ("mean", "deviation", "low", "high")
-        )
-        return Scale(mean, deviation, low, high, _unit(low, high, deviation))
+        mean, deviation, low, high = (self._part(name, part) for part in _PARTS)
+        return Scale(mean, deviation, low, high, *_units(mean, deviation, low, high))
 
     def _row(self, names: Iterable[str], part: str, like: Tensor) -> Tensor:
         """A part of some features side by side, (k1 + k2 + ...,)."""
@@ -222,11 +227,16 @@ class Normaliser(nn.Module):
         return found
 
 
-def _unit(low: Tensor, high: Tensor, deviation: Tensor) -> Tensor:
-    """In which to count how far values are outside a range."""
+def _units(mean: Tensor, deviation: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """In which to count how far values are below and above a range."""
     size = torch.maximum(low.abs(), high.abs())
     constant = high - low <= _LEAST_DEVIATION * size
-    return torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
+    least = torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
+
+    def unit(farthest: Tensor) -> Tensor:
+        return torch.where(constant, least, torch.maximum(least, farthest / _EXTREME))
+
+    return unit(mean - low), unit(high - mean)
 
 
 def _key(name: str, part: str) -> str:

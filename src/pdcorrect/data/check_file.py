@@ -127,4 +127,8 @@ def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator
         missing = sorted(named - set(simulation.runs))
         if missing:
             yield f"simulation {k:04d} has no run {missing[0]!r}"
+        for name, model in models(config, plan).items():
+            run = simulation.runs.get(name)
+            if model.predict and run is not None and run.predictions is None:
+                yield f"simulation {k:04d} has no single steps of run {name!r}"
     yield from model_faults(config, plan, shard)

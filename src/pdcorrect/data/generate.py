@@ -20,8 +20,9 @@ from pdcorrect.data.manifest import manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
 from pdcorrect.data.schema import CONFIG, MANIFEST
+from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
-from pdcorrect.data.simulate import work_per_node
+from pdcorrect.data.simulate import lacking_runs, work_per_node
 from pdcorrect.data.statistics import compute_statistics, load_statistics
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
@@ -161,7 +162,10 @@ def _generated(
 
 
 def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
-    """The hash of a mesh's file; None if there is none, or a damaged one to be made again.
+    """The hash of a mesh's file; None if there is none, or one that is to be made again.
+
+    That is one that is damaged, or lacks a run or the single steps of one, as files of earlier
+    versions of the code may.
 
     Raises
     ------
@@ -173,12 +177,15 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
         return None
     try:
         config_hash, content_hash = stored_hashes(path)
+        header = read_header(path)
     except FileVersionError:
         raise
     except FileFormatError:
         return None
     if config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
+    if lacking_runs(config, plan, header):
+        return None
     return content_hash
 
 

@@ -80,7 +80,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     window : int
         k.
     base : str, optional
-        Run whose predictions are given, "plain" or "best"; None for data without.
+        Run whose predictions are given, "plain", "best" or "total-mass"; None for data without.
     runs : sequence of str
         Runs whose own rollouts are given.
     cache_bytes : int

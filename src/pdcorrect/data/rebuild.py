@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from pdcorrect.data.scene_mesh import discretise_stored
-from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Shard
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, TOTAL_MASS, Shard
 from pdcorrect.errors import InputError
+from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 
-COARSE = (PLAIN, BEST, "total-mass")
+COARSE = BASES
 """Runs of models on the coarse mesh, which a corrector can be added to."""
 FORCE_ERROR = 1e-5
 """Largest difference of loads from the stored ones, over their largest; those are float32."""
@@ -51,9 +52,8 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     for k, scene in enumerate(scenes):
         _check_loads(plain.with_loads(scene.loads), shard, path, k)
     problem = plain
-    if run == "total-mass":
-        factor = float(stored.attributes["total_mass"]) / float(plain.mass.sum())
-        problem = plain.with_material(density=factor * plain.materials.density)
+    if run == TOTAL_MASS:
+        problem = plain.with_total_mass(float(stored.attributes["total_mass"]))
     elif run != PLAIN:
         exact = run == BEST or shard.attributes["setting"] == "exact"
         refine = int(stored.attributes.get("refine", 1))

@@ -43,8 +43,8 @@ from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.replacement import part_of_process, replacing
 
-REFERENCE, PLAIN, BEST = "reference", "plain", "best"
-"""Runs: the truth, the plain coarse model, and `pdcorrect.best_coarse`'s."""
+REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"
+"""Runs: the truth, and the coarse models, see `pdcorrect.fem.coarse_models`."""
 CONVERGED = "time-converged"
 """Run: the reference with smaller time steps."""
 SUFFIX = ".h5"

@@ -12,7 +12,17 @@ import numpy as np
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import BEST, CONVERGED, PLAIN, REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import (
+    BEST,
+    CONVERGED,
+    PLAIN,
+    REFERENCE,
+    TOTAL_MASS,
+    Run,
+    Shard,
+    Simulation,
+)
+from pdcorrect.data.shard_arrays import ShardHeader
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
@@ -84,12 +94,12 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     }
     if exact:
         found[BEST] = Model(1, best=True, predict=True)
+    else:
+        found[TOTAL_MASS] = Model(1, heavy=True, predict=True)
     if mesh.split in (TRAINING, VALIDATION):
         return found
     if mesh.refine > 2:
         found["intermediate"] = Model(2)
-    if not exact:
-        found["total-mass"] = Model(1, heavy=True)
     if mesh.split == EVALUATION:
         if config.converged_steps:
             found[CONVERGED] = Model(
@@ -97,6 +107,19 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
             )
         if mesh.number < config.finest_meshes:
             found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
+    return found
+
+
+def lacking_runs(config: DatasetConfig, mesh: MeshPlan, header: ShardHeader) -> list[str]:
+    """What the simulations of a mesh's file lack: names of runs, or of their single steps."""
+    wanted = models(config, mesh)
+    found = []
+    for name, model in wanted.items():
+        simulations = header.runs[:1] if model.sample else header.runs
+        if any(name not in rollouts for rollouts, _ in simulations):
+            found.append(f"run {name!r}")
+        elif model.predict and any(name not in single for _, single in simulations):
+            found.append(f"single steps of run {name!r}")
     return found
 
 
@@ -126,14 +149,9 @@ class _Meshed:
                 known[key] = discretise(best_coarse(scene) if model.best else scene, model.refine)
             problems[name] = known[key]
             if model.heavy:
-                problems[name] = _with_mass_of(problems[name], problems[REFERENCE])
+                whole = float(problems[REFERENCE].mass.sum())
+                problems[name] = problems[name].with_total_mass(whole)
         return cls(plan, wanted, problems)
-
-
-def _with_mass_of(problem: Problem, other: Problem) -> Problem:
-    """The problem with its density scaled so that its total mass is another's."""
-    factor = float(other.mass.sum() / problem.mass.sum())
-    return problem.with_material(density=factor * problem.materials.density)
 
 
 @dataclass(eq=False)

@@ -118,8 +118,9 @@ def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
         if base not in COARSE:
             raise InputError(f"base {base!r}: expected one of {', '.join(COARSE)}.")
     problems = {base: rebuilt_problems(shard, path, base) for base in bases}
-    if "best" in shard.simulations[0].runs and "best" not in problems:
-        problems["best"] = rebuilt_problems(shard, path, "best")
+    for base in COARSE:  # what is told of a stored run does not depend on the candidates
+        if base in shard.simulations[0].runs and base not in problems:
+            problems[base] = rebuilt_problems(shard, path, base)
     out = []
     for k, simulation in enumerate(shard.simulations):
         reference = simulation.runs[REFERENCE].positions

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -167,6 +168,18 @@ class Problem(ElasticBody):
         materials = self.materials.changed(self.scene.material, young, poisson, density)
         changed = ElasticBody(self.mesh, self.space, self.quadrature, materials, self.cell_size)
         return replace(problem_from_body(self.scene, self.refine, changed), material_changed=True)
+
+    def with_total_mass(self, mass: float) -> Problem:
+        """The same problem, its density scaled so that its nodes have this mass together, kg.
+
+        Raises
+        ------
+        InputError
+            If it is not a positive number.
+        """
+        if isinstance(mass, bool) or not isinstance(mass, Real) or not 0.0 < mass < np.inf:
+            raise InputError(f"total mass {mass} kg: expected a positive number.")
+        return self.with_material(density=mass / self.mass.sum() * self.materials.density)
 
     def with_loads(self, loads: Sequence[Load | Mapping[str, Any]]) -> Problem:
         """The same problem under other loads, each as in a scene's ``loads``.

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from pdcorrect.corrector.config import CorrectorConfig, preset
 from pdcorrect.errors import InputError
+from pdcorrect.fem.coarse_models import Base
 from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 from pdcorrect.toml_config import TomlConfig
 
@@ -138,6 +139,10 @@ class Stage(Strict):
         each of which goes back to the reference with probability ``restart`` after it was used,
         and in any case where its mean squared distance from it is more than ``lost`` times that
         of the base model's rollout: nothing is to be learned there.
+    at_rest
+        Of "unrolled": share of the states of the reference that are those at rest, before the first
+        step; the others are of any frame.  For loads that act in the first steps only, as kicks,
+        which are seldom met otherwise.
     teacher
         Of "unrolled", without derivatives through the solver: a model, by folder or name
         (`pdcorrect.load_model`), whose corrections of the states that this one meets are to be
@@ -162,6 +167,7 @@ class Stage(Strict):
     through_solver: bool = False
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
+    at_rest: Share = 0.0
     lost: Positive = 1.0
     teacher: Annotated[str, Field(min_length=1)] | None = None
     seconds: Positive | None = None
@@ -184,7 +190,8 @@ class Stage(Strict):
         if self.kind == "one-step":
             told = {
                 "steps": self.steps != (1,), "through_solver": self.through_solver,
-                "start": self.start != "reference", "teacher": self.teacher is not None,
+                "start": self.start != "reference", "at_rest": self.at_rest > 0.0,
+                "teacher": self.teacher is not None,
             }  # fmt: skip
         else:
             told = {"epochs": self.epochs is not None, "noise": self.noise.tau > 0.0}
@@ -219,7 +226,7 @@ class TrainingConfig(TomlConfig):
         training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
         architecture.  A folder's path starts where the program does.
     base
-        Whose steps are corrected: "plain", or `pdcorrect.best_coarse`'s ("best").
+        Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
     velocity
         See `pdcorrect.corrector.batch_hybrid.BatchHybrid`.
     validate_every, checkpoint_every, report_every
@@ -234,7 +241,7 @@ class TrainingConfig(TomlConfig):
 
     corrector: Architecture = Architecture()
     start_from: Annotated[str, Field(min_length=1)] | None = None
-    base: Literal["plain", "best"] = "plain"
+    base: Base = "plain"
     velocity: Literal["recomputed", "kept"] = "recomputed"
     seed: Count = 0
     fitting: Fitting = Fitting()

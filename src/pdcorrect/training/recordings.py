@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.scene_mesh import discretise_stored
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
 from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
+from pdcorrect.fem.coarse_models import Base
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
-Base = Literal["plain", "best"]
 Array = NDArray[Any]
 
 _SAME_MESH = 1e-5
@@ -47,6 +47,8 @@ class Recording:
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
         Mean squared errors of the base model, m2, see `pdcorrect.training.losses`.
+    total_mass : float or None
+        To which the base model's density is scaled, kg; None where it is not.
     """
 
     dataset: str
@@ -61,6 +63,7 @@ class Recording:
     plain: Array
     one_step: float
     rollout: float
+    total_mass: float | None = None
 
     @property
     def steps(self) -> int:
@@ -82,7 +85,7 @@ def load_recordings(
     ----------
     folder : path
     split : str
-    base : {"plain", "best"}
+    base : {"plain", "best", "total-mass"}
     scenes : bool
         Whether the base model is to step again, for which it takes the scenes.
 
@@ -128,9 +131,12 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
         scene = Scene.from_toml(recording.scene_toml, recording.name)
         key = recording.split, recording.mesh
         if key not in known:
-            model = best_coarse(scene) if base == "best" else scene
-            known[key] = discretise_stored(model, recording.points, recording.cells)
-            _check_mesh(recording, known[key])
+            model = best_coarse(scene) if base == BEST else scene
+            problem = discretise_stored(model, recording.points, recording.cells)
+            _check_mesh(recording, problem)
+            if recording.total_mass is not None:
+                problem = problem.with_total_mass(recording.total_mass)
+            known[key] = problem
         problems.append(known[key].with_loads(scene.loads))
     return problems
 
@@ -179,6 +185,9 @@ def _recording(
         plain=plain,
         one_step=_mean_square(np.asarray(simulation.runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
+        total_mass=(
+            float(simulation.runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
+        ),
     )
 
 

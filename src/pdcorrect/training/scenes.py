@@ -16,7 +16,8 @@ from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.errors import InputError
-from pdcorrect.training.recordings import Base, Recording, base_errors, make_problems
+from pdcorrect.fem.coarse_models import Base
+from pdcorrect.training.recordings import Recording, base_errors, make_problems
 
 Frames = NDArray[np.int64]
 
@@ -30,7 +31,7 @@ class SceneGroup:
     Parameters
     ----------
     recordings : sequence of Recording
-    base : {"plain", "best"}
+    base : {"plain", "best", "total-mass"}
     device : str or torch.device
 
     Attributes
@@ -138,7 +139,7 @@ class SceneGroups:
     Parameters
     ----------
     recordings : sequence of Recording
-    base : {"plain", "best"}
+    base : {"plain", "best", "total-mass"}
     device : str or torch.device
     seed, rank, world_size : int
         See `grouped`.

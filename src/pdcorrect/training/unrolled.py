@@ -154,8 +154,10 @@ class UnrolledBatches:
     def _start(
         self, number: int, group: SceneGroup, steps: int, rng: np.random.Generator
     ) -> Rollouts:
-        """States of the reference in random frames, or what the pool holds."""
+        """States of the reference, at rest or in random frames, or what the pool holds."""
         frames = rng.integers(0, group.steps - steps + 1)
+        if self._stage.at_rest > 0.0:
+            frames[rng.random(len(group)) < self._stage.at_rest] = 0
         anew = rng.random(len(group)) < self._stage.restart
         positions, velocities = group.states(frames)
         none = torch.zeros(group.nodes, 3, dtype=torch.float64, device=group.device)

@@ -19,7 +19,8 @@ from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.training.recordings import Base, Recording, rounding
+from pdcorrect.fem.coarse_models import Base
+from pdcorrect.training.recordings import Recording, rounding
 from pdcorrect.training.scenes import SceneGroup
 from pdcorrect.training.world import World
 
@@ -73,7 +74,7 @@ class Validation:
     Parameters
     ----------
     recordings : sequence of Recording
-    base : {"plain", "best"}
+    base : {"plain", "best", "total-mass"}
         Which is corrected; Omega is against "plain" in any case.
     """
 

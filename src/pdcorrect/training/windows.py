@@ -22,7 +22,8 @@ from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import TRAINING
 from pdcorrect.data.reader import CACHE_BYTES, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.sampling import ShardShuffle
-from pdcorrect.training.recordings import Base, Recording
+from pdcorrect.fem.coarse_models import Base
+from pdcorrect.training.recordings import Recording
 from pdcorrect.training.resident import ResidentWindows, StoredWindows
 
 _SHARE_OF_DEVICE = 0.3
@@ -73,7 +74,7 @@ class StepWindows:
     recordings : sequence of Recording
         Of the split, for the base model's errors.
     config : CorrectorConfig
-    base : {"plain", "best"}
+    base : {"plain", "best", "total-mass"}
     device : str or torch.device
     workers : int
         Processes that read ahead; none are needed where the split is kept in memory.
@@ -105,6 +106,7 @@ class StepWindows:
         errors = torch.full((rows, columns), float("nan"), dtype=torch.float64)
         for r in recordings:
             errors[r.mesh, r.number] = r.one_step
+        self._masses = {r.mesh: r.total_mass for r in recordings}
         self._errors = errors.to(self.device)
         files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
         self._first = {
@@ -183,16 +185,24 @@ class StepWindows:
         known = [self._known[mesh] for mesh in meshes]
         bodies = replace(
             BodyGraph.of_batch(found).to(dtype=torch.float64),
-            cell_size=torch.cat([body.cell_size for body in known]),
+            **{
+                name: torch.cat([getattr(body, name) for body in known])
+                for name in ("mass", "density", "cell_size")
+            },
         )
         for name in KNOWN:
             vars(bodies)[name] = torch.cat([getattr(body, name) for body in known])
         return bodies
 
     def _alone(self, window: int) -> BodyGraph:
-        """The body of a window."""
+        """The body of a window, of the base model's mass."""
         found = self.dataset.batch([window]).to(self.device)
-        return BodyGraph.of_batch(found).to(dtype=torch.float64)
+        body = BodyGraph.of_batch(found).to(dtype=torch.float64)
+        mass = self._masses[int(found.mesh)]
+        if mass is None:
+            return body
+        factor = mass / body.mass.sum()
+        return replace(body, mass=factor * body.mass, density=factor * body.density)
 
 
 class EndlessBatches:
