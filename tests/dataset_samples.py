@@ -71,7 +71,9 @@ def sample_simulation(config, mesh, problem, number):
             "plain": sample_run(
                 rest + 0.5 * motion, rng, predictions=(rest + 0.8 * motion)[1:], refine=1
             ),
-            "best": sample_run(rest + 0.9 * motion, rng, refine=1),
+            "best": sample_run(
+                rest + 0.9 * motion, rng, predictions=(rest + 0.95 * motion)[1:], refine=1
+            ),
         },
         scene_toml=scene.to_toml(),
         attempt=1,

@@ -337,7 +337,7 @@ def test_every_missing_part_is_named(saved, tmp_path):
     for place in [*arrays, *groups]:
         edited(saved, path, lambda file, place=place: file.__delitem__(place))
         last = place.split("/")[-1]
-        if last in OPTIONAL or place.endswith("plain/positions"):
+        if last in OPTIONAL or place.endswith(("plain/positions", "best/positions")):
             assert "not that of its attribute 'content_hash'" in refusal(path)
         else:
             assert last in refusal(path)
