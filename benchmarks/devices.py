@@ -18,17 +18,18 @@ from typing import Any
 import numpy as np
 
 from pdcorrect.data.engines import Job, OneByOne
-from pdcorrect.data.rebuild import COARSE, rebuilt_problems
+from pdcorrect.data.rebuild import rebuilt_problems
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.environment import environment
+from pdcorrect.fem.coarse_models import BASES
 
 
 def compare(path: Path) -> list[dict[str, Any]]:
     """Largest distances from a file's runs, m, and sizes to hold them against."""
     shard, rows = read_shard(path), []
     tolerance = float(shard.attributes["tolerance"])
-    for name in (*COARSE, REFERENCE):
+    for name in (*BASES, REFERENCE):
         if name not in shard.simulations[0].runs:
             continue
         problems = rebuilt_problems(shard, path, name)[: 1 if name == REFERENCE else None]

@@ -32,9 +32,9 @@ from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.rebuild import rebuilt_problems
+from pdcorrect.data.runs import models
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.data.simulate import models
 from pdcorrect.environment import environment
 from pdcorrect.evaluation.candidates import saved_candidates
 from pdcorrect.evaluation.speed import measure_speed

@@ -151,6 +151,7 @@ ORDER = [
     "data.import_files",
     "data.engines",
     "data.batch_engine",
+    "data.runs",
     "data.simulate",
     "data.manifest",
     "data.check_motion",

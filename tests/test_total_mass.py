@@ -90,6 +90,15 @@ def settings(**changes):
     return samples.config(samples.one_step(), base="total-mass", **changes)
 
 
+def save_silent(published, folder):
+    """A model of it that corrects nothing."""
+    import training_samples as samples
+    from pdcorrect.corrector.model_io import ModelRecord, save_model
+
+    record = ModelRecord(dataset="d", dataset_hash="0", training={"base": "total-mass"})
+    save_model(samples.fitted(published, settings(), silent=True), folder, record=record)
+
+
 def test_all_splits_have_its_rollouts_and_single_steps(published):
     from pdcorrect.data.shard_arrays import read_header
 
@@ -145,12 +154,7 @@ def test_a_silent_corrector_of_it_has_its_omega(published):
 
 def test_a_model_of_it_is_compared_beside_it(published, tmp_path):
     pytest.importorskip("torch_geometric")
-    import training_samples as samples
-    from pdcorrect.corrector.model_io import ModelRecord, save_model
-
-    corrector = samples.fitted(published, settings(), silent=True)
-    record = ModelRecord(dataset="d", dataset_hash="0", training={"base": "total-mass"})
-    save_model(corrector, tmp_path / "silent", record=record)
+    save_silent(published, tmp_path / "silent")
     cases = pc.evaluate.cases_with([str(tmp_path / "silent")])
     assert [case.label for case in cases[-2:]] == ["coarse PD, total mass", "hybrid silent"]
     chosen = (cases[0], cases[2], *cases[-2:])
@@ -241,14 +245,10 @@ def test_the_benchmark_of_hybrids_draws_the_model_that_is_corrected(published, b
 
 def test_a_silent_model_of_it_is_evaluated_as_its_run(published, tmp_path):
     pytest.importorskip("torch_geometric")
-    import training_samples as samples
-    from pdcorrect.corrector.model_io import ModelRecord, save_model
     from pdcorrect.evaluation.candidates import saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate
 
-    corrector = samples.fitted(published, settings(), silent=True)
-    record = ModelRecord(dataset="d", dataset_hash="0", training={"base": "total-mass"})
-    save_model(corrector, tmp_path / "silent", record=record)
+    save_silent(published, tmp_path / "silent")
     (saved,) = saved_candidates([str(tmp_path / "silent")])
     runs = evaluate([saved.candidate], published).runs
     for measure in ("omega", "step_omega", "energy_error", "rms_error"):

@@ -9,8 +9,8 @@ import numpy as np
 from pdcorrect.data.check_motion import load_faults, model_faults, volume_faults
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import MeshPlan, draw_scene
+from pdcorrect.data.runs import lacking
 from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
-from pdcorrect.data.simulate import models
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.problem import discretise
 
@@ -123,12 +123,7 @@ def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator
         if alike and simulation.steps == plan.frames:
             for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
                 yield f"simulation {k:04d}: {message}"
-        named = {n for n, model in models(config, plan).items() if k == 0 or not model.sample}
-        missing = sorted(named - set(simulation.runs))
-        if missing:
-            yield f"simulation {k:04d} has no run {missing[0]!r}"
-        for name, model in models(config, plan).items():
-            run = simulation.runs.get(name)
-            if model.predict and run is not None and run.predictions is None:
-                yield f"simulation {k:04d} has no single steps of run {name!r}"
+        single = {n for n, run in simulation.runs.items() if run.predictions is not None}
+        for what in lacking(config, plan, k, simulation.runs, single)[:1]:
+            yield f"simulation {k:04d} has no {what}"
     yield from model_faults(config, plan, shard)

@@ -15,10 +15,11 @@ import numpy as np
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import MOST_ITERATIONS
 from pdcorrect.data.plan import MeshPlan
-from pdcorrect.data.rebuild import COARSE, FORCE_ERROR, rebuilt_problems
+from pdcorrect.data.rebuild import FORCE_ERROR, rebuilt_problems
+from pdcorrect.data.runs import models
 from pdcorrect.data.schema import REFERENCE, STATISTICS, Array, Shard, Simulation
-from pdcorrect.data.simulate import models
 from pdcorrect.errors import InputError
+from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.hexahedron import shape_derivatives
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -108,7 +109,7 @@ def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Itera
     tolerance : float
         The solver's, m.
     """
-    for name in COARSE:
+    for name in BASES:
         if all(name in simulation.runs for simulation in shard.simulations):
             try:
                 problems = rebuilt_problems(shard, path, name)

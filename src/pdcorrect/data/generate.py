@@ -19,10 +19,10 @@ from pdcorrect.data.folder import all_shards
 from pdcorrect.data.manifest import manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
+from pdcorrect.data.runs import lacking, work_per_node
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
-from pdcorrect.data.simulate import lacking_runs, work_per_node
 from pdcorrect.data.statistics import compute_statistics, load_statistics
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
@@ -184,7 +184,7 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
         return None
     if config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
-    if lacking_runs(config, plan, header):
+    if any(lacking(config, plan, number, *has) for number, has in enumerate(header.runs)):
         return None
     return content_hash
 

@@ -14,8 +14,6 @@ from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene, best_coarse
 
-COARSE = BASES
-"""Runs of models on the coarse mesh, which a corrector can be added to."""
 FORCE_ERROR = 1e-5
 """Largest difference of loads from the stored ones, over their largest; those are float32."""
 
@@ -33,7 +31,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     path : Path
         Of its file, for messages.
     run : str
-        One of `COARSE`, or "reference".
+        One of `pdcorrect.fem.coarse_models.BASES`, or "reference".
 
     Raises
     ------
@@ -41,8 +39,8 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
         If a simulation has no scene, as imported ones, lacks the run, or what its scene
         leads to is not what the file holds.
     """
-    if run not in (*COARSE, REFERENCE):
-        raise InputError(f"run {run!r}: expected one of {', '.join((*COARSE, REFERENCE))}.")
+    if run not in (*BASES, REFERENCE):
+        raise InputError(f"run {run!r}: expected one of {', '.join((*BASES, REFERENCE))}.")
     scenes = [_scene(shard, path, k) for k in range(len(shard.simulations))]
     stored = shard.simulations[0].runs.get(run)
     if stored is None:

@@ -9,20 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import (
-    BEST,
-    CONVERGED,
-    PLAIN,
-    REFERENCE,
-    TOTAL_MASS,
-    Run,
-    Shard,
-    Simulation,
-)
-from pdcorrect.data.shard_arrays import ShardHeader
+from pdcorrect.data.runs import Model, models
+from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
@@ -30,36 +21,6 @@ from pdcorrect.state import State
 
 MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
-
-
-@dataclass(frozen=True)
-class Model:
-    """How a simulation is discretised and stepped.
-
-    Attributes
-    ----------
-    refine : int
-    best : bool
-        `pdcorrect.best_coarse`'s element and mass.
-    predict : bool
-        Whether to take single steps from the reference, too.
-    divisor : int
-        Parts of each time step.
-    heavy : bool
-        Density scaled so that the mass is the reference's.
-    truth : bool
-        Stepped by the reference's solver.
-    sample : bool
-        For the first simulation of the mesh only.
-    """
-
-    refine: int
-    best: bool = False
-    predict: bool = False
-    divisor: int = 1
-    heavy: bool = False
-    truth: bool = False
-    sample: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,50 +44,6 @@ class Engines:
         if len(problem.positions) > self.largest:
             return self.large
         return self.truth if model.truth else self.models
-
-
-def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
-    """The runs of a mesh by name, the reference first."""
-    exact = config.setting == "exact"
-    found = {
-        REFERENCE: Model(mesh.refine, best=exact, truth=True),
-        PLAIN: Model(1, predict=True),
-    }
-    if exact:
-        found[BEST] = Model(1, best=True, predict=True)
-    else:
-        found[TOTAL_MASS] = Model(1, heavy=True, predict=True)
-    if mesh.split in (TRAINING, VALIDATION):
-        return found
-    if mesh.refine > 2:
-        found["intermediate"] = Model(2)
-    if mesh.split == EVALUATION:
-        if config.converged_steps:
-            found[CONVERGED] = Model(
-                mesh.refine, best=exact, divisor=config.converged_steps, truth=True
-            )
-        if mesh.number < config.finest_meshes:
-            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
-    return found
-
-
-def lacking_runs(config: DatasetConfig, mesh: MeshPlan, header: ShardHeader) -> list[str]:
-    """What the simulations of a mesh's file lack: names of runs, or of their single steps."""
-    wanted = models(config, mesh)
-    found = []
-    for name, model in wanted.items():
-        simulations = header.runs[:1] if model.sample else header.runs
-        if any(name not in rollouts for rollouts, _ in simulations):
-            found.append(f"run {name!r}")
-        elif model.predict and any(name not in single for _, single in simulations):
-            found.append(f"single steps of run {name!r}")
-    return found
-
-
-def work_per_node(config: DatasetConfig, mesh: MeshPlan) -> float:
-    """About how much a simulation takes for each coarse node: steps of refined nodes."""
-    runs = (m for m in models(config, mesh).values() if not m.sample)
-    return float(mesh.frames * sum((1 + m.predict) * m.refine**3 * m.divisor for m in runs))
 
 
 @dataclass(eq=False)

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.rebuild import COARSE, rebuilt_problems
+from pdcorrect.data.rebuild import rebuilt_problems
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.physics import energies
+from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem
 from pdcorrect.metrics import EnergyBalance
 
@@ -115,10 +116,10 @@ def read_cases(
 
 def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
     for base in bases:
-        if base not in COARSE:
-            raise InputError(f"base {base!r}: expected one of {', '.join(COARSE)}.")
+        if base not in BASES:
+            raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
     problems = {base: rebuilt_problems(shard, path, base) for base in bases}
-    for base in COARSE:  # what is told of a stored run does not depend on the candidates
+    for base in BASES:  # what is told of a stored run does not depend on the candidates
         if base in shard.simulations[0].runs and base not in problems:
             problems[base] = rebuilt_problems(shard, path, base)
     out = []
