@@ -29,9 +29,9 @@ TOLERANCES = (1e-2, 1e-3, 1e-6)
 MODELS: Mapping[tuple[str, str], Sequence[str]] = {
     ("impulse", "as-published"): ("impulse-as-published",),
     ("impulse", "exact"): ("impulse-exact",),
-    ("stretch", "as-published"): ("stretch-as-published",),
+    ("stretch", "as-published"): ("stretch-as-published", "stretch-as-published-total-mass"),
     ("stretch", "exact"): ("stretch-exact",),
-    ("torsion", "as-published"): ("torsion-as-published",),
+    ("torsion", "as-published"): ("torsion-as-published", "torsion-as-published-total-mass"),
     ("torsion", "exact"): ("torsion-exact", "torsion-exact-compact"),
 }
 """Released correctors that were trained on such scenes, by motion and setting."""
