@@ -7,12 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import torch
-from torch import Tensor
-
 import pdcorrect as pc
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts
-from pdcorrect.corrector.features import View
 from pdcorrect.corrector.model_io import LoadedModel
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
@@ -33,23 +29,6 @@ def scenes_of(
         if plan.split == split
         for number in range(plan.simulations if loads is None else min(loads, plan.simulations))
     ]
-
-
-@torch.no_grad()
-def first_views(
-    model: LoadedModel, scenes: list[tuple[Scene, int]], device: str, batch: int
-) -> Iterator[tuple[View, Tensor]]:
-    """What the network is shown in one step from rest, so many scenes at a time.
-
-    Second: of which of them (B,) the coarse step converged; all where none is shown.
-    """
-    for step in first_steps(model, scenes, device, batch):
-        if model.corrector.config.placement == "state":
-            answer = step.solved()
-            yield step.view(answer), step.ok(answer)
-        else:
-            view = step.view(None)
-            yield view, torch.ones_like(view.bodies.cell_size, dtype=torch.bool)
 
 
 def first_steps(

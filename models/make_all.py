@@ -13,8 +13,10 @@ released model, which is evaluated only, beside what is trained for its data set
     logs/                        what these commands said
 
 Data are generated in the order of the recipes, unless ``--generators 0`` says that they are
-there.  Each training begins as soon as its data are there, several at a time on each GPU, and a
-data set's models are evaluated when all its trainings have ended.  Trainings that are still
+there.  Each training begins as soon as its data are there, several at a time on each GPU, or, if
+it starts from what another recipe makes (``start_from = "trainings/DATASET/NAME/model"``), when
+that has ended; a data set's models are evaluated when all its trainings have.  Commands run in
+WORK.  Trainings that are still
 running after ``--seconds`` are stopped; their best models so far are evaluated, and the next
 start goes on with them.
 """
@@ -35,9 +37,10 @@ from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
 from pdcorrect.data.workers import visible_gpus
+from pdcorrect.training.config import TrainingConfig
 from pdcorrect.training.training import MODEL
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 DATASETS = HERE.parent / "datasets"
 LEARNT = (TRAINING, VALIDATION)
 STOPPED = 1
@@ -77,16 +80,18 @@ class Machine:
 
     Parameters
     ----------
-    logs : path
+    folder : path
+        Where they run; logs go to ``logs`` in it.
     gpus : sequence of str
         As CUDA_VISIBLE_DEVICES names them; none for a machine whose CPU is used.
     places : dict of str to int
         Of each queue; of "train" for each GPU.
     """
 
-    def __init__(self, logs: Path, gpus: Sequence[str], places: dict[str, int]) -> None:
-        self._logs, self._gpus, self._places = logs, gpus, places
-        logs.mkdir(parents=True, exist_ok=True)
+    def __init__(self, folder: Path, gpus: Sequence[str], places: dict[str, int]) -> None:
+        self._folder, self._gpus, self._places = folder, gpus, places
+        self._logs = folder / "logs"
+        self._logs.mkdir(parents=True, exist_ok=True)
 
     def run(self, jobs: Sequence[Job]) -> bool:
         """Run all; whether all were successful."""
@@ -136,7 +141,7 @@ class Machine:
         with (self._logs / f"{job.name}.log").open("ab") as log:
             job.process = subprocess.Popen(
                 [sys.executable, "-m", "pdcorrect.cli", *job.arguments, *limit],
-                stdout=log, stderr=subprocess.STDOUT, env=environment,
+                stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=self._folder,
             )  # fmt: skip
 
     @staticmethod
@@ -168,6 +173,7 @@ def plan(
     for name in names:
         own = [recipe for recipe in recipes if recipe.parent.name == name]
         trainings = [_training(work, recipe, ready[name], until, options) for recipe in own]
+        _put_after_what_they_start_from(work, own, trainings)
         models = [work / "trainings" / name / recipe.stem / MODEL for recipe in own]
         models += [HERE / model for model in released if known[model] == name]
         jobs += trainings
@@ -219,6 +225,20 @@ def _training(
     return Job(f"train-{name}-{recipe.stem}", arguments, data, "train", until)
 
 
+def _put_after_what_they_start_from(
+    work: Path, recipes: Sequence[Path], trainings: Sequence[Job]
+) -> None:
+    """Have trainings of one data set wait for those whose models they start from."""
+    made = {
+        work / "trainings" / recipe.parent.name / recipe.stem / MODEL: job
+        for recipe, job in zip(recipes, trainings, strict=True)
+    }
+    for recipe, job in zip(recipes, trainings, strict=True):
+        start = TrainingConfig.load(recipe).start_from
+        if start is not None and work / start in made:
+            job.after = [*job.after, made[work / start]]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("work", type=Path)
@@ -234,14 +254,15 @@ def main() -> None:
     parser.add_argument("--split", action="append", help=f"to evaluate on; {EVALUATION} by default")
     options = parser.parse_args()
     options.split = options.split or [EVALUATION]
-    recipes = [Path(source) for source in options.sources if source.endswith(".toml")]
+    work = options.work.resolve()
+    recipes = [Path(source).resolve() for source in options.sources if source.endswith(".toml")]
     released = [source for source in options.sources if not source.endswith(".toml")]
     if not options.sources:
         recipes = sorted((HERE / "recipes").glob("*/*.toml"))
     gpus = visible_gpus() if options.device == "cuda" else []
     places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
-    machine = Machine(options.work / "logs", gpus, places)
-    sys.exit(0 if machine.run(plan(options.work, recipes, released, options)) else 1)
+    machine = Machine(work, gpus, places)
+    sys.exit(0 if machine.run(plan(work, recipes, released, options)) else 1)
 
 
 if __name__ == "__main__":

@@ -185,6 +185,42 @@ def test_compare_writes_its_report(program, tmp_path):
         assert f"| {label} |" in text
 
 
+@pytest.mark.parametrize("failing", ["coarse PD", "intermediate PD", "fine PD"])
+def test_compare_goes_on_after_a_case_that_fails(
+    program, scene_file, tmp_path, monkeypatch, failing
+):
+    refine = {case.label: case.refine for case in pc.evaluate.CASES}[failing]
+    nodes = len(pc.discretise(pc.Scene.load(scene_file), refine).positions)
+    step = pc.ProjectiveDynamics.__call__
+
+    def fails_second(self, state, *others):
+        result = step(self, state, *others)
+        if len(state.positions) == nodes and state.time > 0.0:
+            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
+        return result
+
+    monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_second)
+    folder = tmp_path / "report"
+    status, out, err = program("compare", scene_file, "-o", folder)
+    if failing == "fine PD":  # the reference: nothing is left to be said
+        assert status == cli.FAILED
+        assert "frame 2 (t = 0.02 s) failed" in err
+        assert not (folder / "report.md").exists()
+        return
+    assert status == 0
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    others = ["coarse PD", "coarse Newton", "intermediate PD", "fine PD"]
+    assert list(rows) == [label for label in others if label != failing]
+    record = json.loads((folder / "report.json").read_text())
+    assert list(record["failures"]) == [failing]
+    assert (record["solver_error"] is None) == (failing == "coarse PD")
+    text = (folder / "report.md").read_text()
+    assert f"| {failing} |  | failed |" in text
+    for told in (text, " ".join(out.split())):
+        assert f"{failing} failed and has no errors or times: frame 2" in told
+    assert (folder / "comparison.png").stat().st_size > 5000
+
+
 def test_compare_without_figures_needs_no_view_extra(program, scene_file, tmp_path, monkeypatch):
     for module in ("pyvista", "matplotlib"):
         monkeypatch.setitem(sys.modules, module, None)

@@ -14,6 +14,7 @@ ORDER = [
     "errors",
     "toml_text",
     "home",
+    "machine",
     "interruption",
     "replacement",
     "shapes",

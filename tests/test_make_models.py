@@ -36,7 +36,7 @@ def test_a_job_waits_for_those_it_needs(tmp_path, capsys):
     assert machine(tmp_path).run([second, first])
     told = [line.split(" s  ")[1] for line in capsys.readouterr().out.splitlines()]
     assert told == ["first started", "first ended with 0", "second started", "second ended with 0"]
-    assert "Usage" in (tmp_path / "second.log").read_text()
+    assert "Usage" in (tmp_path / "logs/second.log").read_text()
 
 
 def test_what_needs_a_failed_job_is_not_run(tmp_path, capsys):
@@ -87,6 +87,32 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
         "generate-torsion-exact-training"
     ]
     assert str(tmp_path / "trainings/torsion-exact/force/model") in last.arguments
+
+
+def test_a_training_waits_for_the_one_whose_model_it_starts_from(tmp_path):
+    folder = ROOT / "models/recipes/impulse-as-published"
+    recipes = [folder / f"{name}.toml" for name in ("total-mass-kicks", "total-mass", "through")]
+    jobs = {job.name: job for job in make.plan(tmp_path, recipes, [], OPTIONS)}
+    data = jobs["generate-impulse-as-published-training"]
+    first, further = (jobs[f"train-impulse-as-published-{r.stem}"] for r in recipes[1::-1])
+    assert (first.after, further.after) == ([data], [data, first])
+    alone = make.plan(tmp_path, recipes[:1], [], OPTIONS)
+    assert [list(job.after) for job in alone if job.queue == "train"] == [[alone[0]]]
+
+
+def test_commands_run_in_the_folder_of_the_work(tmp_path, monkeypatch):
+    started = []
+
+    class Told:
+        def __init__(self, *arguments, cwd, **others):
+            started.append(cwd)
+
+        def poll(self):
+            return 0
+
+    monkeypatch.setattr(make.subprocess, "Popen", Told)
+    assert machine(tmp_path).run([make.Job("told", [], [], "evaluate")])
+    assert started == [tmp_path]
 
 
 def test_data_that_are_there_are_not_generated(tmp_path):

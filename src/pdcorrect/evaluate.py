@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pdcorrect import metrics
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
@@ -98,7 +98,7 @@ class Comparison:
     Attributes
     ----------
     rows : tuple of Row
-        In the order coarse to fine.
+        In the order coarse to fine, without cases that failed.
     runs : dict of str to Trajectory
         Each case on its own mesh.
     on_coarse : dict of str to Trajectory
@@ -114,6 +114,8 @@ class Comparison:
         minimise the same energy, so this is solver error, unless the body
         buckles and they take different branches.  None without both, or if a
         frame needed a fallback.
+    failures : dict of str to str
+        Of cases whose rollout did not come to its end, by label: why.
     """
 
     scene: Scene
@@ -124,6 +126,7 @@ class Comparison:
     solver_error: float | None
     cases: tuple[Case, ...] = ()
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    failures: Mapping[str, str] = field(default_factory=dict)
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance from the reference in each frame, by label, m."""
@@ -237,6 +240,13 @@ def compare(
         The first is the reference.
     on_step : callable, optional
         For progress.
+
+    Raises
+    ------
+    InputError
+        If there are no cases, or two of one label, or a model does not fit the scene.
+    ConvergenceError
+        If a step of the reference fails.  Another case that fails is among ``failures``.
     """
     if not cases:
         raise InputError("cases is empty: expected at least the reference.")
@@ -244,20 +254,25 @@ def compare(
     if len(set(labels)) < len(labels):
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
     coarse = discretise(scene)
-    runs, on_coarse, setup = {}, {}, {}
+    runs, on_coarse, setup, failures = {}, {}, {}, {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
         started = time.perf_counter()
         stepper = case_stepper(scene, case)
         setup[case.label] = time.perf_counter() - started
-        runs[case.label] = rollout(
-            stepper, frames, on_step=_progress(on_step, case.label), on_failure="raise"
-        )
-        on_coarse[case.label] = restrict(runs[case.label], to=coarse)
+        try:
+            run = rollout(stepper, frames, on_step=_progress(on_step, case.label))
+        except ConvergenceError as error:
+            if case is cases[0]:
+                raise
+            failures[case.label] = str(error)
+            continue
+        runs[case.label], on_coarse[case.label] = run, restrict(run, to=coarse)
     truth = on_coarse[cases[0].label]
-    base = next((on_coarse[c.label] for c in cases[::-1] if c.plain and c.solver == "pd"), None)
+    complete = tuple(case for case in cases if case.label in runs)
+    base = next((on_coarse[c.label] for c in complete[::-1] if c.plain and c.solver == "pd"), None)
     rows = []
     for case in sorted(
-        cases, key=lambda c: (c.refine, c.better, bool(c.mass_of), c.solver != "pd")
+        complete, key=lambda c: (c.refine, c.better, bool(c.mass_of), c.solver != "pd")
     ):
         run, here = runs[case.label], on_coarse[case.label]
         has_base = base is not None and metrics.mean_squared_error(base, truth) > 0
@@ -279,8 +294,8 @@ def compare(
             )
         )
     return Comparison(
-        scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(cases, runs), cases,
-        {case.label: _about(case.model) for case in cases if case.model},
+        scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
+        {case.label: _about(case.model) for case in cases if case.model}, failures,
     )  # fmt: skip
 
 

@@ -44,6 +44,8 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 f"{row.iterations_a_frame:.1f}",
             )
         )
+    rest = ("",) * (len(HEADINGS) - 3)
+    lines += [(label, "", "failed", *rest) for label in comparison.failures]
     return lines
 
 
@@ -69,6 +71,10 @@ def notes(comparison: Comparison) -> list[str]:
         f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
         "Newton. "
         "'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2).",
+    ]
+    out += [
+        f"{label} failed and has no errors or times: {why}"
+        for label, why in comparison.failures.items()
     ]
     lost = _lost_share(comparison.runs[comparison.reference])
     if lost is not None:
@@ -174,6 +180,7 @@ def to_json(comparison: Comparison) -> str:
         "notes": notes(comparison),
         "cases": [dataclasses.asdict(case) for case in comparison.cases],
         "models": dict(comparison.models),
+        "failures": dict(comparison.failures),
         "rows": rows,
         "environment": environment(),
     }
@@ -250,7 +257,8 @@ def overlaid_labels(comparison: Comparison) -> list[str]:
     What is near it is the nearest corrector or better coarse model; without any, the nearest finer
     mesh.  Runs that the comparison does not have are left out.
     """
-    cases, errors = comparison.cases, {row.label: row.rms_error for row in comparison.rows}
+    errors = {row.label: row.rms_error for row in comparison.rows}
+    cases = [case for case in comparison.cases if case.label in errors]
     plain = [c.label for c in cases if c.plain and c.solver == "pd"]
     finer = [c.label for c in cases if c.refine > 1 and c.label != comparison.reference]
     better = [

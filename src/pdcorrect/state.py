@@ -1,7 +1,7 @@
 """What is passed around: `State`, `StepResult`, `Trajectory`.
 
 A stepper is anything that maps a state to a `StepResult`; projective dynamics,
-Newton and (later) the corrected solver are interchangeable because of it.
+Newton and the corrected solver are interchangeable because of it.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ FINEST = {"as-published": 4, "exact": 8}
 TOLERANCES = (1e-2, 1e-3, 1e-6)
 """Of the coarse cell size, beside the scene's own."""
 MODELS: Mapping[tuple[str, str], Sequence[str]] = {
-    ("impulse", "as-published"): ("impulse-as-published",),
+    ("impulse", "as-published"): ("impulse-as-published", "impulse-as-published-total-mass"),
     ("impulse", "exact"): ("impulse-exact",),
     ("stretch", "as-published"): ("stretch-as-published", "stretch-as-published-total-mass"),
     ("stretch", "exact"): ("stretch-exact",),

@@ -12,8 +12,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Literal, Protocol
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem.conjugate_gradients import NotPositiveDefinite as NotPositiveDefinite
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.machine import total_memory
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
@@ -250,19 +250,6 @@ def factor_bytes(size: int, unknowns: int = 1) -> float:
     factor_size).
     """
     return 12.0 * 12.0 * (size / unknowns) ** (4 / 3) * unknowns**2
-
-
-def total_memory() -> float:
-    """Bytes of the machine, or of the control group if less.
-
-    Not what happens to be free: a run that is resumed has to make the same choices.
-    """
-    limits = [float("inf")]
-    with suppress(OSError, ValueError, AttributeError):
-        limits.append(float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")))
-    with suppress(OSError, ValueError):
-        limits.append(float(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min(limits)
 
 
 _REDIRECTION = threading.Lock()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +22,7 @@ from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
 from pdcorrect.fem.selection import Selector
+from pdcorrect.machine import total_memory
 from pdcorrect.scene import Load, MeshFile, Scene
 from pdcorrect.state import State
 
@@ -287,16 +287,13 @@ def _coarse_mesh(scene: Scene, refine: int, given: HexMesh | None) -> HexMesh:
 
 def _check_size(scene: Scene, cells: int, refine: int) -> None:
     """Refuse meshes that cannot fit into the memory of the machine, before it is filled."""
-    try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # not on every system
-        return
-    most = memory // (_LEAST_BYTES * (8 if scene.solver.element == "hex27" else 1))
-    if memory > 0 and cells * refine**3 > most:
+    memory = total_memory()
+    most = memory / (_LEAST_BYTES * (8 if scene.solver.element == "hex27" else 1))
+    if cells * refine**3 > most:
         raise SceneError(
             f"body: {cells} cells, {cells * refine**3} with refine = {refine}: expected at most "
-            f"{most} in the {memory / 1e9:.3g} GB of this machine's memory. Use larger cells or "
-            "a smaller refine."
+            f"{most:.0f} in the {memory / 1e9:.3g} GB of memory that this program may use. Use "
+            "larger cells or a smaller refine."
         )
 
 

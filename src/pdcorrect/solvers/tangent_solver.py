@@ -18,11 +18,11 @@ from pdcorrect.fem.factorisation import (
     Factor,
     NotPositiveDefinite,
     factorise,
-    total_memory,
 )
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.problem import Problem
+from pdcorrect.machine import total_memory
 from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]
