@@ -2,22 +2,22 @@
 
 python models/add_first_steps.py MODEL DATASET/config.toml [--steps 1] [--device cuda] [--batch 60]
 
-Trainings fit ranges to the first steps of all simulations and to a sample of the others
-(`pdcorrect.training.fitting`), those before 2026-11-23 to the sample only.  What follows a kick
-within few steps is rare in it.  The loads of the training split are drawn as `pdcorrect dataset
-generate` does it first, and the corrected coarse model takes so many steps from rest, without a
-gate: among them loads that were rejected then, which the model has not seen.  That takes no
-reference; scenes in which a step fails are left out.  The model is replaced by itself with these
-ranges.
+Trainings fit ranges to the first steps of all simulations and to a sample of the others, in which
+what follows a kick is rare (`pdcorrect.training.fitting`), early ones to the sample only.  This
+adds first steps, or more of them, without data.  The loads of the training split are drawn as
+`pdcorrect dataset generate` does it first, and the corrected coarse model takes so many steps from
+rest: among them loads that were rejected then, which the model has not seen.  That takes no
+reference; scenes in which a step fails, or a correction that the gate refuses by its answer, are
+left out.  The model is replaced by itself with these ranges.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
-import torch
-from first_steps import scenes_of
+from first_steps import scenes_of, seen_in_rollouts
 
 import pdcorrect as pc
 from pdcorrect.corrector import features
@@ -25,7 +25,9 @@ from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
 from pdcorrect.corrector.model_io import LoadedModel, model_folder
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
-from pdcorrect.evaluation.rollouts import roll_out
+
+ANSWERS_ONLY = pc.Gate(margin=None, average=None)
+"""Refuses no inputs, for it is these that are to be known."""
 
 
 def main() -> None:
@@ -37,53 +39,50 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--batch", type=int, default=60, help="scenes at once")
     options = parser.parse_args()
+    if options.steps < 1:
+        parser.error("--steps: expected one step or more.")
     folder = model_folder(options.model)
     model = pc.load_model(folder)
     model.corrector.to(options.device)
     config = DatasetConfig.load(options.config)
     count = add_first_steps(model, config, options.steps, options.device, options.batch)
-    model.record.training["first_steps"] = {"dataset": config.name, "steps": count}
+    if count == 0:
+        raise SystemExit(f"{folder}: no scene without a failure, nothing was changed.")
+    model.record.training["first_steps"] = {
+        "dataset": config.name, "simulations": count, "steps": options.steps,
+    }  # fmt: skip
     print(pc.save_model(model.corrector, folder, record=model.record))
 
 
-@torch.no_grad()
 def add_first_steps(
     model: LoadedModel, config: DatasetConfig, steps: int, device: str, batch: int
 ) -> int:
-    """Widen a model's ranges by ``steps`` steps of each training scene; by how many in all."""
-    corrector, config_of = model.corrector, model.corrector.config
-    tables = (NODE_FEATURES, config_of.node_features), (EDGE_FEATURES, config_of.edge_features)
+    """Widen a model's ranges by ``steps`` steps of each training scene; by how many scenes."""
+    corrector, architecture = model.corrector, model.corrector.config
     inputs, averages = {name: Moments() for name in corrector.normaliser.names}, Moments()
-    answer, seen = corrector.of_view, []
-
-    def watched(view: View) -> torch.Tensor:
-        found = [features.values(table, names, view) for table, names in tables]
-        seen.append((view, found, view.bodies.body_means(corrector.inputs(view)[0])))
-        return answer(view)
-
-    corrector.of_view = watched  # type: ignore[method-assign]
     scenes = scenes_of(config, TRAINING)
     count = 0
+
+    def look(view: View) -> tuple[Any, ...]:
+        of_nodes = features.values(NODE_FEATURES, architecture.node_features, view)
+        of_edges = features.values(EDGE_FEATURES, architecture.edge_features, view)
+        return view, of_nodes, of_edges, view.bodies.body_means(corrector.inputs(view)[0])
+
     for first in range(0, len(scenes), batch):
-        seen.clear()
         some = scenes[first : first + batch]
-        stepper = pc.BatchStepper(
-            [pc.coarse_model(scene, model.base, refine) for scene, refine in some], device=device
-        )
-        hybrid = pc.BatchHybrid(stepper, corrector, velocity=model.velocity)
-        runs = roll_out(hybrid, stepper, [steps] * len(some))
-        whole = torch.tensor([run.failed is None for run in runs], device=stepper.device)
-        for view, (of_nodes, of_edges), means in seen:
+        problems = [pc.coarse_model(scene, model.base, refine) for scene, refine in some]
+        seen, whole = seen_in_rollouts(model, problems, steps, device, look, ANSWERS_ONLY)
+        for view, of_nodes, of_edges, means in seen:
             at_nodes = view.bodies.by_node(whole)
             for values, rows in ((of_nodes, at_nodes), (of_edges, at_nodes[view.receiver])):
                 for name, value in values.items():
                     inputs[name].add(value[rows])
             averages.add(means[whole])
-        count += steps * int(whole.sum())
-        print(f"{first + len(some)} of {len(scenes)}", flush=True)
-    del corrector.of_view
-    corrector.normaliser.widen(inputs)
-    corrector.normaliser.widen_averages(averages)
+        count += int(whole.sum())
+        print(f"{count} of {first + len(some)}, {len(scenes)} in all", flush=True)
+    if count:
+        corrector.normaliser.widen(inputs)
+        corrector.normaliser.widen_averages(averages)
     return count
 
 

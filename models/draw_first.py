@@ -61,6 +61,8 @@ def draw(name: str, output: Path, frames: int | None) -> dict[str, Any]:
     cases = tuple(c for c in every if c == every[0] or c.model or (c.plain and c.refine == 1))
     cases = tuple(c for c in cases if c.solver == "pd")
     found = compare(draw_scene(config, plan, 0), frames or plan.frames, cases)
+    if found.failures:
+        raise SystemExit(f"{name}: " + "; ".join(map(" ".join, found.failures.items())))
     (corrected,) = found.models
     labels = [found.reference, corrected, next(c.label for c in cases if c.plain)]
     runs = {

@@ -17,7 +17,7 @@ import json
 from pathlib import Path
 
 import torch
-from first_steps import scenes_of
+from first_steps import scenes_of, seen_in_rollouts
 from safetensors.torch import load_file
 
 import pdcorrect as pc
@@ -33,7 +33,6 @@ from pdcorrect.corrector.model_io import (
 )
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
-from pdcorrect.evaluation.rollouts import roll_out
 
 _AVERAGES = "normaliser.average_"
 
@@ -76,25 +75,18 @@ def averages_of(
     scenes = scenes_of(config, TRAINING, loads=1)
     problems = [pc.coarse_model(scene, model.base, refine) for scene, refine in scenes]
     problems.sort(key=lambda problem: len(problem.positions))
-    corrector, averages, bodies = model.corrector, Moments(), 0
-    answer, seen = corrector.of_view, []
+    averages, bodies = Moments(), 0
 
-    def watched(view: View) -> torch.Tensor:
-        seen.append(view.bodies.body_means(corrector.inputs(view)[0]))
-        return answer(view)
+    def means(view: View) -> torch.Tensor:
+        return view.bodies.body_means(model.corrector.inputs(view)[0])
 
-    corrector.of_view = watched  # type: ignore[method-assign]
     for first in range(0, len(problems), batch):
-        seen.clear()
-        stepper = pc.BatchStepper(problems[first : first + batch], device=device)
-        hybrid = pc.BatchHybrid(stepper, corrector, velocity=model.velocity)
-        runs = roll_out(hybrid, stepper, [config.frames] * len(stepper.node_counts))
-        whole = [k for k, run in enumerate(runs) if run.failed is None]
-        for means in seen:
-            averages.add(means[whole])
-        bodies += len(whole)
-        print(f"{first + len(runs)} of {len(problems)}", flush=True)
-    del corrector.of_view
+        some = problems[first : first + batch]
+        seen, whole = seen_in_rollouts(model, some, config.frames, device, means)
+        for found in seen:
+            averages.add(found[whole])
+        bodies += int(whole.sum())
+        print(f"{first + len(some)} of {len(problems)}", flush=True)
     return averages, bodies
 
 

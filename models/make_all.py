@@ -15,8 +15,8 @@ released model, which is evaluated only, beside what is trained for its data set
 Data are generated in the order of the recipes, unless ``--generators 0`` says that they are
 there.  Each training begins as soon as its data are there, several at a time on each GPU, or, if
 it starts from what another recipe makes (``start_from = "trainings/DATASET/NAME/model"``), when
-that has ended; a data set's models are evaluated when all its trainings have.  Commands run in
-WORK.  Trainings that are still
+that has ended by itself; a data set's models are evaluated when all its trainings have.  Commands
+run in WORK.  Trainings that are still
 running after ``--seconds`` are stopped; their best models so far are evaluated, and the next
 start goes on with them.
 """
@@ -63,6 +63,13 @@ class Job:
         Jobs of one queue wait for a place in it.
     until : float or None
         `time.time` at which the command is to stop by itself.
+    starts_from : Job or None
+        Training whose model it begins with.  It has to have ended, not only stopped: its model
+        would change when it goes on.
+    models : sequence of Path
+        To be evaluated; those that are there when it starts are put after the command's name.
+    replaces : Path or None
+        Folder that is removed when it starts.
     """
 
     name: str
@@ -70,6 +77,9 @@ class Job:
     after: Sequence[Job]
     queue: str
     until: float | None = None
+    starts_from: Job | None = None
+    models: Sequence[Path] = ()
+    replaces: Path | None = None
     status: int | None = None
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
     gpu: str | None = None
@@ -124,6 +134,9 @@ class Machine:
             return False
         if any(j.status is None for j in job.after):
             return False
+        if job.starts_from is not None and job.starts_from.status != 0:
+            job.status = job.starts_from.status
+            return False
         places = self._places[job.queue] * (max(1, len(self._gpus)) if job.queue == "train" else 1)
         return sum(1 for _ in self._running(job.queue, jobs)) < places
 
@@ -138,9 +151,13 @@ class Machine:
             job.gpu = min(self._gpus, key=busy.count)
             environment["CUDA_VISIBLE_DEVICES"] = job.gpu
         limit = [] if job.until is None else ["--seconds", str(max(0.0, job.until - time.time()))]
+        if job.replaces is not None:
+            shutil.rmtree(job.replaces, ignore_errors=True)
+        name, *options = job.arguments
+        models = [str(model) for model in job.models if model.is_dir()]
         with (self._logs / f"{job.name}.log").open("ab") as log:
             job.process = subprocess.Popen(
-                [sys.executable, "-m", "pdcorrect.cli", *job.arguments, *limit],
+                [sys.executable, "-m", "pdcorrect.cli", name, *models, *options, *limit],
                 stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=self._folder,
             )  # fmt: skip
 
@@ -154,6 +171,8 @@ def plan(
 ) -> list[Job]:
     """All jobs for some recipes and released models."""
     until = None if options.seconds is None else time.time() + options.seconds
+    starts = {recipe: TrainingConfig.load(recipe).start_from for recipe in recipes}
+    _refuse_circles({_output(work, r) / MODEL: work / (starts[r] or "") for r in recipes})
     known = {model: load_model(HERE / model).record.dataset for model in released}
     names = list(dict.fromkeys([*(recipe.parent.name for recipe in recipes), *known.values()]))
     learnt = {recipe.parent.name for recipe in recipes}
@@ -170,15 +189,20 @@ def plan(
                 before[name] = [_generation(work, name, (split,), options, before[name])]
                 jobs += before[name]
             judged[name, split] = before[name]
+    trainings = {
+        _output(work, recipe) / MODEL: _training(work, recipe, ready, until, options)
+        for recipe in recipes
+    }
+    for job, recipe in zip(trainings.values(), recipes, strict=True):
+        job.starts_from = trainings.get(work / (starts[recipe] or ""))
     for name in names:
-        own = [recipe for recipe in recipes if recipe.parent.name == name]
-        trainings = [_training(work, recipe, ready[name], until, options) for recipe in own]
-        _put_after_what_they_start_from(work, own, trainings)
-        models = [work / "trainings" / name / recipe.stem / MODEL for recipe in own]
-        models += [HERE / model for model in released if known[model] == name]
-        jobs += trainings
+        folder = work / "trainings" / name
+        own = [model for model in trainings if folder in model.parents]
+        models = own + [HERE / model for model in released if known[model] == name]
+        each = [trainings[model] for model in own]
+        jobs += each
         jobs += [
-            _evaluation(work, name, split, models, [*trainings, *judged[name, split]], options)
+            _evaluation(work, name, split, models, [*each, *judged[name, split]], options)
             for split in options.split
         ]
     return jobs
@@ -190,13 +214,12 @@ def _evaluation(
 ) -> Job:  # fmt: skip
     label = name if split == EVALUATION else f"{name}-{split}"
     output = work / "evaluations" / label
-    shutil.rmtree(output, ignore_errors=True)
     arguments = [
-        "evaluate", *map(str, models), str(work / "data" / name), "--split", split,
+        "evaluate", str(work / "data" / name), "--split", split,
         "--device", options.device, "--batch", "100", "--workers", str(options.measurers),
         "-o", str(output), "--no-figures",
     ]  # fmt: skip
-    return Job(f"evaluate-{label}", arguments, after, "evaluate")
+    return Job(f"evaluate-{label}", arguments, after, "evaluate", models=models, replaces=output)
 
 
 def _generation(
@@ -213,30 +236,32 @@ def _generation(
     )  # fmt: skip
 
 
+def _output(work: Path, recipe: Path) -> Path:
+    """Of a training."""
+    return work / "trainings" / recipe.parent.name / recipe.stem
+
+
 def _training(
-    work: Path, recipe: Path, data: Sequence[Job], until: float | None, options: argparse.Namespace
-) -> Job:
+    work: Path, recipe: Path, ready: dict[str, list[Job]], until: float | None,
+    options: argparse.Namespace,
+) -> Job:  # fmt: skip
     name = recipe.parent.name
-    output = work / "trainings" / name / recipe.stem
     arguments = [
-        "train", str(recipe), "--data", str(work / "data" / name), "-o", str(output),
-        "--device", options.device, "--resume",
+        "train", str(recipe), "--data", str(work / "data" / name),
+        "-o", str(_output(work, recipe)), "--device", options.device, "--resume",
     ]  # fmt: skip
-    return Job(f"train-{name}-{recipe.stem}", arguments, data, "train", until)
+    return Job(f"train-{name}-{recipe.stem}", arguments, ready[name], "train", until)
 
 
-def _put_after_what_they_start_from(
-    work: Path, recipes: Sequence[Path], trainings: Sequence[Job]
-) -> None:
-    """Have trainings of one data set wait for those whose models they start from."""
-    made = {
-        work / "trainings" / recipe.parent.name / recipe.stem / MODEL: job
-        for recipe, job in zip(recipes, trainings, strict=True)
-    }
-    for recipe, job in zip(recipes, trainings, strict=True):
-        start = TrainingConfig.load(recipe).start_from
-        if start is not None and work / start in made:
-            job.after = [*job.after, made[work / start]]
+def _refuse_circles(starts: dict[Path, Path]) -> None:
+    """Refuse recipes that wait for each other; ``starts`` has what each model starts from."""
+    for model in starts:
+        before, seen = starts[model], {model}
+        while before in starts:
+            if before in seen:
+                raise SystemExit(f"{model}: starts from what starts from it: expected a beginning.")
+            seen.add(before)
+            before = starts[before]
 
 
 def main() -> None:

@@ -185,29 +185,33 @@ def test_compare_writes_its_report(program, tmp_path):
         assert f"| {label} |" in text
 
 
-@pytest.mark.parametrize("failing", ["coarse PD", "intermediate PD", "fine PD"])
+def failing_after_a_step(monkeypatch, kind, nodes):
+    """Have steppers of a class fail in their second step on meshes of so many nodes."""
+    step = kind.__call__
+
+    def fails_second(self, state, *others, **named):
+        result = step(self, state, *others, **named)
+        if len(state.positions) in nodes and state.time > 0.0:
+            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
+        return result
+
+    monkeypatch.setattr(kind, "__call__", fails_second)
+
+
+def nodes_of(scene, refine):
+    return len(pc.discretise(scene, refine).positions)
+
+
+@pytest.mark.parametrize("failing", ["coarse PD", "intermediate PD"])
 def test_compare_goes_on_after_a_case_that_fails(
     program, scene_file, tmp_path, monkeypatch, failing
 ):
     refine = {case.label: case.refine for case in pc.evaluate.CASES}[failing]
-    nodes = len(pc.discretise(pc.Scene.load(scene_file), refine).positions)
-    step = pc.ProjectiveDynamics.__call__
-
-    def fails_second(self, state, *others):
-        result = step(self, state, *others)
-        if len(state.positions) == nodes and state.time > 0.0:
-            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
-        return result
-
-    monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_second)
+    nodes = nodes_of(pc.Scene.load(scene_file), refine)
+    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes})
     folder = tmp_path / "report"
     status, out, err = program("compare", scene_file, "-o", folder)
-    if failing == "fine PD":  # the reference: nothing is left to be said
-        assert status == cli.FAILED
-        assert "frame 2 (t = 0.02 s) failed" in err
-        assert not (folder / "report.md").exists()
-        return
-    assert status == 0
+    assert (status, err) == (cli.FAILED, "")
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     others = ["coarse PD", "coarse Newton", "intermediate PD", "fine PD"]
     assert list(rows) == [label for label in others if label != failing]
@@ -218,7 +222,44 @@ def test_compare_goes_on_after_a_case_that_fails(
     assert f"| {failing} |  | failed |" in text
     for told in (text, " ".join(out.split())):
         assert f"{failing} failed and has no errors or times: frame 2" in told
+        assert ("'Corrected' is" in told) == (failing != "coarse PD")  # whose error is its zero
     assert (folder / "comparison.png").stat().st_size > 5000
+
+
+def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, monkeypatch):
+    nodes = nodes_of(pc.Scene.load(scene_file), 4)
+    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes})
+    status, _, err = program("compare", scene_file, "-o", tmp_path / "report")
+    assert status == cli.FAILED
+    assert "frame 2 (t = 0.02 s) failed" in err
+    assert not (tmp_path / "report" / "report.md").exists()
+
+
+def test_a_report_of_a_reference_alone_has_no_plots_of_errors(tmp_path, monkeypatch):
+    scene = beam((4, 2, 1), time={"frames": 2})
+    coarse = {nodes_of(scene, refine) for refine in (1, 2)}
+    for kind in (pc.ProjectiveDynamics, pc.Newton):
+        failing_after_a_step(monkeypatch, kind, coarse)
+    found = pc.compare(scene)
+    assert [row.label for row in found.rows] == ["fine PD"]
+    assert list(found.failures) == ["coarse Newton", "coarse PD", "intermediate PD"]
+    text = report.write_report(found, tmp_path).read_text()
+    assert "](comparison.png)" in text
+    assert "](error_" not in text
+    assert not list(tmp_path.glob("error_*.png"))
+
+
+def test_a_case_that_cannot_be_set_up_has_failed(monkeypatch):
+    scene = beam((2, 1, 1), time={"frames": 1})
+    make = pc.evaluate.case_stepper
+
+    def refuses(scene, case):
+        if case.solver == "newton":
+            raise pc.errors.ConvergenceError("no factor.")
+        return make(scene, case)
+
+    monkeypatch.setattr(pc.evaluate, "case_stepper", refuses)
+    assert pc.compare(scene).failures == {"coarse Newton": "no factor."}
 
 
 def test_compare_without_figures_needs_no_view_extra(program, scene_file, tmp_path, monkeypatch):

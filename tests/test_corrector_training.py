@@ -451,24 +451,6 @@ def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers)
     assert outside(others).any()  # so few windows do not hold all of the rest
 
 
-def test_steps_that_follow_the_first_ones_are_within_the_ranges_too(folder):
-    settings = samples.config(samples.one_step())
-    windows, _ = samples.windows(folder, settings)
-    corrector = samples.fitted(folder, settings)
-    _, _, steps = windows.dataset.places(range(len(windows.dataset)))
-    early, later = np.flatnonzero(steps < 8), np.flatnonzero(steps == 10)
-    fit_normaliser(corrector, windows, len(early))
-
-    def view(numbers):
-        batch = windows.batch(numbers.tolist())
-        return View(batch.bodies, batch.snapshot)
-
-    assert not corrector.outside(view(early), 0.0).any()
-    assert (corrector.unlike(view(early)) <= 3.5 + 1e-6).all()
-    fit_normaliser(corrector, windows, 1)
-    assert corrector.outside(view(later), 0.0).any()  # one window more of all does not hold them
-
-
 # --- steps of the optimiser --------------------------------------------------------------
 
 

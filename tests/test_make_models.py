@@ -86,18 +86,70 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
     assert [job.name for job in jobs["train-torsion-exact-plain"].after] == [
         "generate-torsion-exact-training"
     ]
-    assert str(tmp_path / "trainings/torsion-exact/force/model") in last.arguments
+    assert tmp_path / "trainings/torsion-exact/force/model" in last.models
 
 
 def test_a_training_waits_for_the_one_whose_model_it_starts_from(tmp_path):
     folder = ROOT / "models/recipes/impulse-as-published"
     recipes = [folder / f"{name}.toml" for name in ("total-mass-kicks", "total-mass", "through")]
     jobs = {job.name: job for job in make.plan(tmp_path, recipes, [], OPTIONS)}
-    data = jobs["generate-impulse-as-published-training"]
-    first, further = (jobs[f"train-impulse-as-published-{r.stem}"] for r in recipes[1::-1])
-    assert (first.after, further.after) == ([data], [data, first])
+    further, first, other = (jobs[f"train-impulse-as-published-{r.stem}"] for r in recipes)
+    assert further.starts_from is first
+    assert first.starts_from is other.starts_from is None
     alone = make.plan(tmp_path, recipes[:1], [], OPTIONS)
-    assert [list(job.after) for job in alone if job.queue == "train"] == [[alone[0]]]
+    assert [job.starts_from for job in alone] == [None] * 4
+
+
+@pytest.mark.parametrize(("status", "begins"), [(0, True), (make.STOPPED, False), (2, False)])
+def test_a_training_begins_with_a_finished_model_only(tmp_path, status, begins):
+    first = make.Job("first", FINE, [], "train", status=status)
+    further = make.Job("further", FINE, [], "train", starts_from=first)
+    evaluation = make.Job("evaluation", FINE, [first, further], "evaluate")
+    assert machine(tmp_path).run([further, first, evaluation]) == begins
+    assert (further.process is not None) == begins
+    assert further.status == status
+    assert (evaluation.process is not None) == (status != 2)
+
+
+def recipe(folder, name, start):
+    path = folder / "tiny" / f"{name}.toml"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(
+        f'start_from = "trainings/tiny/{start}/model"\n'
+        '[[stages]]\nkind = "one-step"\niterations = 3\n'
+    )
+    return path
+
+
+def test_recipes_that_start_from_each_other_are_refused(tmp_path):
+    recipes = [recipe(tmp_path, *names) for names in (("a", "b"), ("b", "c"), ("c", "b"))]
+    with pytest.raises(SystemExit, match="starts from what starts from it"):
+        make.plan(tmp_path, recipes, [], OPTIONS)
+    with pytest.raises(SystemExit, match="starts from what starts from it"):
+        make.plan(tmp_path, [recipe(tmp_path, "own", "own")], [], OPTIONS)
+
+
+def test_an_evaluation_takes_the_models_that_are_there(tmp_path, monkeypatch):
+    called = []
+
+    class Called:
+        def __init__(self, command, **others):
+            called.append(command)
+
+        def poll(self):
+            return 0
+
+    monkeypatch.setattr(make.subprocess, "Popen", Called)
+    there, output = tmp_path / "there", tmp_path / "evaluations"
+    for folder in (there, output):
+        folder.mkdir()
+    job = make.Job(
+        "evaluation", ["evaluate", "data"], [], "evaluate",
+        models=[there, tmp_path / "not"], replaces=output,
+    )  # fmt: skip
+    assert machine(tmp_path).run([job])
+    assert called[0][-3:] == ["evaluate", str(there), "data"]
+    assert not output.exists()
 
 
 def test_commands_run_in_the_folder_of_the_work(tmp_path, monkeypatch):
@@ -141,7 +193,7 @@ def test_released_models_are_evaluated_and_nothing_is_trained_for_them(tmp_path)
     ]
     assert [list(job.after) for job in chain] == [[], [chain[0]], [chain[1]]]
     last = jobs["evaluate-torsion-exact-other-family"]
-    models = [Path(a).parts[-2:] for a in last.arguments[1:4]]
+    models = [path.parts[-2:] for path in last.models]
     assert models == [("force", "model"), ("models", "torsion-exact"),
                       ("models", "torsion-exact-compact")]  # fmt: skip
     assert list(last.after) == [jobs["train-torsion-exact-force"], chain[2]]

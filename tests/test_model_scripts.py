@@ -100,7 +100,8 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
     assert all(
         name.endswith(("__low", "__high", "average_low", "average_high")) for name in changed
     )
-    assert widened.record.training["first_steps"] == {"dataset": "tiny", "steps": 10}
+    told = {"dataset": "tiny", "simulations": 10, "steps": 1}
+    assert widened.record.training["first_steps"] == told
     command = [sys.executable, ROOT / "models" / "refused_first_steps.py"]
     pairs = [f"{narrow}={path}", f"{folder}={path}"]
     output = tmp_path / "record.json"

@@ -111,7 +111,8 @@ def compare(
     """Run coarse, intermediate and fine PD and Newton; report error and run time.
 
     With a corrector, the coarse model that it corrects is compared too; with one of the best
-    coarse model, the fine run has that model's element.
+    coarse model, the fine run has that model's element.  Exit status 1 if a solver failed; the
+    report then has the others, unless it was the fine run.
     """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
@@ -135,8 +136,13 @@ def compare(
     with progress_bar() as progress:
         tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases[::-1]}
 
+        begun: list[str] = []
+
         def on_step(label: str, frame: int, result: StepResult) -> None:
             if frame == 1:
+                for earlier in begun[-1:]:  # which may have failed
+                    progress.stop_task(tasks[earlier])
+                begun.append(label)
                 progress.start_task(tasks[label])
             progress.update(tasks[label], completed=frame)
 
@@ -153,6 +159,8 @@ def compare(
         _say("- " + note)
     _say("drawing the figures ..." if figures else "")
     _say(f"report: {report.write_report(comparison, output, draw=figures)}")
+    if comparison.failures:
+        raise typer.Exit(FAILED)
 
 
 @app.command()

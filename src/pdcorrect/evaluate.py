@@ -115,7 +115,7 @@ class Comparison:
         buckles and they take different branches.  None without both, or if a
         frame needed a fallback.
     failures : dict of str to str
-        Of cases whose rollout did not come to its end, by label: why.
+        Of cases that did not come to their end, by label: why.
     """
 
     scene: Scene
@@ -246,7 +246,7 @@ def compare(
     InputError
         If there are no cases, or two of one label, or a model does not fit the scene.
     ConvergenceError
-        If a step of the reference fails.  Another case that fails is among ``failures``.
+        If the reference fails.  Other cases that fail are among ``failures``.
     """
     if not cases:
         raise InputError("cases is empty: expected at least the reference.")
@@ -257,9 +257,9 @@ def compare(
     runs, on_coarse, setup, failures = {}, {}, {}, {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
         started = time.perf_counter()
-        stepper = case_stepper(scene, case)
-        setup[case.label] = time.perf_counter() - started
         try:
+            stepper = case_stepper(scene, case)
+            setup[case.label] = time.perf_counter() - started
             run = rollout(stepper, frames, on_step=_progress(on_step, case.label))
         except ConvergenceError as error:
             if case is cases[0]:

@@ -69,9 +69,12 @@ def notes(comparison: Comparison) -> list[str]:
         f"E = {effective.young:.6g} Pa and {effective.poisson:.4g} "
         f"(volume weight '{scene.material.volume_weight}').",
         f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
-        "Newton. "
-        "'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2).",
+        "Newton.",
     ]
+    if any(np.isfinite(row.omega) for row in comparison.rows):
+        out[-1] += (
+            " 'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2)."
+        )
     out += [
         f"{label} failed and has no errors or times: {why}"
         for label, why in comparison.failures.items()
@@ -211,7 +214,10 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 
 
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
-    """Bodies side by side and over each other, and four plots; returns their file names."""
+    """Bodies side by side and over each other, and plots; returns their file names.
+
+    No plot of errors where there is none but the reference's.
+    """
     runs = [comparison.runs[row.label] for row in comparison.rows]
     labels = [row.label for row in comparison.rows]
     truth = comparison.on_coarse[comparison.reference]
@@ -237,18 +243,17 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         runs, folder / "node.png", node_point=truth.points[node], labels=labels
     )
     figures.plot_energy(runs, folder / "energy.png", labels=labels)
-    figures.plot_error_over_time(
-        comparison.errors_over_time(), truth.times, folder / "error_over_time.png"
-    )
-    figures.plot_error_against_time(
-        {r.label: (r.seconds_a_frame, r.rms_error) for r in comparison.rows if r.rms_error > 0},
-        folder / "error_against_time.png",
-    )
-    names = (
-        "comparison.png", "overlay.png", "error_against_time.png", "error_over_time.png",
-        "node.png", "energy.png",
-    )  # fmt: skip
-    return [name for name in names if name != "overlay.png" or len(overlaid) > 1]
+    names = ["comparison.png", *(["overlay.png"] if len(overlaid) > 1 else [])]
+    if any(row.rms_error > 0 for row in comparison.rows):
+        names += ["error_against_time.png", "error_over_time.png"]
+        figures.plot_error_over_time(
+            comparison.errors_over_time(), truth.times, folder / "error_over_time.png"
+        )
+        figures.plot_error_against_time(
+            {r.label: (r.seconds_a_frame, r.rms_error) for r in comparison.rows if r.rms_error > 0},
+            folder / "error_against_time.png",
+        )
+    return [*names, "node.png", "energy.png"]
 
 
 def overlaid_labels(comparison: Comparison) -> list[str]:

@@ -43,7 +43,7 @@ Size alone does not decide: a step takes less time with multigrid for a block of
 (1 085), and more for a block of 2 197 (509) and a beam of 55 777 (923; case growth).
 """
 MEMORY_SHARE = 0.5
-"""Share of the machine's memory that a factor may be expected to take."""
+"""Share of the memory that may be used which a factor may be expected to take."""
 
 
 class Factor(Protocol):

@@ -16,8 +16,6 @@ from pdcorrect.training.windows import StepBatch, StepWindows
 
 _AT_ONCE = 32
 """Windows."""
-_EARLY = 8
-"""Steps with which a simulation begins: a kick and what follows it are rare among the others."""
 
 
 @torch.no_grad()
@@ -25,8 +23,8 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     """Set means, deviations, ranges and the output's scale from windows of one step.
 
     Inputs are what the network sees in a step from the reference, targets what it should
-    give there, on free components.  Ranges hold the first eight steps of simulations besides:
-    of a kick the first is the only one with its load, and the next ones are unlike all others.
+    give there, on free components.  Ranges hold the first steps of simulations besides: of a
+    kick, that is the only one with its load.
 
     Parameters
     ----------
@@ -35,13 +33,13 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
         Of the training split.
     most : int
         Windows; if there are more, so many are drawn without replacement by ``seed``.  The same
-        limit holds for first steps, and for those that follow them.
+        limit holds for first steps.
     """
     every = np.arange(len(windows.dataset))
     chosen = _chosen(every, most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
-    _add_first_steps(corrector, windows, most, seed)
+    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
 @torch.no_grad()
@@ -53,13 +51,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     """
     every = np.arange(len(windows.dataset))
     _widen(corrector, windows, _chosen(every, most, seed))
-    _add_first_steps(corrector, windows, most, seed)
-
-
-def _add_first_steps(corrector: Corrector, windows: StepWindows, most: int, seed: int) -> None:
-    """The first of each simulation as it is seen then, without a step before, and those after."""
-    _widen(corrector, windows, _chosen(_early(windows, 1), most, seed), last=False)
-    _widen(corrector, windows, _chosen(_early(windows, _EARLY), most, seed))
+    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
 def _widen(
@@ -69,11 +61,11 @@ def _widen(
     corrector.normaliser.widen_averages(_averages(corrector, windows, chosen, last))
 
 
-def _early(windows: StepWindows, count: int) -> NDArray[np.int64]:
-    """Numbers of the windows that begin in the first ``count`` steps of a simulation."""
+def _beginnings(windows: StepWindows) -> NDArray[np.int64]:
+    """Numbers of the windows with which simulations begin."""
     every = np.arange(len(windows.dataset))
     _, _, steps = windows.dataset.places(every)
-    return every[steps < count]
+    return every[steps == 0]
 
 
 def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
