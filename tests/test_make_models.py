@@ -163,7 +163,7 @@ def test_commands_run_in_the_folder_of_the_work(tmp_path, monkeypatch):
             return 0
 
     monkeypatch.setattr(make.subprocess, "Popen", Told)
-    assert machine(tmp_path).run([make.Job("told", [], [], "evaluate")])
+    assert machine(tmp_path).run([make.Job("told", FINE, [], "evaluate")])
     assert started == [tmp_path]
 
 
