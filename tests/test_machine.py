@@ -30,6 +30,7 @@ def system(root, groups, limits):
         ("4:cpu,memory:/\n0::/\n", {V1.format("."): "9223372036854771712\n"}, MACHINE),
         ("1:cpu:/jobs\n", {V1.format("jobs"): "1000\n"}, MACHINE),
         ("0::/\n", {V2.format("."): "\n"}, MACHINE),
+        ("no group\n0::/jobs\n", {V2.format("jobs"): "6000000\n"}, 6e6),
     ],
 )
 def test_the_least_limit_of_the_control_groups_counts(tmp_path, groups, limits, expected):

@@ -36,7 +36,8 @@ def _group_limits(root: Path) -> Iterator[Path]:
     mounted = root / "sys/fs/cgroup"
     groups = [":memory:/", "0::/"]
     with suppress(OSError, ValueError):
-        groups += (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+        lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
+        groups += [line for line in lines if line.count(":") >= 2]
     for group in groups:
         _, controllers, path = group.split(":", 2)
         if not controllers:
