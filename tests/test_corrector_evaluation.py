@@ -21,6 +21,7 @@ from pdcorrect.batch.states import BatchState  # noqa: E402
 from pdcorrect.cli import app  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
+from pdcorrect.corrector.gate import Gate  # noqa: E402
 from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
@@ -753,10 +754,10 @@ def test_the_gate_refuses_what_the_network_has_not_seen_unless_it_is_off(tmp_pat
     _, stepper = pair
     path = untrained(tmp_path / "model")
     rates = {}
-    for gate in (True, False):
+    for gate in (Gate(), None):
         (saved,) = saved_candidates([path], gate=gate)
         runs = roll_out(saved.candidate.hybrid(stepper), stepper, [2, 2])
-        rates[gate] = [run.refused.mean() for run in runs]
+        rates[gate is not None] = [run.refused.mean() for run in runs]
     assert rates == {True: [1.0, 1.0], False: [0.0, 0.0]}
 
 

@@ -21,6 +21,7 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
 from pdcorrect.corrector.features import View  # noqa: E402
+from pdcorrect.corrector.gate import Gate  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
@@ -1036,7 +1037,7 @@ def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
     assert "removed, %" in out
     summary = json.loads((tmp_path / "out" / "evaluation" / "summary.json").read_text())
     assert summary["data"]["split"] == "validation"
-    assert summary["gate"]
+    assert summary["gate"] == Gate().model_dump()
     assert [row["iteration"] for row in rows(tmp_path / "out") if row["loss"]] == ["1", "2", "3"]
     status, out, err = program(*call, "--resume")
     assert status == 0, err

@@ -131,7 +131,7 @@ def test_a_moved_data_set_is_trained_on_and_judged(moved, tmp_path):
     training = Training(settings, moved, tmp_path / "out")
     assert training.run()
     assert np.isfinite(training.progress.metrics["omega_mean"])
-    (saved,) = saved_candidates([tmp_path / "out" / "model"], gate=False)
+    (saved,) = saved_candidates([tmp_path / "out" / "model"], gate=None)
     runs = evaluate([saved.candidate], moved).runs
     assert len(runs) > 2
     assert all(np.isfinite(run.values("omega")[0]).all() for run in runs.values())

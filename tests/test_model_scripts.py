@@ -102,6 +102,15 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
     )
     told = {"dataset": "tiny", "simulations": 10, "steps": 1}
     assert widened.record.training["first_steps"] == told
+    more = tmp_path / "more"
+    shutil.copytree(folder, more)
+    changed = [sys.executable, ROOT / "models" / "add_first_steps.py", more, path]
+    subprocess.run([*changed, "--batch", "4", "--steps", "3"], check=True, capture_output=True)
+    after_more = pc.load_model(more)
+    assert after_more.record.training["first_steps"] == {**told, "steps": 3}
+    high = "normaliser.average_high"
+    assert (after_more.corrector.state_dict()[high] >= after[high]).all()
+    assert (after_more.corrector.state_dict()[high] > after[high]).any()
     command = [sys.executable, ROOT / "models" / "refused_first_steps.py"]
     pairs = [f"{narrow}={path}", f"{folder}={path}"]
     output = tmp_path / "record.json"
@@ -115,6 +124,23 @@ def test_first_steps_of_training_scenes_are_within_widened_ranges(tmp_path):
     rises = found[0]["rise_of_energy"]
     assert rises["corrected"] == found[1]["rise_of_energy"]["corrected"]  # without a gate
     assert -1.0 < rises["reference"]["most"] < 1.0  # best masses are right
+
+
+def test_scenes_in_which_the_gate_refuses_an_answer_are_left_out():
+    steps, model = script("first_steps"), pc.load_model(ROOT / "models" / "tiny")
+    config = DatasetConfig.load(ROOT / "datasets" / "tiny" / "config.toml")
+    scenes = steps.scenes_of(config, "training", loads=1)[:2]
+    problems = [pc.coarse_model(scene, model.base, refine) for scene, refine in scenes]
+
+    def rolled_out(gate):
+        return steps.seen_in_rollouts(model, problems, 3, "cpu", lambda v: v.bodies.bodies, gate)
+
+    seen, whole = rolled_out(None)
+    assert (seen, whole.tolist()) == ([2, 2, 2], [True, True])
+    nothing_passes = pc.Gate(margin=None, average=None, volume=10.0)
+    seen, whole = rolled_out(nothing_passes)
+    assert (seen, whole.tolist()) == ([2, 2, 2], [False, False])
+    assert "of_view" not in vars(model.corrector)
 
 
 def first_step(path):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 if TYPE_CHECKING:
+    from pdcorrect.corrector.gate import Gate
     from pdcorrect.evaluation.candidates import SavedCandidate
     from pdcorrect.evaluation.evaluation import Evaluation
 
@@ -50,7 +51,7 @@ def evaluate(
     from rich.console import Console
     from rich.progress import Progress
 
-    from pdcorrect.evaluation.candidates import saved_candidates
+    from pdcorrect.evaluation.candidates import DEFAULT_GATE, saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate as run
     from pdcorrect.evaluation.tables import write_evaluation
 
@@ -59,7 +60,8 @@ def evaluate(
         from pdcorrect.errors import require_extra
 
         require_extra("matplotlib", "view")
-    saved = saved_candidates(models, device, gate=gate)
+    refuses = DEFAULT_GATE if gate else None
+    saved = saved_candidates(models, device, gate=refuses)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("evaluating", total=None)
         found = run(
@@ -70,7 +72,7 @@ def evaluate(
     notes = _notes(saved, found)
     _print(found, notes, seed)
     if output:
-        record = _record(saved, folder, device, batch, gate, notes)
+        record = _record(saved, folder, device, batch, refuses, notes)
         written = write_evaluation(found, output, record, notes, seed)
         for path in [*written, *(_draw(found, output) if figures else [])]:
             typer.echo(f"wrote {path}")
@@ -125,7 +127,12 @@ def _print(found: Evaluation, notes: list[str], seed: int) -> None:
 
 
 def _record(
-    saved: list[SavedCandidate], folder: str, device: str, batch: int, gate: bool, notes: list[str]
+    saved: list[SavedCandidate],
+    folder: str,
+    device: str,
+    batch: int,
+    gate: Gate | None,
+    notes: list[str],
 ) -> dict[str, Any]:
     import datetime
 
@@ -138,7 +145,7 @@ def _record(
         "code_digest": code_digest(),
         "folder": folder,
         "batch": batch,
-        "gate": gate,
+        "gate": None if gate is None else gate.model_dump(),
         "models": {one.candidate.name: one.record() for one in saved},
         "notes": notes,
     }

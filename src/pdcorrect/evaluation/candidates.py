@@ -23,6 +23,7 @@ from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.evaluation.rollouts import Hybrid
 
+DEFAULT_GATE = Gate()
 _GROUP_DIGITS = 8
 
 
@@ -77,7 +78,7 @@ class SavedCandidate:
 
 
 def saved_candidates(
-    paths: Sequence[str | Path], device: str = "cpu", *, gate: bool = True
+    paths: Sequence[str | Path], device: str = "cpu", *, gate: Gate | None = DEFAULT_GATE
 ) -> list[SavedCandidate]:
     """Models by folder or name; they are called by the ends of their paths that tell them apart.
 
@@ -90,9 +91,8 @@ def saved_candidates(
     paths : sequence of str or path
         As of `load_model`.
     device : str
-    gate : bool
-        Whether corrections may be refused, as by `pdcorrect.corrector.gate.Gate` by default.
-        Those that are not finite are refused in any case.
+    gate : Gate or None
+        What else is refused than corrections that are not finite.
 
     Raises
     ------
@@ -105,14 +105,12 @@ def saved_candidates(
     return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
 
 
-def _saved(path: str | Path, name: str, device: str, gate: bool) -> SavedCandidate:
+def _saved(path: str | Path, name: str, device: str, gate: Gate | None) -> SavedCandidate:
     folder = model_folder(path)
     model = load_model(path, device)
 
     def hybrid(stepper: BatchStepper) -> Hybrid:
-        return BatchHybrid(
-            stepper, model.corrector, velocity=model.velocity, gate=Gate() if gate else None
-        )
+        return BatchHybrid(stepper, model.corrector, velocity=model.velocity, gate=gate)
 
     candidate = Candidate(name, model.base, hybrid, _group(model))
     return SavedCandidate(candidate, folder, model, weights_digest(folder))

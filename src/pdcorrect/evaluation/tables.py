@@ -19,7 +19,8 @@ from pdcorrect.evaluation.measures import TrajectoryMeasures
 from pdcorrect.evaluation.resampling import SeedSummary, Summary, over_seeds, summarise
 from pdcorrect.replacement import make_folder, write_text
 
-VERSION = 1
+VERSION = 2
+"""Of ``summary.json``; in 1, "gate" says only whether there was one."""
 SUMMARY, TRAJECTORIES, ERRORS, TABLE = "summary.json", "trajectories.csv", "errors.csv", "table.md"
 """Files of an evaluation."""
 
