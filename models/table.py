@@ -1,6 +1,9 @@
-"""Print the table of ``docs/results.md`` from records of evaluations; a test holds them equal.
+"""Print the tables of ``docs/results.md`` from records of evaluations; a test holds them equal.
 
 python models/table.py
+
+The first has models on unseen meshes of their evaluation splits, the second scenes unlike those
+of the training, with the default gate and without one.
 """
 
 from __future__ import annotations
@@ -11,7 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parents[1] / "validation" / "results"
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.plan import make_plan
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "validation" / "results"
 
 
 @dataclass(frozen=True)
@@ -52,15 +59,56 @@ HEADINGS = (
 )  # fmt: skip
 
 
+OTHERS = (
+    "other-family", "stiffer", "more-compressible", "stronger", "half-step", "double-step",
+    "half-refined",
+)  # fmt: skip
+"""Splits of the second table, in its order."""
+OTHER_HEADINGS = (
+    "model", "split", "simulations", "steps refused, %", "base alone: Ω mean",
+    "corrected: Ω mean, worst", "error over the base's: median, largest",
+    "without a gate: the same",
+)  # fmt: skip
+
+
 def main() -> None:
-    """Print it."""
+    """Print them."""
     print(table())
+    print()
+    print(others_table())
 
 
 def table() -> str:
     """The table in Markdown."""
     head = [_line(HEADINGS), _line(["---", "---", *["---:"] * (len(HEADINGS) - 2)])]
     return "\n".join([*head, *(_line(_cells(row)) for row in ROWS)])
+
+
+def others_table() -> str:
+    """The second table in Markdown."""
+    head = [_line(OTHER_HEADINGS), _line(["---", "---", *["---:"] * (len(OTHER_HEADINGS) - 2)])]
+    lines = []
+    for dataset in ("impulse-exact", "stretch-exact", "torsion-exact"):
+        plans = make_plan(DatasetConfig.load(ROOT / "datasets" / dataset / "config.toml"))
+        for split in OTHERS:
+            path = RESULTS / "other-scenes" / f"{dataset}-{split}.json"
+            if path.exists():
+                frames = next(plan.frames for plan in plans if plan.split == split)
+                record = json.loads(path.read_text(encoding="utf-8"))
+                lines.append(_line(_other_cells(record, dataset, split, frames)))
+    return "\n".join([*head, *lines])
+
+
+def _other_cells(record: dict[str, Any], model: str, split: str, frames: int) -> list[str]:
+    each = [row["models"][model] for row in record["simulations"]]
+    omega, harm = record["omega"][model], record["error_over_base"][model]
+    refused = sum(len(row["refused"]) for row in each) / (frames * len(each))
+    return [
+        f"`{model}`", split.replace("-", " "), f"{len(each)}", f"{100 * refused:.0f}",
+        _signed(f"{omega['own_base']['mean']:.1f}"),
+        _signed(f"{omega['with_gate']['mean']:.1f}, {omega['with_gate']['least']:.1f}"),
+        *("{median:.2f}, {largest:.2f}".format(**harm[x]) for x in ("with_gate", "without")),
+    ]  # fmt: skip
 
 
 def _cells(row: Row) -> list[str]:

@@ -1,10 +1,11 @@
-"""Repeat simulations of an evaluation split on the CPU, corrected with and without a gate.
+"""Compute simulations of a split on the CPU, corrected with and without a gate.
 
 python models/with_and_without_gate.py DATASET/config.toml --model MODEL ... [MESH/LOAD ...]
-    -o RECORD.json
+    [--split evaluation] -o RECORD.json
 
 The reference, the plain coarse mesh, each model's own base, and that corrected, with the default
-gate and without one: Omega of each, and what the gate refused.  Without MESH/LOAD it is one load of
+gate and without one: Omega of each, how many have more than 1.05 times their base's error, and what
+the gate refused.  Without MESH/LOAD it is one load of
 each mesh.  Loads are those that are drawn first; where `pdcorrect dataset generate` has rejected
 one, this is another simulation than the data set's.  The record is written after each simulation;
 the same command goes on where it ended.
@@ -37,17 +38,18 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", metavar="MESH/LOAD")
     parser.add_argument("--model", action="append", required=True, help="folder or name")
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--split", default=EVALUATION)
     parser.add_argument("--frames", type=int, default=None, help="all of the data set by default")
     options = parser.parse_args()
     config = DatasetConfig.load(options.config)
     models = {model_folder(name).name: pc.load_model(name) for name in options.model}
-    plans = {plan.number: plan for plan in make_plan(config) if plan.split == EVALUATION}
+    plans = {plan.number: plan for plan in make_plan(config) if plan.split == options.split}
     digests = {
         model_folder(name).name: weights_digest(model_folder(name)) for name in options.model
     }
     about = {
-        "dataset": config.name, "frames": options.frames, "gate": pc.Gate().model_dump(),
-        "weights_sha256": digests,
+        "dataset": config.name, "split": options.split, "frames": options.frames,
+        "gate": pc.Gate().model_dump(), "weights_sha256": digests,
     }  # fmt: skip
     rows = known_rows(options.output, about)
     for case in options.cases or [f"{number}/0" for number in plans]:
@@ -62,6 +64,7 @@ def main() -> None:
             "environment": environment(),
             **about,
             "omega": {name: summary(rows, name) for name in models},
+            "error_over_base": {name: harm(rows, name) for name in models},
             "simulations": rows,
         }
         write_text(options.output, json.dumps(record, indent=2) + "\n")
@@ -76,6 +79,19 @@ def known_rows(path: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
         raise SystemExit(f"{path}: of other models, another gate, data set or number of frames.")
     rows: list[dict[str, Any]] = record["simulations"]
     return rows
+
+
+def harm(rows: list[dict[str, Any]], name: str) -> dict[str, dict[str, float]]:
+    """RMS error over that of the model's base: median, largest, and how many are above 1.05."""
+    found = {}
+    for label in ("with_gate", "without"):
+        each = [row["models"][name] for row in rows]
+        ratios = np.array([one[f"rms_mm_{label}"] / one["rms_mm_own_base"] for one in each])
+        found[label] = {
+            "median": float(np.median(ratios)), "largest": float(ratios.max()),
+            "above_1.05": int((ratios > 1.05).sum()),
+        }  # fmt: skip
+    return found
 
 
 def summary(rows: list[dict[str, Any]], name: str) -> dict[str, dict[str, float]]:
@@ -105,7 +121,10 @@ def repeated(
     for name, model in models.items():
         coarse = pc.coarse_model(scene, model.base, plan.refine)
         base = pc.rollout(pc.ProjectiveDynamics(coarse), frames)
-        row = {"own_base": pc.metrics.error_corrected(base, zero, reference)}
+        row = {
+            "own_base": pc.metrics.error_corrected(base, zero, reference),
+            "rms_mm_own_base": 1e3 * pc.metrics.rms_error(base, reference),
+        }
         for label, gate in (("with_gate", pc.Gate()), ("without", None)):
             steps = pc.ProjectiveDynamics(coarse)
             hybrid = pc.HybridStepper(steps, model.corrector, velocity=model.velocity, gate=gate)

@@ -34,9 +34,10 @@ def script(name):
     return module
 
 
-def test_the_page_of_results_has_the_table_of_the_records():
-    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    assert script("table").table() in page
+def test_the_page_of_results_has_the_tables_of_the_records():
+    page, tables = (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), script("table")
+    assert tables.table() in page
+    assert tables.others_table() in page
 
 
 def as_version_1(folder):
@@ -211,3 +212,7 @@ def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
     assert found["omega"]["tiny"]["without"] == dict.fromkeys(
         ("mean", "median", "least"), row["without"]
     )
+    harm = found["error_over_base"]["tiny"]["without"]
+    ratio = row["rms_mm_without"] / row["rms_mm_own_base"]
+    assert harm == {"median": ratio, "largest": ratio, "above_1.05": 0}
+    assert ratio == pytest.approx(((100 - row["without"]) / (100 - row["own_base"])) ** 0.5)
