@@ -16,9 +16,8 @@ Data are generated in the order of the recipes, unless ``--generators 0`` says t
 there.  Each training begins as soon as its data are there, several at a time on each GPU, or, if
 it starts from what another recipe makes (``start_from = "trainings/DATASET/NAME/model"``), when
 that has ended by itself; a data set's models are evaluated when all its trainings have.  Commands
-run in WORK.  Trainings that are still
-running after ``--seconds`` are stopped; their best models so far are evaluated, and the next
-start goes on with them.
+run in WORK.  Trainings that are still running after ``--seconds`` are stopped; their best models
+so far are evaluated, and the next start goes on with them.
 """
 
 from __future__ import annotations

@@ -5,10 +5,9 @@ python models/with_and_without_gate.py DATASET/config.toml --model MODEL ... [ME
 
 The reference, the plain coarse mesh, each model's own base, and that corrected, with the default
 gate and without one: Omega of each, how many have more than 1.05 times their base's error, and what
-the gate refused.  Without MESH/LOAD it is one load of
-each mesh.  Loads are those that are drawn first; where `pdcorrect dataset generate` has rejected
-one, this is another simulation than the data set's.  The record is written after each simulation;
-the same command goes on where it ended.
+the gate refused.  Without MESH/LOAD it is one load of each mesh.  Loads are those that are drawn
+first; where `pdcorrect dataset generate` has rejected one, this is another simulation than the data
+set's.  The record is written after each simulation; the same command goes on where it ended.
 """
 
 from __future__ import annotations
