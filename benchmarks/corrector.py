@@ -83,11 +83,13 @@ def fitted(name: str, view: View) -> Corrector:
         for feature, values in features.values(table, names, view).items():
             found[feature] = Moments()
             found[feature].add(values)
-    target, averages = Moments(), Moments()
+    target, averages, shapes = Moments(), Moments(), Moments()
     target.add(torch.ones(1, 1))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
     corrector.normaliser.fit_averages(averages)
+    shapes.add(view.bodies.shapes)
+    corrector.normaliser.fit_shapes(shapes)
     return corrector.eval()
 
 

@@ -2,8 +2,7 @@
 
 python models/fit_body_ranges.py MODEL DATASET/config.toml [--device cuda] [--batch 20]
 
-For models of format version 1, from before there were such ranges; trainings fit them to their
-data.  Models of version 2 are fitted anew.
+Trainings fit them to their data, of references; this fits them anew, without data.
 One load is drawn for each mesh of the training split, as `pdcorrect dataset generate` does it,
 and the corrected coarse model rolled out from rest, without a gate; what the network sees on
 the way is what it knows.  That takes no reference; rollouts that fail are left out.  The model
@@ -13,28 +12,16 @@ is replaced by itself with these ranges.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
 from first_steps import scenes_of, seen_in_rollouts
-from safetensors.torch import load_file
 
 import pdcorrect as pc
-from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import View
-from pdcorrect.corrector.model_io import (
-    DESCRIPTION,
-    WEIGHTS,
-    LoadedModel,
-    ModelRecord,
-    model_folder,
-)
+from pdcorrect.corrector.model_io import LoadedModel, model_folder
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
-
-_AVERAGES = "normaliser.average_"
 
 
 def main() -> None:
@@ -46,8 +33,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=20, help="rollouts at once")
     options = parser.parse_args()
     folder = model_folder(options.model)
-    version = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["version"]
-    model = first_version(folder) if version == 1 else pc.load_model(folder)
+    model = pc.load_model(folder)
     model.corrector.to(options.device)
     config = DatasetConfig.load(options.config)
     averages, bodies = averages_of(model, config, options.device, options.batch)
@@ -56,16 +42,6 @@ def main() -> None:
         "dataset": config.name, "rollouts": bodies, "steps": averages.count,
     }  # fmt: skip
     print(pc.save_model(model.corrector, folder, record=model.record))
-
-
-def first_version(folder: Path) -> LoadedModel:
-    """A model of format version 1, which has no ranges of bodies' means."""
-    found = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
-    corrector = Corrector(CorrectorConfig.model_validate(found["architecture"]))
-    gaps = corrector.load_state_dict(load_file(folder / WEIGHTS), strict=False)
-    if gaps.unexpected_keys or not all(_AVERAGES in name for name in gaps.missing_keys):
-        raise SystemExit(f"{folder}: its weights are not those of its architecture.")
-    return LoadedModel(corrector.eval(), ModelRecord.model_validate(found["record"]))
 
 
 def averages_of(

@@ -1,13 +1,18 @@
 """Compute simulations of a split on the CPU, corrected with and without a gate.
 
 python models/with_and_without_gate.py DATASET/config.toml --model MODEL ... [MESH/LOAD ...]
-    [--split evaluation] -o RECORD.json
+    [--split evaluation | --coarse-nodes LEAST MOST [--family NAME]] [--one-clamp]
+    [--strength-factor 1.0] -o RECORD.json
 
 The reference, the plain coarse mesh, each model's own base, and that corrected, with the default
 gate and without one: Omega of each, how many have more than 1.05 times their base's error, and what
-the gate refused.  Without MESH/LOAD it is one load of each mesh.  Loads are those that are drawn
-first; where `pdcorrect dataset generate` has rejected one, this is another simulation than the data
-set's.  The record is written after each simulation; the same command goes on where it ended.
+the gate refused, and how far the body at rest lies outside the range of training bodies
+(`Gate.body`).  With ``--coarse-nodes`` bodies of other sizes, and of another family, are drawn in
+place of a split's; materials and loads are drawn as the data set's.  ``--one-clamp`` holds bodies
+at the first of their clamps only.  Without MESH/LOAD it is one
+load of each mesh.  Loads are those that are drawn first; where `pdcorrect dataset generate` has
+rejected one, this is another simulation than the data set's.  The record is written after each
+simulation; the same command goes on where it ended.
 """
 
 from __future__ import annotations
@@ -16,17 +21,23 @@ import argparse
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import pdcorrect as pc
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.corrector.model_io import LoadedModel, model_folder, weights_digest
-from pdcorrect.data.config import EVALUATION, DatasetConfig
+from pdcorrect.corrector.shapes import SHAPE_MEASURES
+from pdcorrect.data.config import EVALUATION, DatasetConfig, FamilyName, Split
+from pdcorrect.data.families import PUBLISHED, count_bodies
 from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
 from pdcorrect.environment import environment
+from pdcorrect.fem.problem import Problem
 from pdcorrect.replacement import write_text
 
 
@@ -38,16 +49,31 @@ def main() -> None:
     parser.add_argument("--model", action="append", required=True, help="folder or name")
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--split", default=EVALUATION)
+    parser.add_argument("--coarse-nodes", type=int, nargs=2, metavar=("LEAST", "MOST"))
+    parser.add_argument("--family", choices=sorted(PUBLISHED), help="the data set's by default")
+    parser.add_argument("--one-clamp", action="store_true", help="hold bodies there only")
+    parser.add_argument("--strength-factor", type=float, default=1.0, help="on the loads")
     parser.add_argument("--frames", type=int, default=None, help="all of the data set by default")
     options = parser.parse_args()
+    if options.family and not options.coarse_nodes:
+        parser.error("--family: expected --coarse-nodes, too.")
+    if options.coarse_nodes and options.split != EVALUATION:
+        parser.error("--coarse-nodes: bodies of its own take the place of a split's: no --split.")
     config = DatasetConfig.load(options.config)
+    if options.coarse_nodes:
+        config = of_bodies(config, options.family or config.family, options.coarse_nodes)
     models = {model_folder(name).name: pc.load_model(name) for name in options.model}
-    plans = {plan.number: plan for plan in make_plan(config) if plan.split == options.split}
+    plans = {
+        plan.number: replace(plan, strength_factor=options.strength_factor * plan.strength_factor)
+        for plan in make_plan(config) if plan.split == options.split
+    }  # fmt: skip
     digests = {
         model_folder(name).name: weights_digest(model_folder(name)) for name in options.model
     }
     about = {
         "dataset": config.name, "split": options.split, "frames": options.frames,
+        "bodies": {"family": config.family, "coarse_nodes": list(config.coarse_nodes or ())},
+        "one_clamp": options.one_clamp, "strength_factor": options.strength_factor,
         "gate": pc.Gate().model_dump(), "weights_sha256": digests,
     }  # fmt: skip
     rows = known_rows(options.output, about)
@@ -55,7 +81,10 @@ def main() -> None:
         mesh, load = map(int, case.split("/"))
         if any((row["mesh"], row["load"]) == (mesh, load) for row in rows):
             continue
-        rows.append(repeated(models, config, plans[mesh], load, options.frames))
+        scene = draw_scene(config, plans[mesh], load)
+        if options.one_clamp:
+            scene = scene.model_copy(update={"clamps": scene.clamps[:1]})
+        rows.append(repeated(models, config, plans[mesh], load, scene, options.frames))
         print(json.dumps(rows[-1]), flush=True)
         record = {
             "date": time.strftime("%Y-%m-%d"),
@@ -67,6 +96,19 @@ def main() -> None:
             "simulations": rows,
         }
         write_text(options.output, json.dumps(record, indent=2) + "\n")
+
+
+def of_bodies(config: DatasetConfig, family: FamilyName, nodes: list[int]) -> DatasetConfig:
+    """The configuration with ten evaluation meshes of other bodies, or as many as there are."""
+    there = min(10, count_bodies(family, (nodes[0], nodes[1])) - 1)
+    if there < 1:
+        raise SystemExit(f"--coarse-nodes {nodes[0]} {nodes[1]}: fewer than two bodies there.")
+    changes = {
+        "family": family, "coarse_nodes": tuple(nodes), "extra": (),
+        "training": Split(meshes=1, simulations=1),
+        "evaluation": Split(meshes=there, simulations=there),
+    }  # fmt: skip
+    return config.model_copy(update=changes)
 
 
 def known_rows(path: Path, about: dict[str, Any]) -> list[dict[str, Any]]:
@@ -107,10 +149,10 @@ def summary(rows: list[dict[str, Any]], name: str) -> dict[str, dict[str, float]
 
 def repeated(
     models: dict[str, LoadedModel], config: DatasetConfig, plan: MeshPlan, load: int,
-    frames: int | None,
+    scene: pc.Scene, frames: int | None,
 ) -> dict[str, Any]:  # fmt: skip
     """Omega with and without a gate, per cent, and the steps that it refused."""
-    scene, frames = draw_scene(config, plan, load), frames or plan.frames
+    frames = frames or plan.frames
     plain = pc.discretise(scene)
     truth = pc.best_coarse(scene) if config.setting == "exact" else scene
     fine = pc.discretise(truth, refine=plan.refine)
@@ -121,6 +163,7 @@ def repeated(
         coarse = pc.coarse_model(scene, model.base, plan.refine)
         base = pc.rollout(pc.ProjectiveDynamics(coarse), frames)
         row = {
+            "body_beyond": beyond(model, coarse),
             "own_base": pc.metrics.error_corrected(base, zero, reference),
             "rms_mm_own_base": 1e3 * pc.metrics.rms_error(base, reference),
         }
@@ -141,6 +184,13 @@ def repeated(
         "mesh": plan.number, "load": load, "nodes": len(plain.positions),
         "rms_mm_plain": 1e3 * pc.metrics.rms_error(zero, reference), "models": found,
     }  # fmt: skip
+
+
+def beyond(model: LoadedModel, problem: Problem) -> dict[str, float]:
+    """Measures of a body at rest that lie outside the range of training bodies, and by how much."""
+    shapes = BodyGraph.of([problem], dtype=torch.float64).shapes
+    found = model.corrector.normaliser.shape_excess(shapes)[0].tolist()
+    return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > 1e-6}
 
 
 if __name__ == "__main__":

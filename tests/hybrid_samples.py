@@ -56,12 +56,14 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         ):
             for name in names:
                 moments[name].add(table[name][1](views[-1]))
-    target, averages = Moments(), Moments()
+    target, averages, shapes = Moments(), Moments(), Moments()
     target.add(torch.full((4, 1), size))
     corrector.normaliser.fit(moments, target)
     for view in views:
         averages.add(nodes.graph.body_means(corrector.inputs(view)[0]))
+        shapes.add(nodes.graph.shapes)
     corrector.normaliser.fit_averages(averages)
+    corrector.normaliser.fit_shapes(shapes)
     return corrector
 
 

@@ -122,11 +122,13 @@ def fit(corrector, view):
         for name, values in features.values(table, names, view).items():
             found[name] = Moments()
             found[name].add(values)
-    target, averages = Moments(), Moments()
+    target, averages, shapes = Moments(), Moments(), Moments()
     target.add(torch.tensor([[0.1], [-0.3]]))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
     corrector.normaliser.fit_averages(averages)
+    shapes.add(view.bodies.shapes)
+    corrector.normaliser.fit_shapes(shapes)
     return corrector
 
 

@@ -719,6 +719,9 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     averages = Moments()
     averages.add(torch.zeros(1, len(corrector.normaliser.average_low)))
     corrector.normaliser.fit_averages(averages)
+    shapes = Moments()
+    shapes.add(torch.zeros(1, len(corrector.normaliser.shape_low)))
+    corrector.normaliser.fit_shapes(shapes)
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()
@@ -750,15 +753,20 @@ def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_see
 
 
 def test_the_gate_refuses_what_the_network_has_not_seen_unless_it_is_off(tmp_path, pair):
-    """A fitted range of nothing: every input lies outside."""
+    """A fitted range of nothing: every body, and every input, lies outside."""
     _, stepper = pair
     path = untrained(tmp_path / "model")
     rates = {}
-    for gate in (Gate(), None):
+    gates = {
+        "all": Gate(), "bodies": Gate(margin=None, average=None), "inputs": Gate(body=None),
+        "none": None,
+    }  # fmt: skip
+    for name, gate in gates.items():
         (saved,) = saved_candidates([path], gate=gate)
         runs = roll_out(saved.candidate.hybrid(stepper), stepper, [2, 2])
-        rates[gate is not None] = [run.refused.mean() for run in runs]
-    assert rates == {True: [1.0, 1.0], False: [0.0, 0.0]}
+        rates[name] = [run.refused.mean() for run in runs]
+    assert rates.pop("none") == [0.0, 0.0]
+    assert set(map(tuple, rates.values())) == {(1.0, 1.0)}
 
 
 def run_command(*arguments):

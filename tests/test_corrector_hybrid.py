@@ -35,7 +35,7 @@ from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.solvers.resume import check_same_run
 
 CELL = 0.02
-OPEN = Gate(margin=None, average=None, volume=None, crushing=None, energy=None)
+OPEN = Gate(body=None, margin=None, average=None, volume=None, crushing=None, energy=None)
 
 
 def same(a, b):
@@ -1020,7 +1020,7 @@ def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element)
 
 def test_refusals_are_counted_by_reason():
     assert refusals(np.array([0.0, 1.0, 3.0, 3.0, 0.0])) == {
-        "not finite": 1, "features": 0, "inversion": 2, "energy": 0, "solver": 0,
+        "not finite": 1, "features": 0, "inversion": 2, "energy": 0, "solver": 0, "body": 0,
     }  # fmt: skip
 
 

@@ -380,12 +380,13 @@ def test_numbers_that_are_not_finite_are_refused(model):
 
 
 def test_other_versions_are_told_from_damage(model):
-    rewrite_json(model, put_json("version", value=3), seal=False)
-    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 3: expected 2.*newer"):
+    rewrite_json(model, put_json("version", value=4), seal=False)
+    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 4: expected 3.*newer"):
         load_model(model)
-    rewrite_json(model, put_json("version", value=1))
-    with pytest.raises(FileVersionError, match="format version 1: expected 2"):
-        load_model(model)
+    for old in (1, 2):
+        rewrite_json(model, put_json("version", value=old))
+        with pytest.raises(FileVersionError, match=f"format version {old}: expected 3"):
+            load_model(model)
 
 
 def test_a_changed_entry_is_found_by_the_checksum(model):

@@ -39,7 +39,7 @@ from pdcorrect.training.config import (  # noqa: E402
     Rate,
     TrainingConfig,
 )
-from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
+from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
 from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402, mean_of
 from pdcorrect.training.optimisation import Optimiser, rate_at  # noqa: E402
 from pdcorrect.training.progress import check_same  # noqa: E402
@@ -419,6 +419,25 @@ def test_bodies_of_the_training_split_are_like_it(folder):
         normaliser.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
     )
     assert 1.0 < float(corrector.unlike(view).max()) <= 3.5 + 1e-9
+
+
+def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector = samples.fitted(folder, settings)
+    corrector.normaliser.shape_low.fill_(torch.nan)
+    fit_normaliser(corrector, windows, 1)
+    bodies = windows.batch(range(len(windows.dataset))).bodies
+    assert len(torch.unique(bodies.shapes, dim=0)) > 1
+    assert not corrector.shape_excess(bodies).any()
+    normaliser = corrector.normaliser
+    assert torch.equal(normaliser.shape_low, bodies.shapes.double().amin(dim=0))
+    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
+    normaliser.shape_low += 1.0  # as of larger bodies
+    assert (corrector.shape_excess(bodies) > 0.5).any()
+    widen_ranges(corrector, windows, 1)
+    assert not corrector.shape_excess(bodies).any()
+    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
 
 
 def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
@@ -883,7 +902,7 @@ def test_every_damaged_checkpoint_is_refused_by_name(tmp_path):
     path.write_bytes(whole[:-3])
     with pytest.raises(FileFormatError, match=path.name):
         read_checkpoint(path)
-    path.write_bytes(whole.replace(b'"version":"1"', b'"version":"9"'))
+    path.write_bytes(whole.replace(b'"version":"2"', b'"version":"9"'))
     with pytest.raises(FileVersionError, match="version 9"):
         read_checkpoint(path)
 

@@ -170,6 +170,7 @@ ORDER = [
     "corrector",
     "corrector.rotations",
     "corrector.frames",
+    "corrector.shapes",
     "corrector.bodies",
     "corrector.features",
     "corrector.config",

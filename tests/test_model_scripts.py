@@ -19,6 +19,7 @@ import pdcorrect as pc  # noqa: E402
 import pdcorrect.errors  # noqa: E402
 from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.data.config import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
 from pdcorrect.evaluation.cases import read_cases  # noqa: E402
@@ -38,24 +39,57 @@ def test_the_page_of_results_has_the_tables_of_the_records():
     page, tables = (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), script("table")
     assert tables.table() in page
     assert tables.others_table() in page
+    assert tables.bodies_table() in page
 
 
-def as_version_1(folder):
-    """A model as it was before there were ranges of bodies' means."""
+def as_version_2(folder):
+    """A model as it was before there were ranges of bodies at rest."""
     description = json.loads((folder / "model.json").read_text())
-    (folder / "model.json").write_text(json.dumps({**description, "version": 1}))
+    (folder / "model.json").write_text(json.dumps({**description, "version": 2}))
     weights = {k: x for k, x in load_file(folder / "weights.safetensors").items()
-               if ".average_" not in k}  # fmt: skip
+               if ".shape_" not in k}  # fmt: skip
     save_file(weights, folder / "weights.safetensors")
 
 
-def test_the_body_ranges_of_an_old_model_are_those_of_its_own_rollouts(tmp_path):
+def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path):
+    folder, config = tmp_path / "tiny", ROOT / "datasets" / "tiny" / "config.toml"
+    shutil.copytree(ROOT / "models" / "tiny", folder)
+    before = pc.load_model(folder)
+    as_version_2(folder)
+    with pytest.raises(pc.errors.FileVersionError, match="version 2"):
+        pc.load_model(folder)
+    command = [sys.executable, ROOT / "models" / "fit_shapes.py", folder, config]
+    subprocess.run(command, check=True, capture_output=True)
+    after = pc.load_model(folder)
+    values = before.corrector.state_dict()
+    for name, tensor in after.corrector.state_dict().items():
+        assert torch.equal(tensor, values[name]), name
+    told = after.record.training["shapes"]
+    assert (told["dataset"], told["meshes"]) == ("tiny", 6)
+    assert 0.0 < told["left_out"] < 1.0
+
+
+def test_a_body_left_out_lies_outside_the_others_by_its_distance_from_the_next():
+    each = torch.tensor([[0.0, 5.0], [3.0, 1.0], [1.0, 2.0]])
+    assert script("fit_shapes").left_out(each) == 3.0
+
+
+def test_released_models_know_the_bodies_that_they_were_trained_on():
+    steps = script("first_steps")
+    for name, found in (("tiny", "tiny"), ("torsion-exact-compact", "torsion-exact")):
+        config = DatasetConfig.load(ROOT / "datasets" / found / "config.toml")
+        corrector = pc.load_model(ROOT / "models" / name).corrector
+        scenes = steps.scenes_of(config, "training", loads=1)
+        bodies = BodyGraph.of([pc.discretise(scene) for scene, _ in scenes], dtype=torch.float64)
+        assert float(corrector.shape_excess(bodies).max()) < 1e-9
+        assert (bodies.shapes.amin(dim=0) - corrector.normaliser.shape_low).abs().max() < 1e-9
+        assert (bodies.shapes.amax(dim=0) - corrector.normaliser.shape_high).abs().max() < 1e-9
+
+
+def test_ranges_of_bodies_means_are_fitted_to_own_rollouts(tmp_path):
     folder = tmp_path / "tiny"
     shutil.copytree(ROOT / "models" / "tiny", folder)
     before = pc.load_model(folder).corrector.state_dict()
-    as_version_1(folder)
-    with pytest.raises(pc.errors.FileVersionError, match="version 1"):
-        pc.load_model(folder)
     config = ROOT / "datasets" / "tiny" / "config.toml"
     command = [sys.executable, ROOT / "models" / "fit_body_ranges.py", folder, config]
     subprocess.run([*command, "--batch", "4"], check=True, capture_output=True)
@@ -212,7 +246,26 @@ def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
     assert found["omega"]["tiny"]["without"] == dict.fromkeys(
         ("mean", "median", "least"), row["without"]
     )
+    assert found["bodies"] == {"family": "cross", "coarse_nodes": [72, 108]}
+    assert max(row["body_beyond"].values()) < found["gate"]["body"]
     harm = found["error_over_base"]["tiny"]["without"]
     ratio = row["rms_mm_without"] / row["rms_mm_own_base"]
     assert harm == {"median": ratio, "largest": ratio, "above_1.05": 0}
     assert ratio == pytest.approx(((100 - row["without"]) / (100 - row["own_base"])) ** 0.5)
+
+
+def test_bodies_of_other_sizes_are_drawn_for_a_gate_to_refuse(tmp_path):
+    config, record = ROOT / "datasets" / "tiny" / "config.toml", tmp_path / "record.json"
+    command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", config, "0/0"]
+    bodies = ["--coarse-nodes", "144", "180", "--family", "beam", "--frames", "2"]
+    subprocess.run(
+        [*command, "--model", "tiny", "-o", record, *bodies], check=True, capture_output=True
+    )
+    found = json.loads(record.read_text())
+    (simulation,) = found["simulations"]
+    assert found["bodies"] == {"family": "beam", "coarse_nodes": [144, 180]}
+    assert 144 <= simulation["nodes"] <= 180
+    row = simulation["models"]["tiny"]
+    assert row["body_beyond"]["nodes"] == pytest.approx(np.log(simulation["nodes"] / 108))
+    assert row["refused"] == {"1": "body", "2": "body"}
+    assert row["with_gate"] == row["own_base"] != row["without"]

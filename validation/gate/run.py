@@ -22,10 +22,11 @@ SPLITS = ("evaluation", "stronger", "stiffer", "softer", "compressible", "half-s
           "double-step", "long")  # fmt: skip
 GATES: dict[str, dict[str, float | None] | None] = {
     "none": None,
-    "margin 3": {"margin": 3.0, "average": None},
-    "margin 1": {"average": None},
-    "margin 0.3": {"margin": 0.3, "average": None},
-    "average": {"margin": None},
+    "margin 3": {"margin": 3.0, "average": None, "body": None},
+    "margin 1": {"average": None, "body": None},
+    "margin 0.3": {"margin": 0.3, "average": None, "body": None},
+    "average": {"margin": None, "body": None},
+    "body": {"margin": None, "average": None},
     "default": {},
 }
 """Changes of the default gate, in deviations; None: no gate."""

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
 from pdcorrect.corrector.rotations import polar_rotations, turns_between
+from pdcorrect.corrector.shapes import shape_measures
 from pdcorrect.data.graph import mesh_edges, node_means
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
@@ -149,6 +150,15 @@ class BodyGraph:
             frames = self.rest_frames
             return turns_between(frames[here], frames[there])
 
+    @cached_property
+    def shapes(self) -> Tensor:
+        """What a gate knows of the bodies at rest, (B, 10), see `shape_measures`."""
+        parts = (self.rest, self.free, self.edge_index, self.cells, self.graph, self.cell_size)
+        exact = (part.double() if part.is_floating_point() else part for part in parts)
+        with torch.inference_mode(False):
+            found = shape_measures(*(part.detach().cpu().numpy() for part in exact))
+            return torch.as_tensor(found).to(self.rest)
+
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""
         return values.index_select(0, self.graph)
@@ -173,7 +183,7 @@ class BodyGraph:
     ) -> BodyGraph:
         """The same bodies of another material: nodal masses (n,), kg, and values (c,) of cells.
 
-        What is known of their rest is kept.
+        What is known of their rest is kept, also by a gate.
         """
         corners = self.cells.reshape(-1)
 
@@ -185,7 +195,8 @@ class BodyGraph:
             self, mass=mass.to(self.rest), young=mean(young), poisson=mean(poisson),
             density=mean(density),
         )  # fmt: skip
-        vars(found).update({name: vars(self)[name] for name in KNOWN if name in vars(self)})
+        known = {name: vars(self)[name] for name in (*KNOWN, "shapes") if name in vars(self)}
+        vars(found).update(known)
         return found
 
     def to(
@@ -203,7 +214,7 @@ REST_OF_NODES = ("rest_frames", "cell_counts")
 REST_OF_EDGES = ("rest_edges", "rest_turns")
 REST_OF_CELLS = ("rest_inverses",)
 KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
-"""What a graph computes of its bodies at rest once, when first asked for."""
+"""What a graph computes of its bodies at rest once for a network, when first asked for."""
 
 _NODAL = ("rest", "free", "mass", "young", "poisson", "density")
 

@@ -92,6 +92,10 @@ class CompiledCorrector:
         normaliser = self._corrector.normaliser
         return normaliser.strangeness(torch.from_numpy(averages)[None]).amax(dim=1)
 
+    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.shape_excess`."""
+        return self._corrector.shape_excess(bodies)
+
     def _seen(self, view: View) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""
         if view is not self._view:

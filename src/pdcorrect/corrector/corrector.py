@@ -39,6 +39,9 @@ class Answers(Protocol):
     def unlike(self, view: View) -> Tensor:
         """How far each body's mean inputs are from those of training bodies, (B,)."""
 
+    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+        """How far measures of each body at rest lie outside their range in training, (B,)."""
+
 
 class Corrector(nn.Module):
     """Displacements (n, 3), m, that are to be added to a coarse step.
@@ -115,6 +118,13 @@ class Corrector(nn.Module):
         nodes = features.values(NODE_FEATURES, config.node_features, view)
         averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
         return self.normaliser.strangeness(averages).amax(dim=1)
+
+    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+        """How far measures of each body at rest lie outside their range in training, (B,).
+
+        The largest of all, dimensionless, see `shape_measures`; most are logarithms.
+        """
+        return self.normaliser.shape_excess(bodies.shapes).amax(dim=1)
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

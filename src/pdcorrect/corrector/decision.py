@@ -60,7 +60,8 @@ class Decision:
     ----------
     bodies : BodyGraph
     asked : (n, 3)
-        What the network gave, m; zero where that is not finite or its inputs are unknown.
+        What the network gave, m; zero where that is not finite, or the body or its inputs are
+        unknown.
     reasons : (B,) int64
         Numbers of `Reason`.
     factors : (B,)
@@ -74,15 +75,19 @@ class Decision:
 
     @classmethod
     def of(cls, corrector: Answers, view: View, gate: Gate | None) -> Decision:
-        """Ask the network."""
-        bodies, asked = view.bodies, corrector.of_view(view)
-        sound = bodies.sound(asked)
-        reasons = torch.where(sound, int(Reason.NONE), int(Reason.NOT_FINITE))
+        """Ask the network, if a gate lets it see one of the bodies."""
+        bodies, factors = view.bodies, torch.ones_like(view.bodies.cell_size)
+        reasons = torch.zeros_like(factors, dtype=torch.int64)
         if gate is not None:
-            unknown = sound & gate.unknown(corrector, view)
-            reasons = torch.where(unknown, int(Reason.FEATURES), reasons)
+            reasons[gate.foreign(corrector, bodies)] = int(Reason.BODY)
+            if reasons.all():
+                return cls(bodies, torch.zeros_like(bodies.rest), reasons, factors)
+        asked = corrector.of_view(view)
+        reasons[(reasons == 0) & ~bodies.sound(asked)] = int(Reason.NOT_FINITE)
+        if gate is not None:
+            reasons[(reasons == 0) & gate.unknown(corrector, view)] = int(Reason.FEATURES)
         asked = torch.where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
-        return cls(bodies, asked, reasons, torch.ones_like(bodies.cell_size))
+        return cls(bodies, asked, reasons, factors)
 
     @cached_property
     def counts(self) -> Tensor:

@@ -15,6 +15,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.features import View
 from pdcorrect.errors import InputError
@@ -30,6 +31,7 @@ class Reason(IntEnum):
     INVERSION = 3
     ENERGY = 4
     SOLVER = 5
+    BODY = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +56,10 @@ class Measured:
 class Gate(Strict):
     """When a correction is refused; None switches a test off.
 
-    The network's inputs are tested before any placement.  Volumes and energy are tested on
-    corrected answers (placement "state") and on those under corrected loads ("force"), against
-    the plain coarse answer of the same step; where only the first iterate is corrected
+    The body at rest is tested first: one that is refused is so in every step, and where all are
+    the network is not asked.  Its inputs are tested before any placement.  Volumes and energy are
+    tested on corrected answers (placement "state") and on those under corrected loads ("force"),
+    against the plain coarse answer of the same step; where only the first iterate is corrected
     ("guess"), the answer is the coarse solver's anyway.
 
     To save the plain step, an answer under corrected loads is first held against the state
@@ -66,6 +69,11 @@ class Gate(Strict):
 
     Attributes
     ----------
+    body
+        Refused in all steps if a measure of the body's size, slenderness, ratio of volume to
+        surface or supports at rest (`pdcorrect.corrector.shapes.shape_measures`) lies farther than
+        this outside its range in training.  Most are logarithms: 0.3 is a factor of 1.35.  Ranges
+        are separate: what is unlike by a combination of them, or by where a body branches, passes.
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data, of which
@@ -97,13 +105,20 @@ class Gate(Strict):
         passes, and refused only then; for placement "state".
     """
 
+    body: NonNegative | None = 0.3
     margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
-    average: NonNegative | None = 3.7
+    average: NonNegative | None = 4.5
     volume: Number | None = 0.0
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
     energy: NonNegative | None = 8.0
     limit: bool = False
+
+    def foreign(self, corrector: Answers, bodies: BodyGraph) -> Tensor:
+        """Whether bodies at rest are too unlike those of its training, (B,) bool."""
+        if self.body is None:
+            return torch.zeros_like(bodies.cell_size, dtype=torch.bool)
+        return corrector.shape_excess(bodies) > self.body
 
     def unknown(self, corrector: Answers, view: View) -> Tensor:
         """Whether the network's inputs are too far from its training data, (B,) bool."""

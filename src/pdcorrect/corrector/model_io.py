@@ -45,7 +45,7 @@ from torch import Tensor  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 
 FORMAT = "pdcorrect-model"
-VERSION = 2
+VERSION = 3
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 _NORMALISER = "normaliser."
@@ -77,7 +77,7 @@ class _Description(Strict):
     """``model.json`` without its checksum."""
 
     format: Literal["pdcorrect-model"] = "pdcorrect-model"
-    version: Literal[2] = 2
+    version: Literal[3] = 3
     architecture: CorrectorConfig
     parameters: int
     dtype: Literal["float32"] = "float32"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector.features import UNSCALED
+from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.errors import InputError
 
 _LEAST_DEVIATION = 1e-5
@@ -110,6 +111,9 @@ class Normaliser(nn.Module):
     average_low, average_high, average_mean, average_deviation : (a,) tensors
         Range, mean and deviation, over the training data, of the means over a body's nodes of
         what the network sees of them; not numbers before `fit_averages`.
+    shape_low, shape_high : (10,) tensors
+        Range of the measures of training bodies at rest, see `shape_measures`; not numbers before
+        `fit_shapes`.
     fitted : bool
         Whether it has seen data.
     """
@@ -119,6 +123,8 @@ class Normaliser(nn.Module):
     average_high: Tensor
     average_mean: Tensor
     average_deviation: Tensor
+    shape_low: Tensor
+    shape_high: Tensor
 
     def __init__(self, nodes: Mapping[str, int], edges: Mapping[str, int]) -> None:
         super().__init__()
@@ -130,6 +136,9 @@ class Normaliser(nn.Module):
         for part in _PARTS:
             unknown = torch.full((sum(nodes.values()),), torch.nan, dtype=torch.float64)
             self.register_buffer(f"average_{part}", unknown)
+        for part in ("low", "high"):
+            unknown = torch.full((len(SHAPE_MEASURES),), torch.nan, dtype=torch.float64)
+            self.register_buffer(f"shape_{part}", unknown)
 
     @property
     def fitted(self) -> bool:
@@ -169,6 +178,11 @@ class Normaliser(nn.Module):
         self.average_mean.copy_(averages.mean)
         self.average_deviation.copy_(averages.deviation.clamp_min(_LEAST_SPREAD))
 
+    def fit_shapes(self, shapes: Moments) -> None:
+        """Take over the range of bodies' measures at rest (m, 10)."""
+        self.shape_low.copy_(shapes.low)
+        self.shape_high.copy_(shapes.high)
+
     def widen(self, features: Mapping[str, Moments]) -> None:
         """Widen the ranges by those of further values; means and deviations do not change."""
         for name in self.names:
@@ -177,6 +191,10 @@ class Normaliser(nn.Module):
     def widen_averages(self, averages: Moments) -> None:
         """Widen the ranges of bodies' mean inputs (m, a); as of `widen`."""
         self._widen("average_", averages)
+
+    def widen_shapes(self, shapes: Moments) -> None:
+        """Widen the range of bodies' measures at rest (m, 10); as of `widen`."""
+        self._widen("shape_", shapes)
 
     def _widen(self, prefix: str, moments: Moments) -> None:
         for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
@@ -211,6 +229,15 @@ class Normaliser(nn.Module):
         )
         farthest = torch.where(averages < mean, mean - low, high - mean)
         found = (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
+        return torch.where(found.isnan(), torch.inf, found)
+
+    def shape_excess(self, shapes: Tensor) -> Tensor:
+        """How far measures (B, 10) lie outside the range of training bodies, at least 0.
+
+        Infinite where it is not a number.
+        """
+        low, high = self.shape_low.to(shapes), self.shape_high.to(shapes)
+        found = torch.maximum(low - shapes, shapes - high).clamp_min(0.0)
         return torch.where(found.isnan(), torch.inf, found)
 
     def scale(self, name: str) -> Scale:

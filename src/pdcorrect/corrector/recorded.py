@@ -112,6 +112,11 @@ class RecordedCorrector:
         """See `Corrector.unlike`."""
         return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
 
+    @torch.no_grad()
+    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.shape_excess`."""
+        return self._corrector.shape_excess(bodies)
+
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""
         self._forget()

@@ -39,6 +39,7 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     chosen = _chosen(every, most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
+    corrector.normaliser.fit_shapes(_shapes(windows))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
@@ -50,6 +51,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
     every = np.arange(len(windows.dataset))
+    corrector.normaliser.widen_shapes(_shapes(windows))
     _widen(corrector, windows, _chosen(every, most, seed))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
@@ -103,6 +105,15 @@ def _averages(
         view = View(batch.bodies, batch.snapshot)
         averages.add(batch.bodies.body_means(corrector.inputs(view)[0]))
     return averages
+
+
+def _shapes(windows: StepWindows) -> Moments:
+    """Of the measures of all bodies at rest (m, 9)."""
+    meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
+    shapes = Moments()
+    for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
+        shapes.add(batch.bodies.shapes)
+    return shapes
 
 
 def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:
