@@ -133,9 +133,10 @@ def _body_cells(record: dict[str, Any], model: str, bodies: str, frames: int) ->
     farthest = max(beyond, default=(0.0, "none"))
     refused = sum(len(row["refused"]) for row in each) / (frames * len(each))
     omega = record["omega"][model]
+    span = " – ".join(map(str, sorted({min(nodes), max(nodes)})))
     ratios = sorted(row["rms_mm_with_gate"] / row["rms_mm_own_base"] for row in each)
     return [
-        f"`{model}`", bodies.replace("-", " "), " – ".join(map(str, sorted({min(nodes), max(nodes)}))), f"{len(each)}",
+        f"`{model}`", bodies.replace("-", " "), span, f"{len(each)}",
         f"{farthest[0]:.2f} ({farthest[1]})", f"{100 * refused:.0f}",
         _signed(f"{omega['own_base']['mean']:.1f}"),
         _signed(f"{omega['with_gate']['mean']:.1f}, {omega['with_gate']['least']:.1f}"),

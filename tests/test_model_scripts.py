@@ -1,5 +1,6 @@
 """The scripts in `models` that print tables, fit and widen ranges, and draw."""
 
+import hashlib
 import importlib.util
 import json
 import shutil
@@ -45,10 +46,12 @@ def test_the_page_of_results_has_the_tables_of_the_records():
 def as_version_2(folder):
     """A model as it was before there were ranges of bodies at rest."""
     description = json.loads((folder / "model.json").read_text())
-    (folder / "model.json").write_text(json.dumps({**description, "version": 2}))
     weights = {k: x for k, x in load_file(folder / "weights.safetensors").items()
                if ".shape_" not in k}  # fmt: skip
     save_file(weights, folder / "weights.safetensors")
+    digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
+    changed = {**description, "version": 2, "weights_sha256": digest}
+    (folder / "model.json").write_text(json.dumps(changed))
 
 
 def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path):
@@ -64,12 +67,18 @@ def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path
     values = before.corrector.state_dict()
     for name, tensor in after.corrector.state_dict().items():
         assert torch.equal(tensor, values[name]), name
+    as_version_2(folder)
+    (folder / "weights.safetensors").write_bytes(b"")
+    damaged = subprocess.run(command, capture_output=True, text=True)
+    assert damaged.returncode == 1
+    assert "damaged" in damaged.stderr
     told = after.record.training["shapes"]
     assert (told["dataset"], told["meshes"]) == ("tiny", 6)
     assert 0.0 < told["left_out"] < 1.0
 
 
-def test_a_body_left_out_lies_outside_the_others_by_its_distance_from_the_next():
+def test_a_body_left_out_lies_outside_the_others_by_its_distance_from_the_next(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "models")
     each = torch.tensor([[0.0, 5.0], [3.0, 1.0], [1.0, 2.0]])
     assert script("fit_shapes").left_out(each) == 3.0
 
