@@ -26,18 +26,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 import pdcorrect as pc
-from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.corrector.model_io import LoadedModel, model_folder, weights_digest
-from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION, DatasetConfig, FamilyName, Split
 from pdcorrect.data.families import PUBLISHED, count_bodies
 from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
 from pdcorrect.environment import environment
-from pdcorrect.fem.problem import Problem
 from pdcorrect.replacement import write_text
 
 
@@ -163,13 +159,13 @@ def repeated(
         coarse = pc.coarse_model(scene, model.base, plan.refine)
         base = pc.rollout(pc.ProjectiveDynamics(coarse), frames)
         row = {
-            "body_beyond": beyond(model, coarse),
             "own_base": pc.metrics.error_corrected(base, zero, reference),
             "rms_mm_own_base": 1e3 * pc.metrics.rms_error(base, reference),
         }
         for label, gate in (("with_gate", pc.Gate()), ("without", None)):
             steps = pc.ProjectiveDynamics(coarse)
             hybrid = pc.HybridStepper(steps, model.corrector, velocity=model.velocity, gate=gate)
+            row["body_beyond"] = hybrid.body_excess()
             run = pc.rollout(hybrid, frames)
             row[label] = pc.metrics.error_corrected(run, zero, reference)
             row[f"rms_mm_{label}"] = 1e3 * pc.metrics.rms_error(run, reference)
@@ -184,13 +180,6 @@ def repeated(
         "mesh": plan.number, "load": load, "nodes": len(plain.positions),
         "rms_mm_plain": 1e3 * pc.metrics.rms_error(zero, reference), "models": found,
     }  # fmt: skip
-
-
-def beyond(model: LoadedModel, problem: Problem) -> dict[str, float]:
-    """Measures of a body at rest that lie outside the range of training bodies, and by how much."""
-    shapes = BodyGraph.of([problem], dtype=torch.float64).shapes
-    found = model.corrector.normaliser.shape_excess(shapes)[0].tolist()
-    return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > 1e-6}
 
 
 if __name__ == "__main__":

@@ -446,7 +446,10 @@ def test_refused_corrections_are_told():
     stiff = scene.with_changes(material={"young": 1e7}, time={"frames": 2})
     cases = pc.evaluate.cases_with(["torsion-exact"])[-1:]
     notes = report.notes(pc.compare(stiff, cases=cases))
-    assert "hybrid torsion-exact: 2 of 2 corrections were refused by the gate." in notes
+    assert (
+        "hybrid torsion-exact: 2 of 2 corrections were refused by the gate (2 by features)."
+        in notes
+    )
 
 
 def test_correctors_are_told_apart_and_are_of_one_coarse_model(tmp_path):

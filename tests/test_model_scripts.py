@@ -21,6 +21,7 @@ import pdcorrect.errors  # noqa: E402
 from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
+from pdcorrect.corrector.shapes import SHAPE_MEASURES  # noqa: E402
 from pdcorrect.data.config import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
 from pdcorrect.evaluation.cases import read_cases  # noqa: E402
@@ -278,3 +279,19 @@ def test_bodies_of_other_sizes_are_drawn_for_a_gate_to_refuse(tmp_path):
     assert row["body_beyond"]["nodes"] == pytest.approx(np.log(simulation["nodes"] / 108))
     assert row["refused"] == {"1": "body", "2": "body"}
     assert row["with_gate"] == row["own_base"] != row["without"]
+
+
+def test_bodies_that_a_gate_refuses_are_counted_by_split(tmp_path):
+    record, far = tmp_path / "record.json", ROOT / "validation" / "gate" / "far.toml"
+    pairs = [f"tiny={path}" for path in (ROOT / "datasets" / "tiny" / "config.toml", far)]
+    pairs.append(f"tiny={ROOT / 'datasets' / 'torsion-pilot' / 'config.toml'}")
+    command = [sys.executable, ROOT / "models" / "known_bodies.py", *pairs, "-o", record]
+    subprocess.run(command, check=True, capture_output=True)
+    found = json.loads(record.read_text())
+    own, near, large = (row["splits"] for row in found["models"])
+    assert own["evaluation"]["meshes"] == 3
+    assert all(split["refused"] == 0 for split in [*own.values(), *near.values()])
+    assert max(split["farthest"] for split in near.values()) < found["gate"]["body"]
+    assert set(near) > {"evaluation", "stiffer", "half-step", "long"}
+    assert large["evaluation"]["refused"] == large["evaluation"]["meshes"] == 10
+    assert large["evaluation"]["measure"] in SHAPE_MEASURES

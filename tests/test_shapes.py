@@ -228,6 +228,22 @@ def test_a_foreign_body_keeps_all_its_coarse_steps_and_its_network_is_not_asked(
     assert corrector.calls == 1
 
 
+def test_a_hybrid_tells_by_which_measures_its_body_is_foreign():
+    known = problems((3, 1, 1), (5, 1, 1))
+    corrector = fitted(known)
+
+    def told(problem):
+        return HybridStepper(pc.ProjectiveDynamics(problem), corrector).body_excess()
+
+    assert told(known[0]) == told(known[1]) == {}
+    longer = pc.discretise(soft_beam((12, 1, 1), loads=[TORSION]))
+    found = told(longer)
+    assert found["nodes"] == pytest.approx(np.log(52 / 24))
+    assert {"largest radius", "supported", "distance"} < set(found)
+    assert "smallest radius" not in found
+    assert max(found.values()) == pytest.approx(excess(corrector, longer)[0])
+
+
 def test_compiled_answers_refuse_a_foreign_body_too():
     corrector = fitted(problems((3, 1, 1)))
     problem = pc.discretise(soft_beam((6, 1, 1), loads=[TORSION]))

@@ -106,7 +106,8 @@ def notes(comparison: Comparison) -> list[str]:
         for label, about in comparison.models.items()
     ]
     out += [
-        f"{row.label}: {row.refused_frames} of {frames} corrections were refused by the gate."
+        f"{row.label}: {row.refused_frames} of {frames} corrections were refused by the gate "
+        f"({_reasons(comparison.runs[row.label].stats)})."
         for row in comparison.rows
         if row.refused_frames
     ]
@@ -115,6 +116,14 @@ def notes(comparison: Comparison) -> list[str]:
         if inverted:
             out.append(f"{row.label}: {inverted}.")
     return out
+
+
+def _reasons(stats: Mapping[str, Any]) -> str:
+    """Why a gate refused corrections, as "2 by features, 1 by energy"."""
+    from pdcorrect.corrector.gate import refusals
+
+    found = refusals(stats["gate"])
+    return ", ".join(f"{count} by {reason}" for reason, count in found.items() if count)
 
 
 def inverted_frames(stats: Mapping[str, Any], step: float) -> str | None:

@@ -23,7 +23,13 @@ from pdcorrect.scene.regions import NonNegative, Number, Strict
 
 
 class Reason(IntEnum):
-    """Why a correction was refused; 0 where it was not."""
+    """Why a correction was refused; 0 where it was not.
+
+    NOT_FINITE: the network's answer is not a number.  FEATURES: its inputs are unlike those of the
+    training (`Gate.margin`, `Gate.average`).  INVERSION, ENERGY: the corrected state fails
+    (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
+    body at rest is unlike those of the training (`Gate.body`).
+    """
 
     NONE = 0
     NOT_FINITE = 1

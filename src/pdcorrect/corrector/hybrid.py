@@ -23,6 +23,7 @@ from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.decision import Decision, corrected_step
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.placements import Velocity, check_velocity
+from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.implicit import ImplicitStepper
@@ -32,6 +33,10 @@ Array = NDArray[np.float64]
 
 MEMORY = "previous_correction"
 """In `State.memory`, m, where the network asks for the correction of the step before."""
+
+
+_ROUNDING = 1e-5
+"""Of measures whose ranges were fitted to meshes in single precision."""
 
 
 class HybridStepper:
@@ -135,6 +140,15 @@ class HybridStepper:
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
         }
+
+    def body_excess(self) -> dict[str, float]:
+        """Measures of the body at rest that lie outside their range in training, and how far.
+
+        By the names of `SHAPE_MEASURES`, dimensionless; a gate refuses the body if one is more
+        than its bound `Gate.body`.
+        """
+        found = self.corrector.normaliser.shape_excess(self.bodies.shapes)[0].tolist()
+        return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > _ROUNDING}
 
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""

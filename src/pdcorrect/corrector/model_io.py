@@ -305,10 +305,12 @@ def _read_description(path: Path) -> _Description:
     version = content.get("version")
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
-        raise FileVersionError(
-            f"{path}: format version {version!r}: expected {VERSION}"
-            + (": written by a newer pdcorrect: update it." if newer else ".")
+        advice = (
+            "written by a newer pdcorrect: update it."
+            if newer
+            else ("written by an older pdcorrect: docs/files.md says how to bring it up to date.")
         )
+        raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {advice}")
     if content.pop(_CHECKSUM, None) != digest:
         raise FileFormatError(
             f"{path}: damaged: its checksum is not that of its content; copy or save it again."

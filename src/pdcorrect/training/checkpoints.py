@@ -73,7 +73,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         raise FileFormatError(f"{path}: no checkpoint of a training: expected format {FORMAT!r}.")
     if head.get("version") != str(VERSION):
         raise FileVersionError(
-            f"{path}: version {head.get('version')} of its format: expected {VERSION}."
+            f"{path}: version {head.get('version')} of its format: expected {VERSION}: another "
+            "pdcorrect wrote it, and this one cannot go on with it: train anew, in another folder."
         )
     text = head.get("content", "")
     if head.get("hash") != _hash(text, tensors):
