@@ -305,11 +305,9 @@ def _read_description(path: Path) -> _Description:
     version = content.get("version")
     if version != VERSION:
         newer = isinstance(version, int) and version > VERSION
-        advice = (
-            "written by a newer pdcorrect: update it."
-            if newer
-            else ("written by an older pdcorrect: docs/files.md says how to bring it up to date.")
-        )
+        advice = "written by an older pdcorrect: docs/files.md says how to bring it up to date."
+        if newer:
+            advice = "written by a newer pdcorrect: update it."
         raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {advice}")
     if content.pop(_CHECKSUM, None) != digest:
         raise FileFormatError(

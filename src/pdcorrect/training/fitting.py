@@ -108,7 +108,7 @@ def _averages(
 
 
 def _shapes(windows: StepWindows) -> Moments:
-    """Of the measures of all bodies at rest (m, 9)."""
+    """Of the measures of all bodies at rest (m, 10)."""
     meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
     shapes = Moments()
     for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
