@@ -27,6 +27,7 @@ import torch
 
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import shard_paths
@@ -91,6 +92,13 @@ def main() -> None:
             recorded=chosen.recorded,
         )  # fmt: skip
 
+    def refused(problems: list[Problem]) -> int:
+        """Bodies that the gate refuses at rest, whose steps are the coarse ones."""
+        corrector = model.corrector
+        device = corrector.normaliser.shape_low.device
+        bodies = BodyGraph.of(problems, dtype=torch.float64, device=device)
+        return int(Gate().foreign(corrector, bodies).sum())
+
     data = Path(chosen.data)
     source = drawn(data, chosen.split, base) if data.is_file() else stored(data, chosen.split, base)
     most = min(chosen.meshes, max(batches)) if data.is_file() else max(batches)
@@ -104,6 +112,7 @@ def main() -> None:
         )  # fmt: skip
         rows.append({
             **asdict(found), "speed_up": found.speed_up, "network_share": found.network_share,
+            "bodies_refused": refused([coarse for coarse, _ in scenes]),
         })  # fmt: skip
         print(json.dumps(rows[-1], indent=1), flush=True)
     machine = environment()

@@ -18,6 +18,7 @@ from hybrid_samples import fitted, problems  # noqa: E402
 from pdcorrect.corrector import recorded  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.features import Snapshot, View  # noqa: E402
+from pdcorrect.corrector.gate import Reason  # noqa: E402
 from pdcorrect.corrector.recorded import RecordedCorrector, recordable  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 
@@ -335,3 +336,16 @@ def test_inference_mode_makes_no_difference(device, made):
     with torch.inference_mode():
         found = hybrid(state).correction
     assert torch.equal(found, hybrid(state).correction)
+
+
+def test_of_a_recorded_batch_the_foreign_body_alone_is_refused(device, made):
+    several = [*problems(*CELLS), *problems((14, 1, 1))]
+    stepper = pc.BatchStepper(several, device=device)
+    gate = pc.Gate(margin=None, average=None, volume=None, crushing=None, energy=None)
+    hybrid, state = pc.BatchHybrid(stepper, made, gate=gate, recorded=True), stepper.rest_state()
+    for _ in range(3):
+        result = hybrid(state)
+        state = result.state
+        assert result.reasons.tolist() == [*[0] * len(CELLS), Reason.BODY]
+    assert not result.correction[-len(several[-1].positions) :].any()
+    assert result.correction.any()
