@@ -25,6 +25,7 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import model_folder, weights_digest
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION, VALIDATION, DatasetConfig
+from pdcorrect.environment import environment
 from pdcorrect.replacement import write_text
 
 
@@ -49,6 +50,7 @@ def main() -> None:
         record = {
             "date": time.strftime("%Y-%m-%d"),
             "command": " ".join(["python", "models/known_bodies.py", *sys.argv[1:]]),
+            "environment": environment(),
             "gate": pc.Gate().model_dump(),
             "models": rows,
         }

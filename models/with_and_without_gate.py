@@ -5,14 +5,14 @@ python models/with_and_without_gate.py DATASET/config.toml --model MODEL ... [ME
     [--strength-factor 1.0] -o RECORD.json
 
 The reference, the plain coarse mesh, each model's own base, and that corrected, with the default
-gate and without one: Omega of each, how many have more than 1.05 times their base's error, and what
-the gate refused, and how far the body at rest lies outside the range of training bodies
+gate and without one: Omega of each, how many have more than 1.05 times their base's error, what
+the gate refused, and how far the body at rest lies outside the ranges of training bodies
 (`Gate.body`).  With ``--coarse-nodes`` bodies of other sizes, and of another family, are drawn in
 place of a split's; materials and loads are drawn as the data set's.  ``--one-clamp`` holds bodies
-at the first of their clamps only.  Without MESH/LOAD it is one
-load of each mesh.  Loads are those that are drawn first; where `pdcorrect dataset generate` has
-rejected one, this is another simulation than the data set's.  The record is written after each
-simulation; the same command goes on where it ended.
+at the first of their clamps only.  Without MESH/LOAD it is one load of each mesh.  Loads are those
+that are drawn first; where `pdcorrect dataset generate` has rejected one, this is another
+simulation than the data set's.  The record is written after each simulation; the same command goes
+on where it ended.
 """
 
 from __future__ import annotations

@@ -440,6 +440,19 @@ def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folde
     assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
 
 
+def test_stored_bodies_have_the_measures_of_those_that_are_drawn():
+    """What a training fits to is what `models/fit_shapes.py` fitted to without data."""
+    home = Path(__file__).parents[1]
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(home / "datasets" / "tiny", settings)
+    corrector = samples.fitted(home / "datasets" / "tiny", settings)
+    fit_normaliser(corrector, windows, 1)
+    drawn = load_model(home / "models" / "tiny").corrector.normaliser
+    for part in ("shape_low", "shape_high"):
+        found = getattr(corrector.normaliser, part)
+        torch.testing.assert_close(found, getattr(drawn, part), rtol=0.0, atol=1e-5)
+
+
 def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)

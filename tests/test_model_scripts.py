@@ -42,6 +42,10 @@ def test_the_page_of_results_has_the_tables_of_the_records():
     assert tables.table() in page
     assert tables.others_table() in page
     assert tables.bodies_table() in page
+    made = {"other-scenes": tables.others_table(), "other-bodies": tables.bodies_table()}
+    for folder, found in made.items():
+        records = list((ROOT / "validation" / "results" / folder).glob("*.json"))
+        assert len(found.splitlines()) == 2 + len(records) > 5  # each has its row
 
 
 def as_version_2(folder):
@@ -268,10 +272,15 @@ def test_bodies_of_other_sizes_are_drawn_for_a_gate_to_refuse(tmp_path):
     config, record = ROOT / "datasets" / "tiny" / "config.toml", tmp_path / "record.json"
     command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", config, "0/0"]
     bodies = ["--coarse-nodes", "144", "180", "--family", "beam", "--frames", "2"]
-    subprocess.run(
-        [*command, "--model", "tiny", "-o", record, *bodies], check=True, capture_output=True
-    )
+    command += ["--model", "tiny", "-o", record, *bodies]
+    subprocess.run(command, check=True, capture_output=True)
     found = json.loads(record.read_text())
+    subprocess.run(command, check=True, capture_output=True)  # knows its own record
+    assert json.loads(record.read_text()) == found
+    for wrong, told in ((["--split", "validation"], "no --split"), (["--frames", "3"], "frames")):
+        refused = subprocess.run([*command, *wrong], capture_output=True, text=True)
+        assert refused.returncode != 0
+        assert told in refused.stderr
     (simulation,) = found["simulations"]
     assert found["bodies"] == {"family": "beam", "coarse_nodes": [144, 180]}
     assert 144 <= simulation["nodes"] <= 180
