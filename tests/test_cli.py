@@ -214,7 +214,8 @@ def test_compare_goes_on_after_a_case_that_fails(
     assert (status, err) == (cli.FAILED, "")
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     others = ["coarse PD", "coarse Newton", "intermediate PD", "fine PD"]
-    assert list(rows) == [label for label in others if label != failing]
+    assert list(rows) == [*(label for label in others if label != failing), failing]
+    assert [row["failure"] != "" for row in rows.values()] == [False] * 3 + [True]
     record = json.loads((folder / "report.json").read_text())
     assert list(record["failures"]) == [failing]
     assert (record["solver_error"] is None) == (failing == "coarse PD")
@@ -437,7 +438,27 @@ def test_a_corrector_of_the_plain_mesh_is_held_against_the_plain_fine_run():
     pytest.importorskip("torch_geometric")
     cases = pc.evaluate.cases_with(["torsion-as-published"])
     assert cases[:-1] == pc.evaluate.CASES
-    assert (cases[-1].label, cases[-1].better) == ("hybrid torsion-as-published", False)
+    assert (cases[-1].label, cases[-1].base) == ("hybrid torsion-as-published", "plain")
+
+
+def test_correctors_of_the_plain_mesh_and_of_the_right_mass_share_a_reference():
+    pytest.importorskip("torch_geometric")
+    models = ["torsion-as-published", "torsion-as-published-total-mass"]
+    cases = pc.evaluate.cases_with([*models, models[1].replace("torsion", "stretch")])
+    assert cases[:4] == pc.evaluate.CASES
+    bases = ["total-mass", "plain", "total-mass", "total-mass"]
+    assert [case.base for case in cases[4:]] == bases
+    assert cases[4].label == "coarse PD, total mass"
+
+
+def test_a_base_is_known_and_on_a_mesh_that_it_is_for():
+    scene, case = beam((2, 1, 1)), pc.evaluate.CASES[1]
+    for base in ("total-mass", "worst"):
+        with pytest.raises(pc.errors.InputError, match="refined 2 times: expected 'plain' or"):
+            dataclasses.replace(case, base=base).problem(scene)
+    with pytest.raises(pc.errors.InputError, match="base 'worst': expected one of plain, best"):
+        dataclasses.replace(case, base="worst", refine=1).problem(scene)
+    assert dataclasses.replace(case, base="best").problem(scene).element == "hex8-bubble"
 
 
 def test_refused_corrections_are_told():
@@ -452,6 +473,15 @@ def test_refused_corrections_are_told():
     )
 
 
+def test_correctors_without_a_gate_are_refused_nothing():
+    pytest.importorskip("torch_geometric")
+    scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
+    stiff = scene.with_changes(material={"young": 1e7}, time={"frames": 2})
+    cases = pc.evaluate.cases_with(["torsion-exact"], gate=False)[-1:]
+    (row,) = pc.compare(stiff, cases=cases).rows
+    assert (row.label, row.refused_frames) == ("hybrid torsion-exact, no gate", 0)
+
+
 def test_correctors_are_told_apart_and_are_of_one_coarse_model(tmp_path):
     pytest.importorskip("torch_geometric")
     for name in ("one", "two"):
@@ -459,7 +489,7 @@ def test_correctors_are_told_apart_and_are_of_one_coarse_model(tmp_path):
     models = [str(tmp_path / name / "model") for name in ("one", "two")]
     labels = [case.label for case in pc.evaluate.cases_with(models)]
     assert labels[-2:] == ["hybrid one/model", "hybrid two/model"]
-    with pytest.raises(pc.errors.InputError, match="correctors of best, plain: expected of one"):
+    with pytest.raises(pc.errors.InputError, match="of best, plain: expected of 'best' or"):
         pc.evaluate.cases_with([models[0], "torsion-as-published"])
     with pytest.raises(pc.errors.InputError, match="coarse PD, coarse PD: expected each one once"):
         pc.compare(beam((2, 1, 1)), cases=pc.evaluate.CASES[2:3] * 2)

@@ -162,9 +162,6 @@ def test_a_model_of_it_is_compared_beside_it(published, tmp_path):
     rows = {row.label: row for row in pc.compare(scene, cases=chosen).rows}
     base, hybrid = rows["coarse PD, total mass"], rows["hybrid silent"]
     assert hybrid.rms_error == base.rms_error < 0.7 * rows["coarse PD"].rms_error
-    shutil.copytree(tmp_path / "silent", tmp_path / "other")
-    with pytest.raises(InputError, match="correctors of plain, total-mass: expected of one"):
-        pc.evaluate.cases_with([str(tmp_path / "other"), "torsion-as-published"])
 
 
 def without(shard, name, predictions_only):

@@ -106,11 +106,12 @@ def compare(
         Optional[list[str]],
         typer.Option(help="Also a corrector, by name or folder; repeatable (extra 'learn')."),
     ] = None,
+    gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
     figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
 ) -> None:
     """Run coarse, intermediate and fine PD and Newton; report error and run time.
 
-    With a corrector, the coarse model that it corrects is compared too; with one of the best
+    With correctors, the coarse models that they correct are compared too; with those of the best
     coarse model, the fine run has that model's element.  Exit status 1 if a solver failed; the
     report then has the others, unless it was the fine run.
     """
@@ -130,7 +131,7 @@ def compare(
     if model:
         require_extra("torch", "learn")
     loaded = Scene.load(scene)
-    cases = evaluate.cases_with(model or [])
+    cases = evaluate.cases_with(model or [], gate=gate)
     count = frames or loaded.time.frames
     make_folder(output)
     with progress_bar() as progress:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pdcorrect import metrics
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.coarse_models import BASES
+from pdcorrect.fem.coarse_models import BASES, coarse_model
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.solvers.newton import Newton
@@ -33,26 +33,42 @@ class Case:
     solver : str
         "pd" or "newton".
     refine : int
-    better : bool
-        With the element and mass of `best_coarse`, on any mesh.
+    base : {"plain", "best", "total-mass"}
+        As of `coarse_model`; "best" on any mesh, "total-mass" on the coarse one only.
     model : str or None
         Name or folder of a corrector of the steps.
-    mass_of : int or None
-        The density is scaled so that the total mass is that of the scene refined so often.
+    gate : bool
+        Whether a default `Gate` lets the corrector pass.
     """
 
     label: str
     solver: str
     refine: int
-    better: bool = False
+    base: str = "plain"
     model: str | None = None
-    mass_of: int | None = None
+    gate: bool = True
 
     @property
     def plain(self) -> bool:
         """Whether it is the scene itself on the coarse mesh."""
-        changed = self.better or self.model is not None or self.mass_of is not None
-        return self.refine == 1 and not changed
+        return self.refine == 1 and self.base == "plain" and self.model is None
+
+    def problem(self, scene: Scene) -> Problem:
+        """What is stepped.
+
+        Raises
+        ------
+        InputError
+            If there is no such base on its mesh.
+        """
+        if self.refine == 1:
+            return coarse_model(scene, self.base)
+        if self.base not in ("plain", "best"):
+            raise InputError(
+                f"{self.label}: base {self.base!r} refined {self.refine} times: expected 'plain' "
+                "or 'best'."
+            )
+        return discretise(best_coarse(scene) if self.base == "best" else scene, self.refine)
 
 
 CASES = (
@@ -62,6 +78,9 @@ CASES = (
     Case("coarse Newton", "newton", 1),
 )
 """The default comparison; the first case is the reference of all errors."""
+
+_COARSE = {"best": "best coarse PD", "total-mass": "coarse PD, total mass"}
+"""Labels of coarse models by their base."""
 
 
 @dataclass(frozen=True)
@@ -150,77 +169,72 @@ def _stepper(problem: Problem, solver: str) -> Stepper:
     return kinds[solver](problem).prepare()
 
 
-def cases_with(models: Sequence[str]) -> tuple[Case, ...]:
-    """The default comparison with correctors of one coarse model.
+def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
+    """The default comparison with correctors.
 
     Those of the best coarse model have learned references with its element: all errors
-    are then distances from such a one.  The coarse model that they correct is among the cases.
+    are then distances from such a one.  The coarse models that they correct are among the cases.
 
     Parameters
     ----------
     models : sequence of str
         Names or folders.
+    gate : bool
+        Of the correctors.
 
     Raises
     ------
     InputError
-        If there is no such model, or they do not all correct one coarse model.
+        If there is no such model, or they learned from references of unlike elements.
     """
     if not models:
         return CASES
     from pdcorrect.corrector.model_io import load_model, model_folder, model_names
 
     names = model_names([model_folder(model).resolve() for model in models])
-    bases = {load_model(model).base for model in models}
-    if len(bases) > 1:
-        raise InputError(
-            f"models {', '.join(names)}: correctors of {', '.join(sorted(bases))}: expected of one "
-            "coarse model, as their references have its element; compare the others apart."
-        )
-    (base,) = bases
-    if base not in BASES:
-        raise InputError(f"{names[0]}: corrects {base!r}: expected one of {', '.join(BASES)}.")
+    bases = [load_model(model).base for model in models]
+    for name, base in zip(names, bases, strict=True):
+        if base not in BASES:
+            raise InputError(f"{name}: corrects {base!r}: expected one of {', '.join(BASES)}.")
     reference, *others = CASES
-    corrected = Case("coarse PD", "pd", 1)
-    if base == "best":
-        reference = replace(reference, label="fine best PD", better=True)
-        corrected = Case("best coarse PD", "pd", 1, better=True)
-    elif base == "total-mass":
-        corrected = Case("coarse PD, total mass", "pd", 1, mass_of=reference.refine)
+    if "best" in bases:
+        if set(bases) != {"best"}:
+            raise InputError(
+                f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: "
+                "expected of 'best' or of the others, as their references have unlike elements; "
+                "compare the others apart."
+            )
+        reference = replace(reference, label="fine best PD", base="best")
+    without = "" if gate else ", no gate"
     return (
         reference,
         *others,
-        *([] if corrected.plain else [corrected]),
+        *(Case(_COARSE[b], "pd", 1, b) for b in dict.fromkeys(bases) if b != "plain"),
         *(
-            replace(corrected, label=f"hybrid {name}", model=model)
-            for name, model in zip(names, models, strict=True)
+            Case(f"hybrid {name}{without}", "pd", 1, base, model, gate)
+            for name, base, model in zip(names, bases, models, strict=True)
         ),
     )
 
 
 def case_stepper(scene: Scene, case: Case) -> Stepper:
-    """What steps a case, factorised and with its kernels compiled; correctors have their gate.
+    """What steps a case, factorised and with its kernels compiled.
 
     Raises
     ------
     InputError
-        If there is no such solver or model, or a model does not fit the scene.
+        If there is no such solver, base or model, or a model does not fit the scene.
     """
-    if case.better:
-        scene = best_coarse(scene)
-    problem = discretise(scene, case.refine)
-    if case.mass_of is not None:
-        problem = problem.with_total_mass(float(discretise(scene, case.mass_of).mass.sum()))
+    problem = case.problem(scene)
     if case.model is None:
         return _stepper(problem, case.solver)
     from pdcorrect.corrector.gate import Gate
     from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model
 
-    model = load_model(case.model)
+    model, gate = load_model(case.model), Gate() if case.gate else None
     coarse = ProjectiveDynamics(problem)
-    hybrid = HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=Gate())
-    return hybrid.prepare()
+    return HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=gate).prepare()
 
 
 def compare(
@@ -271,9 +285,7 @@ def compare(
     complete = tuple(case for case in cases if case.label in runs)
     base = next((on_coarse[c.label] for c in complete[::-1] if c.plain and c.solver == "pd"), None)
     rows = []
-    for case in sorted(
-        complete, key=lambda c: (c.refine, c.better, bool(c.mass_of), c.solver != "pd")
-    ):
+    for case in sorted(complete, key=lambda c: (c.refine, BASES.index(c.base), c.solver != "pd")):
         run, here = runs[case.label], on_coarse[case.label]
         has_base = base is not None and metrics.mean_squared_error(base, truth) > 0
         rows.append(

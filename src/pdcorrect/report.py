@@ -87,8 +87,8 @@ def notes(comparison: Comparison) -> list[str]:
             "all rows share)."
         )
     if comparison.solver_error is not None:
-        better = any(c.better for c in comparison.cases if c.label == comparison.reference)
-        of_element = " and the element's" if better else ""
+        best = {c.label for c in comparison.cases if c.base == "best"}
+        of_element = " and the element's" if comparison.reference in best else ""
         out.append(
             f"PD and Newton on the coarse mesh differ by at most "
             f"{1e3 * comparison.solver_error:.2g} mm (solver error); the rest of their error is "
@@ -171,11 +171,13 @@ def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
 
 
 def to_csv(comparison: Comparison) -> str:
-    """All numbers in SI units, one line a solver."""
+    """All numbers in SI units, one line a solver; of those that failed label and reason."""
     buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([f.name for f in dataclasses.fields(Row)])
-    writer.writerows(dataclasses.astuple(row) for row in comparison.rows)
+    names = [field.name for field in dataclasses.fields(Row)]
+    writer = csv.DictWriter(buffer, [*names, "failure"], restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(dataclasses.asdict(row) for row in comparison.rows)
+    writer.writerows({"label": k, "failure": why} for k, why in comparison.failures.items())
     return buffer.getvalue()
 
 
@@ -275,9 +277,7 @@ def overlaid_labels(comparison: Comparison) -> list[str]:
     cases = [case for case in comparison.cases if case.label in errors]
     plain = [c.label for c in cases if c.plain and c.solver == "pd"]
     finer = [c.label for c in cases if c.refine > 1 and c.label != comparison.reference]
-    better = [
-        c.label for c in cases if c.refine == 1 and (c.model or c.better or c.mass_of)
-    ] or finer
+    better = [c.label for c in cases if c.refine == 1 and (c.model or c.base != "plain")] or finer
     nearest = sorted(better, key=lambda label: errors[label])[:1]
     return list(dict.fromkeys([comparison.reference, *nearest, *plain[:1]]))
 
