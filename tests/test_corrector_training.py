@@ -98,6 +98,10 @@ FORCED = '[corrector]\nchanges = {placement = "force"}\n'
         (BASIC.replace("one-step", "unrolled") + "[stages.noise]\ntau = 0.1\n", "noise has no"),
         (BASIC.replace("one-step", "two-step"), 'stages.0.kind = "two-step"'),
         (BASIC + "[stages.loss]\nkind = 'absolute'\nbend = 1.0\n", "loss .*bend has no meaning"),
+        (BASIC + "[stages.loss]\nkind = 'absolute'\nswing = 1.0\n", "loss .*swing has no meaning"),
+        (BASIC + "loss = {swing = 1.0}\n", "stages.0 .*loss.swing has no meaning"),
+        (UNROLLED + "loss = {swing = 0.0}\n", "stages.0.loss.swing = 0.0"),
+        (UNROLLED + "teacher = 'tiny'\nloss = {swing = 1.0}\n", "teacher: loss.swing"),
         (BASIC + "teacher = 'tiny'\n", "stages.0 .*teacher has no meaning"),
         (BASIC + "at_rest = 0.5\n", "stages.0 .*at_rest has no meaning"),
         (UNROLLED + "at_rest = 1.5\n", "stages.0.at_rest = 1.5"),
@@ -137,6 +141,33 @@ TRAININGS = [*(ROOT / "examples" / "training").glob("*.toml"), *(ROOT / "models"
 )
 def test_the_examples_and_recipes_can_be_read(path):
     TrainingConfig.load(path)
+
+
+def told(settings):
+    """What the table of recipes has in its columns "corrects", "seconds" and "goes on with"."""
+    parts = []
+    for stage in settings.stages:
+        if stage.kind == "one-step":
+            parts.append(f"single {stage.seconds:g}")
+            continue
+        steps = stage.steps if isinstance(stage.steps, tuple) else (stage.steps,)
+        detached = "" if stage.through_solver else " detached"
+        parts.append(f"{', '.join(map(str, steps))}{detached}: {stage.seconds:g}")
+    start = settings.start_from
+    return (
+        settings.base.replace("-", " "),
+        "; ".join(parts),
+        f"`{Path(start).parent.name}`" if start else "",
+    )
+
+
+def test_each_recipe_has_its_row_in_the_table():
+    folder = ROOT / "models" / "recipes"
+    lines = (folder / "README.md").read_text(encoding="utf-8").splitlines()
+    cells = [[c.strip() for c in line.split("|")[1:-1]] for line in lines if line.startswith("| `")]
+    rows = {row[0].strip("`"): tuple(row[1:4]) for row in cells}
+    recipes = {str(p.relative_to(folder).with_suffix("")): p for p in folder.glob("*/*.toml")}
+    assert rows == {name: told(TrainingConfig.load(path)) for name, path in recipes.items()}
 
 
 def test_the_thesis_is_an_example():

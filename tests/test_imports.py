@@ -211,6 +211,7 @@ ORDER = [
     "training.resident",
     "training.windows",
     "training.fitting",
+    "training.vibrations",
     "training.scenes",
     "training.unrolled",
     "training.world",

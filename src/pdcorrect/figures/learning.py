@@ -11,6 +11,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.figures.curves import _axes, _legend, _save, _style
 
 _BINS = 24
+_HALF = 50.0  # per cent
 
 
 def plot_omega(values: Mapping[str, Sequence[float]], output: str | Path) -> Path:
@@ -45,6 +46,8 @@ def plot_validations(
 ) -> Path:
     """Omega on the validation split, per cent, over the time of training, s, one line a training.
 
+    Zero is in the plot only where a value is below a half: what is near 100 is told apart then.
+
     Parameters
     ----------
     histories : mapping of str to (seconds, omegas)
@@ -62,7 +65,8 @@ def plot_validations(
     figure, (axis,) = _axes(1, 4.5)
     for index, (label, (seconds, omegas)) in enumerate(histories.items()):
         axis.plot(seconds, omegas, marker="o", markersize=4, label=label, **_style(index))
-    axis.axhline(0.0, color="0.5", linewidth=0.8)
+    if min(min(omegas) for _, omegas in histories.values()) < _HALF:
+        axis.axhline(0.0, color="0.5", linewidth=0.8)
     axis.set_xlabel("time of training [s]")
     axis.set_ylabel("Omega, mean on the validation split [%]")
     _legend(figure, [axis])

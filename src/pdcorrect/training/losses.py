@@ -10,8 +10,9 @@ reference is the mean over the body's nodes of the squared distance over
 The factor is how far j equal one-step errors carry: each of them is an error e of the
 positions and so e / h of the velocities, and j of them in the same direction add up to
 e (1 + 2 + ... + j) where nothing holds the body back.  The base model itself has a loss of
-about one, whether a trajectory moves by metres or trembles by micrometres.  With a bend b
-a loss x counts as b log(1 + x / b).
+about one, whether a trajectory moves by metres or trembles by micrometres.  With a weight
+``swing`` what the error of the velocities leads to (`pdcorrect.training.vibrations`) is added,
+over D, times that weight.  With a bend b a loss x counts as b log(1 + x / b).
 
 The "absolute" loss (thesis, eq. 5-3) sums over a body's nodes distances, or their squares,
 of positions in units of 1 / 1000 m.
@@ -49,11 +50,21 @@ class BaseErrors:
     def after(self, steps: Tensor | int) -> Tensor:
         """d(j) for j steps, one number or (B,)."""
         factor = (steps * (steps + 1) / 2) ** 2
-        return torch.minimum(factor * self.one_step, torch.maximum(self.rollout, self.one_step))
+        return torch.minimum(factor * self.one_step, self.most)
+
+    @property
+    def most(self) -> Tensor:
+        """D, at least d1, (B,)."""
+        return torch.maximum(self.rollout, self.one_step)
 
 
 def body_losses(
-    loss: Loss, errors: Tensor, total: Callable[[Tensor], Tensor], counts: Tensor, scale: Tensor
+    loss: Loss,
+    errors: Tensor,
+    total: Callable[[Tensor], Tensor],
+    counts: Tensor,
+    scale: Tensor,
+    further: Tensor | float = 0.0,
 ) -> Tensor:
     """The loss of each body, (B,).
 
@@ -68,9 +79,11 @@ def body_losses(
         Nodes of each body.
     scale : (B,)
         d(j), m2.
+    further : (B,)
+        Added to relative losses.
     """
     if loss.kind == "relative":
-        ratios = total(errors.square().sum(dim=-1)) / (counts * scale)
+        ratios = total(errors.square().sum(dim=-1)) / (counts * scale) + further
         return ratios if loss.bend is None else loss.bend * torch.log1p(ratios / loss.bend)
     errors = loss.scale * errors
     if loss.power == 1:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
@@ -18,6 +19,7 @@ from pdcorrect.corrector.placements import Velocity
 from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import Base
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
+from pdcorrect.training.vibrations import Vibrations
 
 Frames = NDArray[np.int64]
 
@@ -108,6 +110,15 @@ class SceneGroup:
         now = self.truth(frames)
         return now, (now - self.truth(np.maximum(frames - 1, 0))) / self.time_step
 
+    @cached_property
+    def vibrations(self) -> Vibrations:
+        """Of the scenes' bodies about their shapes at rest."""
+        shared = Sharing(self.stepper.problems, self.device)
+        durations = self.time_step * self.steps
+        return Vibrations(
+            shared.distinct, shared.owners, durations, self.mask.shape[1], self.device
+        )
+
     def times(self, frames: Frames) -> list[float]:
         """Seconds."""
         return [self.time_step * int(frame) for frame in frames]
@@ -119,7 +130,7 @@ class SceneGroup:
     def lost(self, positions: Tensor, frames: Frames, most: float) -> NDArray[np.bool_]:
         """Which scenes are off by more than ``most`` times the base model's D, squared, (B,)."""
         squares = self.sums((positions - self.truth(frames)).square().sum(dim=2)) / self.counts
-        far = ~(squares <= most * torch.maximum(self.errors.rollout, self.errors.one_step))
+        far = ~(squares <= most * self.errors.most)
         found: NDArray[np.bool_] = far.cpu().numpy()
         return found
 
