@@ -4,7 +4,7 @@ python models/table.py
 
 The first has models on unseen meshes of their evaluation splits, the second scenes unlike those
 of the training, with the default gate of then and without one, the third bodies of other sizes and
-families, the fourth beside the first what single steps and rollouts of the same models are worth.
+families, the fourth, for the models of the first, errors of single steps beside those of rollouts.
 """
 
 from __future__ import annotations

@@ -478,8 +478,10 @@ def test_correctors_without_a_gate_are_refused_nothing():
     scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
     stiff = scene.with_changes(material={"young": 1e7}, time={"frames": 2})
     cases = pc.evaluate.cases_with(["torsion-exact"], gate=False)[-1:]
-    (row,) = pc.compare(stiff, cases=cases).rows
+    found = pc.compare(stiff, cases=cases)
+    (row,) = found.rows
     assert (row.label, row.refused_frames) == ("hybrid torsion-exact, no gate", 0)
+    assert any("of no use, and it has no gate." in note for note in report.notes(found))
 
 
 def test_correctors_are_told_apart_and_are_of_one_coarse_model(tmp_path):

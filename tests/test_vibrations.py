@@ -1,4 +1,4 @@
-"""How far velocities' errors swing bodies: against modes, simulations and drifting bodies."""
+"""What errors come to in the frames ahead: against modes, simulations and drifting bodies."""
 
 from dataclasses import replace
 
@@ -7,93 +7,121 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.modes import modes
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.training.losses import LEAST_ERROR  # noqa: E402
+from pdcorrect.training import scenes  # noqa: E402
 from pdcorrect.training.recordings import load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, unroll  # noqa: E402
-from pdcorrect.training.vibrations import MODES, Vibrations  # noqa: E402
+from pdcorrect.training.vibrations import MODES, Vibrations, body_modes  # noqa: E402
 
-LONG = 1e3  # s
+STEP = 0.01  # s
+CPU = torch.device("cpu")
 
 
 def held_beam(**changes):
     return pc.discretise(beam((6, 1, 1), loads=[], **changes))
 
 
-def of_one(problem, duration=LONG, count=MODES):
-    nodes = len(problem.positions)
-    device = torch.device("cpu")
-    return Vibrations([problem], [0], np.array([duration]), nodes, device, count)
+def of_one(problem, steps=60, count=MODES, step=STEP):
+    bodies = [body_modes(problem, count)]
+    return Vibrations(bodies, [0], np.array([steps]), step, len(problem.positions), CPU)
 
 
-def test_a_mode_swings_by_its_velocity_over_its_frequency():
+def ahead(vibrations, positions, velocities, left):
+    """Of one body, for arrays (N, 3)."""
+    errors = (torch.from_numpy(np.array(x))[None] for x in (positions, velocities))
+    return vibrations.ahead(*errors, torch.tensor([left])).item()
+
+
+def simulated(problem, positions, velocities, steps):
+    """Sum over steps of the mean squared distance of nodes from rest."""
+    stepper = pc.ProjectiveDynamics(problem)
+    state = replace(
+        problem.rest_state(), positions=problem.positions + positions, velocities=velocities
+    )
+    total = 0.0
+    for _ in range(steps):
+        state = stepper(state).state
+        total += ((state.positions - problem.positions) ** 2).sum(axis=1).mean()
+    return total
+
+
+@pytest.mark.parametrize("mode", [0, 2, 3])
+@pytest.mark.parametrize(("x", "y"), [(1.0, 0.0), (0.0, 1.0), (0.7, -0.5)])
+def test_it_is_what_backward_euler_makes_of_a_mode(mode, x, y):
+    problem = held_beam(time={"step": STEP, "integrator": "backward-euler", "frames": 1})
+    found = modes(problem, 4)
+    size = 1e-5 / np.abs(found.shapes[mode]).max()  # m: small strains
+    e, v = x * size * found.shapes[mode], y * 30.0 * size * found.shapes[mode]
+    for left in (1, 5, 25):
+        expected = simulated(problem, e, v, left) / 60
+        assert ahead(of_one(problem), e, v, left) == pytest.approx(expected, rel=2e-3)
+
+
+def test_it_is_nearly_that_of_a_mix_of_modes():
+    problem = held_beam(time={"step": STEP, "integrator": "backward-euler", "frames": 1})
+    found, generator = modes(problem, 4), np.random.default_rng(4)
+    e, v = (
+        scale * np.einsum("m,mnd->nd", generator.normal(size=4), found.shapes)
+        for scale in (1e-6, 3e-5)
+    )
+    expected = simulated(problem, e, v, 40) / 60
+    assert ahead(of_one(problem), e, v, 40) == pytest.approx(expected, rel=0.1)
+
+
+def test_nothing_lies_ahead_of_the_last_frame():
     problem = held_beam()
-    found = modes(problem, 3)
-    for shape, frequency in zip(found.shapes, found.frequencies, strict=True):
-        amplitude = 0.5 / (2 * np.pi * frequency)
-        expected = 0.5 * amplitude**2 * (shape**2).sum() / len(shape)
-        reach = of_one(problem).reach(torch.from_numpy(0.5 * shape)[None])
-        assert reach.tolist() == pytest.approx([expected], rel=1e-5)
+    shape = modes(problem, 1).shapes[0]
+    assert ahead(of_one(problem), shape, shape, 0) == 0.0
 
 
 def test_modes_that_are_left_out_do_not_count():
     problem = held_beam()
-    shapes = torch.from_numpy(modes(problem, 4).shapes)
-    two = of_one(problem, count=2)
-    assert two.reach(shapes[3:4]).item() < 1e-10 * two.reach(shapes[:1]).item()
-
-
-def test_it_is_what_a_simulation_comes_to():
-    """Of the second-order integrator over whole periods, from rest with any small velocities."""
-    step = 1e-3
-    problem = held_beam(time={"step": step, "integrator": "midpoint", "frames": 1})
-    generator = np.random.default_rng(4)
-    smooth = modes(problem, 3)
-    weights = generator.normal(size=3) * smooth.frequencies
-    speeds = 1e-4 * np.einsum("m,mnd->nd", weights, smooth.shapes)
-    steps = round(10 / smooth.frequencies[0] / step)
-    stepper = pc.ProjectiveDynamics(problem)
-    state = replace(problem.rest_state(), velocities=speeds)
-    squares = []
-    for _ in range(steps):
-        state = stepper(state).state
-        squares.append(((state.positions - problem.positions) ** 2).sum(axis=1).mean())
-    reach = of_one(problem).reach(torch.from_numpy(speeds)[None]).item()
-    assert np.mean(squares) == pytest.approx(reach, rel=0.05)
+    shapes, two = modes(problem, 4).shapes, of_one(problem, count=2)
+    none = np.zeros_like(shapes[0])
+    assert ahead(two, none, shapes[3], 60) < 1e-10 * ahead(two, none, shapes[0], 60)
 
 
 def test_a_body_without_clamps_drifts():
     """Rigid modes are orthogonal by mass and nearly so by node: what they share is left out."""
     problem = pc.discretise(beam((4, 1, 1), clamps=[], loads=[]))
-    v = torch.zeros(1, len(problem.positions), 3, dtype=torch.float64)
-    v[..., 1] = 0.3
-    drift = (0.3 * 2.0) ** 2 / 3
-    assert of_one(problem, duration=2.0).reach(v).item() == pytest.approx(drift, rel=0.05)
+    e, v = np.zeros((2, len(problem.positions), 3))
+    e[:, 1], v[:, 1] = 0.2, 0.3
+    n = np.arange(1, 31)
+    drift = ((0.2 + 0.3 * STEP * n) ** 2).sum() / 60
+    assert ahead(of_one(problem), e, v, 30) == pytest.approx(drift, rel=0.05)
 
 
 def test_bodies_of_a_batch_are_independent():
     one, two = held_beam(), pc.discretise(beam((3, 2, 2), loads=[]))
     nodes = max(len(one.positions), len(two.positions))
-    both = Vibrations([one, two], [1, 0, 1], np.full(3, LONG), nodes, torch.device("cpu"))
-    v = torch.from_numpy(np.random.default_rng(0).normal(size=(3, nodes, 3)))
+    steps, left = np.array([60, 30, 40]), torch.tensor([10, 30, 7])
+    both = Vibrations([body_modes(p) for p in (one, two)], (1, 0, 1), steps, STEP, nodes, CPU)
+    x, v = np.random.default_rng(0).normal(size=(2, 3, nodes, 3))
+    found = both.ahead(torch.from_numpy(x), torch.from_numpy(v), left)
     alone = [
-        of_one(p).reach(v[i : i + 1, : len(p.positions)]).item()
+        ahead(of_one(p, steps[i]), x[i, : len(p.positions)], v[i, : len(p.positions)], left[i])
         for i, p in enumerate((two, one, two))
     ]
-    assert both.reach(v).tolist() == pytest.approx(alone, rel=1e-5)
+    assert found.tolist() == pytest.approx(alone, rel=1e-5)
 
 
 def test_a_body_with_few_free_components_has_fewer_modes():
     problem = pc.discretise(beam((1, 1, 1), loads=[]))
     free = int(problem.free.sum())
-    v = torch.from_numpy(1e-3 * problem.free[None].astype(float))
-    assert of_one(problem, count=free + 5).reach(v).item() > 0.0
+    assert len(body_modes(problem, free + 5).frequencies) == free - 1
+    h, boxes = 0.02, ([0, 1, 1], [1, 0, 1], [1, 1, 0])  # of a cell: all nodes but one
+    held = [{"region": {"box": [[0.0] * 3, [h * x for x in box]]}} for box in boxes]
+    plane = {"region": {"box": [[0.0] * 3, [h] * 3]}, "components": ["x", "y"]}
+    hinged = pc.discretise(beam((1, 1, 1), loads=[], clamps=[*held, plane]))
+    assert hinged.free.sum() == 1
+    assert len(body_modes(hinged).frequencies) == 0
 
 
 # --- in a loss ---------------------------------------------------------------------------
@@ -105,8 +133,13 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def group(folder):
-    return SceneGroup(load_recordings(folder, "training", "plain"), "plain", "cpu")
+def recordings(folder):
+    return load_recordings(folder, "training", "plain")
+
+
+@pytest.fixture(scope="module")
+def group(recordings):
+    return SceneGroup(recordings, "plain", "cpu")
 
 
 def started(group, frames):
@@ -119,36 +152,34 @@ def started(group, frames):
 def test_it_is_added_over_the_error_of_the_base_models_rollout(group, folder, bend):
     frames = np.array([2, 7, 11])
     losses = {}
-    for swing in (None, 0.7):
-        stage = samples.unrolled(loss={"bend": bend, "swing": swing})
+    for weight in (None, 0.7):
+        stage = samples.unrolled(loss={"bend": bend, "ahead": weight})
         silent = samples.fitted(folder, samples.config(stage), silent=True)
         found = unroll(group, silent, started(group, frames), 1, stage)
-        losses[swing] = found.losses if bend is None else bend * torch.expm1(found.losses / bend)
-    wrong = found.end.velocities - group.states(frames + 1)[1]
-    reach = group.vibrations.reach(wrong)
-    assert (reach > LEAST_ERROR).all()
-    expected = 0.7 * reach / torch.maximum(group.errors.rollout, group.errors.one_step)
-    torch.testing.assert_close(losses[0.7] - losses[None], expected)
+        losses[weight] = found.losses if bend is None else bend * torch.expm1(found.losses / bend)
+    truth, speeds = group.states(frames + 1)
+    left = torch.from_numpy(group.steps - frames - 1)
+    errors = found.end.positions - truth, found.end.velocities - speeds
+    largest = torch.maximum(group.errors.rollout, group.errors.one_step)
+    expected = group.vibrations.ahead(*errors, left) / largest
+    assert (expected > 1e-3).all()
+    torch.testing.assert_close(losses[0.7] - losses[None], 0.7 * expected)
 
 
 def test_it_has_a_gradient(group, folder):
-    stage = samples.unrolled(loss={"swing": 1.0}, through_solver=True)
-    corrector = samples.fitted(folder, samples.config(stage))
-    frames = np.array([0, 3, 5])
-    unroll(group, corrector, started(group, frames), 2, stage).losses.mean().backward()
-    plain = samples.unrolled(through_solver=True)
-    grads = [p.grad.clone() for p in corrector.network.parameters()]
-    corrector.network.zero_grad()
-    unroll(group, corrector, started(group, frames), 2, plain).losses.mean().backward()
-    others = [p.grad for p in corrector.network.parameters()]
-    assert any(
-        (a - b).abs().max() > 1e-6 * b.abs().max() for a, b in zip(grads, others, strict=True)
-    )
-    assert all(torch.isfinite(g).all() for g in grads)
+    frames, grads = np.array([0, 3, 5]), []
+    corrector = samples.fitted(folder, samples.config(samples.unrolled()))
+    for loss in ({}, {"ahead": 1.0}):
+        stage = samples.unrolled(loss=loss, through_solver=True)
+        corrector.network.zero_grad()
+        unroll(group, corrector, started(group, frames), 2, stage).losses.mean().backward()
+        grads.append(torch.cat([p.grad.flatten() for p in corrector.network.parameters()]))
+    assert torch.isfinite(grads[1]).all()
+    assert (grads[1] - grads[0]).norm() > 1e-3 * grads[0].norm()
 
 
 def test_a_scene_that_fails_leaves_the_others_theirs(group, folder):
-    stage = samples.unrolled(loss={"swing": 1.0})
+    stage = samples.unrolled(loss={"ahead": 1.0})
     silent = samples.fitted(folder, samples.config(stage), silent=True)
     frames = np.array([2, 7, 11])
     good = unroll(group, silent, started(group, frames), 1, stage)
@@ -158,3 +189,35 @@ def test_a_scene_that_fails_leaves_the_others_theirs(group, folder):
     assert found.alive.tolist() == [True, False, True]
     assert found.losses[1] == 0.0
     torch.testing.assert_close(found.losses[[0, 2]], good.losses[[0, 2]])
+
+
+def test_modes_of_a_mesh_are_computed_once(recordings, monkeypatch):
+    asked = []
+
+    def counted(problem):
+        asked.append(problem)
+        return body_modes(problem)
+
+    monkeypatch.setattr(scenes, "body_modes", counted)
+    groups = SceneGroups(recordings, "plain")
+    for chosen in (recordings[:1], recordings, recordings[1:]):
+        groups(chosen).vibrations  # noqa: B018
+    assert len(asked) == len({r.mesh for r in recordings})
+
+
+def test_modes_that_are_not_found_name_the_recording(recordings, monkeypatch):
+    def failing(problem):
+        raise ConvergenceError("the search did not end.")
+
+    monkeypatch.setattr(scenes, "body_modes", failing)
+    with pytest.raises(ConvergenceError, match=r"training/mesh-0000/\d: its modes: the search"):
+        SceneGroup(recordings, "plain", "cpu").vibrations  # noqa: B018
+
+
+def test_other_integrators_are_refused(recordings):
+    moved = [
+        replace(r, scene_toml=r.scene_toml.replace('"backward-euler"', '"midpoint"'))
+        for r in recordings
+    ]
+    with pytest.raises(InputError, match=r"loss\.ahead with integrator 'midpoint'"):
+        SceneGroup(moved, "plain", "cpu").vibrations  # noqa: B018

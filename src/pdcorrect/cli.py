@@ -104,9 +104,14 @@ def compare(
     frames: Frames = None,
     model: Annotated[
         Optional[list[str]],
-        typer.Option(help="Also a corrector, by name or folder; repeatable (extra 'learn')."),
+        typer.Option(
+            help="Also a corrector, by name or folder; repeatable (extra 'learn'). Those of base "
+            "'best' not together with others."
+        ),
     ] = None,
-    gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
+    gate: Annotated[
+        bool, typer.Option(help="Of correctors: let the default gate refuse doubtful corrections.")
+    ] = True,
     figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
 ) -> None:
     """Run coarse, intermediate and fine PD and Newton; report error and run time.

@@ -100,9 +100,11 @@ def notes(comparison: Comparison) -> list[str]:
         for row in comparison.rows
         if row.unusual_frames
     ]
+    gated = {case.label: case.gate for case in comparison.cases}
     out += [
         f"{label}: trained on scenes of the data set {about['dataset']!r} and with references of "
-        "its setting; on others it may be of no use, and its gate need not notice."
+        "its setting; on others it may be of no use, and "
+        + ("its gate need not notice." if gated[label] else "it has no gate.")
         for label, about in comparison.models.items()
     ]
     out += [

@@ -62,7 +62,8 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     InputError
         If ``count`` is not below the number of free components.
     ConvergenceError
-        If K has negative eigenvalues: the positions are no stable equilibrium.
+        If K has negative eigenvalues: the positions are no stable equilibrium; or if the search
+        does not end.
     """
     at = problem.positions if positions is None else positions
     free = np.flatnonzero(problem.free)
@@ -74,7 +75,10 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
         K.shape, matvec=_inverse(K + shift * M, rigid_motions(at)[free]), dtype=np.float64
     )
     start = np.random.default_rng(0).normal(size=len(free))  # for the same digits every time
-    values, vectors = spla.eigsh(K, count, M, sigma=-shift, OPinv=inverse, v0=start)
+    try:
+        values, vectors = spla.eigsh(K, count, M, sigma=-shift, OPinv=inverse, v0=start)
+    except spla.ArpackNoConvergence as error:
+        raise ConvergenceError(f"the search for {count} modes: {error}.") from None
     order = np.argsort(values)
     shapes = np.zeros((count, problem.free.size))
     shapes[:, free] = vectors[:, order].T

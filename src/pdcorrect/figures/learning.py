@@ -46,7 +46,7 @@ def plot_validations(
 ) -> Path:
     """Omega on the validation split, per cent, over the time of training, s, one line a training.
 
-    Zero is in the plot only where a value is below a half: what is near 100 is told apart then.
+    Zero is in the plot only where a value is below 50 %: what is near 100 is told apart then.
 
     Parameters
     ----------

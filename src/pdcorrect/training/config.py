@@ -61,20 +61,20 @@ class Loss(Strict):
     bend
         Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``), so that those
         far above ``bend`` do not outweigh all others.  None: as x.
-    swing
-        Of "relative", in unrolled stages: weight of how far the velocities' error swings the
-        body (`pdcorrect.training.vibrations`).
+    ahead
+        Of "relative", in unrolled stages: weight of what the error of a state will come to in the
+        frames ahead (`pdcorrect.training.vibrations`).
     """
 
     kind: Literal["relative", "absolute"] = "relative"
     power: Literal[1, 2] = 2
     scale: Positive = 1000.0
     bend: Positive | None = None
-    swing: Positive | None = None
+    ahead: Positive | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Loss:
-        for name in ("bend", "swing"):
+        for name in ("bend", "ahead"):
             if self.kind == "absolute" and getattr(self, name) is not None:
                 raise ValueError(f"{name} has no meaning in a loss of kind 'absolute'")
         return self
@@ -196,7 +196,7 @@ class Stage(Strict):
             told = {
                 "steps": self.steps != (1,), "through_solver": self.through_solver,
                 "start": self.start != "reference", "at_rest": self.at_rest > 0.0,
-                "teacher": self.teacher is not None, "loss.swing": self.loss.swing is not None,
+                "teacher": self.teacher is not None, "loss.ahead": self.loss.ahead is not None,
             }  # fmt: skip
         else:
             told = {"epochs": self.epochs is not None, "noise": self.noise.tau > 0.0}
@@ -208,8 +208,8 @@ class Stage(Strict):
                 "teacher: its corrections are learned step by step, over the base model's error: "
                 "expected through_solver = false and a loss of kind 'relative'"
             )
-        if self.teacher is not None and self.loss.swing is not None:
-            raise ValueError("teacher: loss.swing is of errors from the reference: expected none")
+        if self.teacher is not None and self.loss.ahead is not None:
+            raise ValueError("teacher: loss.ahead is of errors from the reference: expected none")
         return self
 
     def horizon(self, progress: float) -> int:
@@ -264,6 +264,11 @@ class TrainingConfig(TomlConfig):
     def _placed(self) -> TrainingConfig:
         placement = self.corrector.config().placement
         for k, stage in enumerate(self.stages):
+            if stage.loss.ahead is not None and self.velocity != "recomputed":
+                raise ValueError(
+                    f"stages.{k}: loss.ahead is of velocities that are differences of positions, "
+                    "as the reference's are: expected velocity = 'recomputed'"
+                )
             if placement != "state" and stage.teacher is not None:
                 raise ValueError(f"stages.{k}: a teacher teaches corrections of states only")
             if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):

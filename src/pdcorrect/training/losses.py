@@ -11,8 +11,8 @@ The factor is how far j equal one-step errors carry: each of them is an error e 
 positions and so e / h of the velocities, and j of them in the same direction add up to
 e (1 + 2 + ... + j) where nothing holds the body back.  The base model itself has a loss of
 about one, whether a trajectory moves by metres or trembles by micrometres.  With a weight
-``swing`` what the error of the velocities leads to (`pdcorrect.training.vibrations`) is added,
-over D, times that weight.  With a bend b a loss x counts as b log(1 + x / b).
+``ahead`` what the error will come to in the frames ahead (`pdcorrect.training.vibrations`) is
+added, over D, times that weight.  With a bend b a loss x counts as b log(1 + x / b).
 
 The "absolute" loss (thesis, eq. 5-3) sums over a body's nodes distances, or their squares,
 of positions in units of 1 / 1000 m.
@@ -50,10 +50,10 @@ class BaseErrors:
     def after(self, steps: Tensor | int) -> Tensor:
         """d(j) for j steps, one number or (B,)."""
         factor = (steps * (steps + 1) / 2) ** 2
-        return torch.minimum(factor * self.one_step, self.most)
+        return torch.minimum(factor * self.one_step, self.largest)
 
     @property
-    def most(self) -> Tensor:
+    def largest(self) -> Tensor:
         """D, at least d1, (B,)."""
         return torch.maximum(self.rollout, self.one_step)
 
@@ -64,7 +64,7 @@ def body_losses(
     total: Callable[[Tensor], Tensor],
     counts: Tensor,
     scale: Tensor,
-    further: Tensor | float = 0.0,
+    added: Tensor | float = 0.0,
 ) -> Tensor:
     """The loss of each body, (B,).
 
@@ -79,11 +79,11 @@ def body_losses(
         Nodes of each body.
     scale : (B,)
         d(j), m2.
-    further : (B,)
-        Added to relative losses.
+    added : (B,)
+        To relative losses, before they are bent.
     """
     if loss.kind == "relative":
-        ratios = total(errors.square().sum(dim=-1)) / (counts * scale) + further
+        ratios = total(errors.square().sum(dim=-1)) / (counts * scale) + added
         return ratios if loss.bend is None else loss.bend * torch.log1p(ratios / loss.bend)
     errors = loss.scale * errors
     if loss.power == 1:

@@ -11,17 +11,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.coarse_models import Base
+from pdcorrect.fem.problem import Problem
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
-from pdcorrect.training.vibrations import Vibrations
+from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 
 Frames = NDArray[np.int64]
+Mesh = tuple[str, int]
+"""Split and number."""
 
 _LEAST_FREE = 0.2
 """Of a GPU's memory, when a group is set up."""
@@ -35,6 +37,8 @@ class SceneGroup:
     recordings : sequence of Recording
     base : {"plain", "best", "total-mass"}
     device : str or torch.device
+    modes : dict, optional
+        Modes of meshes that are known already, by split and number; new ones are added.
 
     Attributes
     ----------
@@ -48,9 +52,14 @@ class SceneGroup:
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], base: Base, device: str | torch.device
+        self,
+        recordings: Sequence[Recording],
+        base: Base,
+        device: str | torch.device,
+        modes: dict[Mesh, BodyModes] | None = None,
     ) -> None:
         self.recordings = tuple(recordings)
+        self._modes = {} if modes is None else modes
         self.stepper = BatchStepper(
             make_problems(recordings, base), device=str(device), recover=False
         )
@@ -112,11 +121,33 @@ class SceneGroup:
 
     @cached_property
     def vibrations(self) -> Vibrations:
-        """Of the scenes' bodies about their shapes at rest."""
-        shared = Sharing(self.stepper.problems, self.device)
-        durations = self.time_step * self.steps
+        """Small vibrations of the base model's bodies about their shapes at rest.
+
+        Raises
+        ------
+        InputError
+            If steps are not those of backward Euler.
+        ConvergenceError
+            If a body's modes are not found.
+        """
+        if self.stepper.integrator != "backward-euler":
+            raise InputError(
+                f"loss.ahead with integrator {self.stepper.integrator!r}: expected backward-euler, "
+                "whose velocities are differences of positions, as the reference's are."
+            )
+        meshes: dict[Mesh, int] = {}
+        for recording, problem in zip(self.recordings, self.stepper.problems, strict=True):
+            key = recording.split, recording.mesh  # of which all simulations have one material
+            meshes.setdefault(key, len(meshes))
+            if key not in self._modes:
+                self._modes[key] = _modes(recording, problem)
         return Vibrations(
-            shared.distinct, shared.owners, durations, self.mask.shape[1], self.device
+            [self._modes[key] for key in meshes],
+            [meshes[r.split, r.mesh] for r in self.recordings],
+            self.steps,
+            self.time_step,
+            self.mask.shape[1],
+            self.device,
         )
 
     def times(self, frames: Frames) -> list[float]:
@@ -130,7 +161,7 @@ class SceneGroup:
     def lost(self, positions: Tensor, frames: Frames, most: float) -> NDArray[np.bool_]:
         """Which scenes are off by more than ``most`` times the base model's D, squared, (B,)."""
         squares = self.sums((positions - self.truth(frames)).square().sum(dim=2)) / self.counts
-        far = ~(squares <= most * self.errors.most)
+        far = ~(squares <= most * self.errors.largest)
         found: NDArray[np.bool_] = far.cpu().numpy()
         return found
 
@@ -170,6 +201,7 @@ class SceneGroups:
         self.rank = rank
         self._base, self._place = base, {"seed": seed, "rank": rank, "world_size": world_size}
         self._known: dict[tuple[str, ...], SceneGroup] = {}
+        self._modes: dict[Mesh, BodyModes] = {}
 
     def of(self, size: int, shortest: int) -> list[list[Recording]]:
         """The simulations of at least so many steps, in groups of at most ``size``.
@@ -193,7 +225,7 @@ class SceneGroups:
         key = tuple(r.name for r in recordings)
         if key not in self._known:
             self._make_room()
-            self._known[key] = SceneGroup(recordings, self._base, self.device)
+            self._known[key] = SceneGroup(recordings, self._base, self.device, self._modes)
         return self._known[key]
 
     def _make_room(self) -> None:
@@ -205,6 +237,13 @@ class SceneGroups:
             del self._known[next(iter(self._known))]
             torch.cuda.empty_cache()
             free, total = torch.cuda.mem_get_info(self.device)
+
+
+def _modes(recording: Recording, problem: Problem) -> BodyModes:
+    try:
+        return body_modes(problem)
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{recording.name}: its modes: {error}") from None
 
 
 def grouped(

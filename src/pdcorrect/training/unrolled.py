@@ -201,19 +201,20 @@ def unroll(
         # Not a number times zero is not zero: it must not reach what all scenes share.
         positions = torch.where(at, positions, truth)
         velocities = torch.where(at, velocities, 0.0)
-        further: Tensor | float = 0.0
+        added: Tensor | float = 0.0
         if teacher is None:
             errors, scale = positions - truth, group.errors.after(group.on_device(ages))
-            if stage.loss.swing is not None:
+            if stage.loss.ahead is not None:
                 wrong = torch.where(at, velocities - group.states(frames)[1], 0.0)
-                reach = group.vibrations.reach(wrong)
-                further = stage.loss.swing * reach / group.errors.most
+                left = group.on_device(group.steps - frames)
+                ahead = group.vibrations.ahead(errors, wrong, left)
+                added = stage.loss.ahead * ahead / group.errors.largest
         else:
             errors = torch.where(
                 at, layer.padded(correction - _taught(teacher, views.pop(), stage)), 0.0
             )
             scale = group.errors.after(1)
-        total = total + body_losses(stage.loss, errors, group.sums, group.counts, scale, further)
+        total = total + body_losses(stage.loss, errors, group.sums, group.counts, scale, added)
     layer.watch = None
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)

@@ -1,88 +1,142 @@
-"""How far an error of the velocities swings a body: what a few steps do not yet show.
+"""What the error of a state will come to in the frames ahead, in a body's soft modes.
 
-An error v of the velocities starts, in the mode phi of frequency w (phi . M phi = 1), a free
-vibration of amplitude phi . M v / w.  The mean of its squared distances over a body's N nodes and
-over time is
+An error of positions e and velocities v, small and near the shape at rest, goes on by itself: in
+the mode phi of angular frequency w (phi . M phi = 1) backward Euler takes its coordinates
+(x, y) = (phi . M e, phi . M v) in a step h to
 
-    (phi . M v)^2 |phi|^2 / (2 w^2 N),
+    y' = (y - h w^2 x) / (1 + (h w)^2),        x' = x + h y',
 
-undamped, near the shape at rest, and without what modes of like frequency share.  In soft modes
-that is seconds away from steps of milliseconds: a rollout of few of them ends before an error has
-shown, and single steps of equal length count for very different errors of rollouts.  Where a body
-drifts rather than vibrates in the simulation's time T, the distance is that of the drift, T^2 / 3
-in place of 1 / (2 w^2).
+which is linear in x and y, so that x_n = a_n x + b_n y after n steps.  Meant over a body's N nodes
+and the T frames of its simulation, the squared distances in those that are left, R, are
+
+    sum_{n = 1..R} (a_n x + b_n y)^2 |phi|^2 / (N T),
+
+without what unlike modes have in common.  A soft mode takes a second to show an error of its
+velocity, where derivatives of training reach back over some hundredths of one; and single steps of
+equal errors differ in how much of them is in such modes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.fem.modes import Modes, modes
+from pdcorrect.fem.modes import modes
 from pdcorrect.fem.problem import Problem
 
 MODES = 8
-"""Lowest ones that count; fewer where a body has fewer free components."""
+"""Lowest ones that count; fewer where a body has no more free components."""
+
+Array = NDArray[np.float64]
 
 
-class Vibrations:
-    """The lowest modes of B bodies on a device.
+class BodyModes(NamedTuple):
+    """Of one body.
 
-    Parameters
+    Attributes
     ----------
-    distinct : sequence of Problem
-    owners : sequence of int
-        Which of them each body is, (B,).
-    durations : (B,)
-        T of each body's simulation, s.
-    nodes : int
-        Of padded tensors, N.
-    device : torch.device
-    count : int
-        Modes, at most.
+    frequencies : (m,)
+        Angular, rad/s.
+    weighted : (m, N, 3)
+        M phi, kg^1/2.
+    squares : (m,)
+        |phi|^2 / N, 1/kg.
+    """
+
+    frequencies: Array
+    weighted: Array
+    squares: Array
+
+
+def body_modes(problem: Problem, count: int = MODES) -> BodyModes:
+    """The lowest modes of a body at rest, of the problem's own mass and stiffness.
 
     Raises
     ------
     ConvergenceError
         As of `pdcorrect.modes`.
     """
+    nodes = len(problem.positions)
+    count = min(count, int(problem.free.sum()) - 1)
+    if count < 1:
+        return BodyModes(np.zeros(0), np.zeros((0, nodes, 3)), np.zeros(0))
+    found = modes(problem, count)
+    weighted = np.stack([problem.mass_matrix @ shape for shape in found.shapes])
+    squares = (found.shapes**2).sum(axis=(1, 2)) / nodes
+    return BodyModes(2.0 * np.pi * found.frequencies, weighted, squares)
+
+
+class Vibrations:
+    """The lowest modes of B bodies on a device, stepped by backward Euler.
+
+    Parameters
+    ----------
+    bodies : sequence of BodyModes
+        Unlike ones.
+    owners : sequence of int
+        Which of them each body is, (B,).
+    steps : (B,) int
+        T of each body's simulation.
+    time_step : float
+        h, s.
+    nodes : int
+        Of padded tensors.
+    device : torch.device
+    """
 
     def __init__(
         self,
-        distinct: Sequence[Problem],
+        bodies: Sequence[BodyModes],
         owners: Sequence[int],
-        durations: NDArray[np.floating],
+        steps: NDArray[np.int64],
+        time_step: float,
         nodes: int,
         device: torch.device,
-        count: int = MODES,
     ) -> None:
-        momenta = np.zeros((len(distinct), count, nodes, 3), dtype=np.float32)
-        frequencies = np.full((len(distinct), count), np.inf)
-        squares = np.zeros((len(distinct), count))
-        for k, problem in enumerate(distinct):
-            found = _lowest(problem, count)
-            most, here = len(found.frequencies), len(problem.positions)
-            for i, shape in enumerate(found.shapes):
-                momenta[k, i, :here] = problem.mass_matrix @ shape
-            frequencies[k, :most] = 2.0 * np.pi * found.frequencies
-            squares[k, :most] = (found.shapes**2).sum(axis=(1, 2)) / here
-        time = durations[:, None]
-        with np.errstate(divide="ignore"):
-            held = np.minimum(0.5 / frequencies[owners] ** 2, time**2 / 3.0)
-        self._owners = torch.as_tensor(list(owners), device=device)
-        self._momenta = torch.from_numpy(momenta).to(device)
-        self._reach = torch.from_numpy(held * squares[owners]).to(device)
+        count = max(len(body.frequencies) for body in bodies)
+        weighted = np.zeros((len(bodies), count, nodes, 3), dtype=np.float32)
+        frequencies, squares = np.zeros((2, len(bodies), count))
+        for k, body in enumerate(bodies):
+            here, its_nodes, _ = body.weighted.shape
+            weighted[k, :here, :its_nodes] = body.weighted
+            frequencies[k, :here] = body.frequencies
+            squares[k, :here] = body.squares
+        which = np.asarray(owners)
+        table = _responses(frequencies[which], int(steps.max()), time_step)
+        table *= (squares[which] / steps[:, None])[:, None, None]
+        self._owners = torch.from_numpy(which).to(device)
+        self._weighted = torch.from_numpy(weighted).to(device)
+        self._table = torch.from_numpy(table).to(device)
+        self._rows = torch.arange(len(which), device=device)
 
-    def reach(self, velocities: Tensor) -> Tensor:
-        """Mean squared distances (B,), m2, to which velocities' errors (B, N, 3), m/s, lead."""
-        momenta = self._momenta.index_select(0, self._owners).to(velocities.dtype)
-        speeds = torch.einsum("bmnd,bnd->bm", momenta, velocities)
-        return (speeds.square() * self._reach).sum(dim=1)
+    def ahead(self, positions: Tensor, velocities: Tensor, left: Tensor) -> Tensor:
+        """Mean squared distances (B,), m2, that errors will come to.
+
+        Parameters
+        ----------
+        positions, velocities : (B, N, 3)
+            Errors, m and m/s.
+        left : (B,) int
+            Frames that are left, R.
+        """
+        weighted = self._weighted.index_select(0, self._owners).to(positions.dtype)
+        x, y = (torch.einsum("bmnd,bnd->bm", weighted, z) for z in (positions, velocities))
+        xx, xy, yy = self._table[self._rows, left].to(positions.dtype).unbind(dim=1)
+        return (xx * x.square() + 2.0 * xy * x * y + yy * y.square()).sum(dim=1)
 
 
-def _lowest(problem: Problem, count: int) -> Modes:
-    return modes(problem, min(count, int(problem.free.sum()) - 1))
+def _responses(frequencies: Array, steps: int, h: float) -> Array:
+    """Sums of a^2, a b and b^2 over the first R steps, (B, steps + 1, 3, m), R from 0."""
+    out = np.zeros((len(frequencies), steps + 1, 3, frequencies.shape[1]))
+    x = np.stack([np.ones_like(frequencies), np.zeros_like(frequencies)])
+    y = x[::-1].copy()
+    for n in range(1, steps + 1):
+        y = (y - h * frequencies**2 * x) / (1.0 + (h * frequencies) ** 2)
+        x = x + h * y
+        out[:, n] = out[:, n - 1] + np.stack([x[0] ** 2, x[0] * x[1], x[1] ** 2], axis=1)
+    return out
