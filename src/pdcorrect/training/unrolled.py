@@ -206,9 +206,8 @@ def unroll(
             errors, scale = positions - truth, group.errors.after(group.on_device(ages))
             if stage.loss.ahead is not None:
                 wrong = torch.where(at, velocities - group.states(frames)[1], 0.0)
-                left = group.on_device(group.steps - frames)
-                ahead = group.vibrations.ahead(errors, wrong, left)
-                added = stage.loss.ahead * ahead / group.errors.largest
+                added = stage.loss.ahead * group.vibrations.ahead(errors, wrong)
+                added = added / group.errors.largest
         else:
             errors = torch.where(
                 at, layer.padded(correction - _taught(teacher, views.pop(), stage)), 0.0

@@ -7,13 +7,14 @@ the mode phi of angular frequency w (phi . M phi = 1) backward Euler takes its c
     y' = (y - h w^2 x) / (1 + (h w)^2),        x' = x + h y',
 
 which is linear in x and y, so that x_n = a_n x + b_n y after n steps.  Meant over a body's N nodes
-and the T frames of its simulation, the squared distances in those that are left, R, are
+and the next T frames, as many as its simulation has, the squared distances are
 
-    sum_{n = 1..R} (a_n x + b_n y)^2 |phi|^2 / (N T),
+    sum_{n = 1..T} (a_n x + b_n y)^2 |phi|^2 / (N T),
 
-without what unlike modes have in common.  A soft mode takes a second to show an error of its
-velocity, where derivatives of training reach back over some hundredths of one; and single steps of
-equal errors differ in how much of them is in such modes.
+without what unlike modes have in common, and wherever in the simulation it is, for users let
+theirs go on.  A soft mode takes a second to show an error of its velocity, where derivatives of
+training reach back over some hundredths of one; and single steps of equal errors differ in how
+much of them is in such modes.
 """
 
 from __future__ import annotations
@@ -107,36 +108,33 @@ class Vibrations:
             frequencies[k, :here] = body.frequencies
             squares[k, :here] = body.squares
         which = np.asarray(owners)
-        table = _responses(frequencies[which], int(steps.max()), time_step)
-        table *= (squares[which] / steps[:, None])[:, None, None]
+        responses = _responses(frequencies[which], steps, time_step) * squares[which]
         self._owners = torch.from_numpy(which).to(device)
         self._weighted = torch.from_numpy(weighted).to(device)
-        self._table = torch.from_numpy(table).to(device)
-        self._rows = torch.arange(len(which), device=device)
+        self._responses = torch.from_numpy(responses).to(device)
 
-    def ahead(self, positions: Tensor, velocities: Tensor, left: Tensor) -> Tensor:
-        """Mean squared distances (B,), m2, that errors will come to.
+    def ahead(self, positions: Tensor, velocities: Tensor) -> Tensor:
+        """Mean squared distances (B,), m2, that errors will come to in the next T frames.
 
         Parameters
         ----------
         positions, velocities : (B, N, 3)
             Errors, m and m/s.
-        left : (B,) int
-            Frames that are left, R.
         """
         weighted = self._weighted.index_select(0, self._owners).to(positions.dtype)
         x, y = (torch.einsum("bmnd,bnd->bm", weighted, z) for z in (positions, velocities))
-        xx, xy, yy = self._table[self._rows, left].to(positions.dtype).unbind(dim=1)
+        xx, xy, yy = self._responses.to(positions.dtype)
         return (xx * x.square() + 2.0 * xy * x * y + yy * y.square()).sum(dim=1)
 
 
-def _responses(frequencies: Array, steps: int, h: float) -> Array:
-    """Sums of a^2, a b and b^2 over the first R steps, (B, steps + 1, 3, m), R from 0."""
-    out = np.zeros((len(frequencies), steps + 1, 3, frequencies.shape[1]))
+def _responses(frequencies: Array, steps: NDArray[np.int64], h: float) -> Array:
+    """Means of a^2, a b and b^2 over each body's steps (B,), (3, B, m)."""
+    out = np.zeros((3, *frequencies.shape))
     x = np.stack([np.ones_like(frequencies), np.zeros_like(frequencies)])
     y = x[::-1].copy()
-    for n in range(1, steps + 1):
+    for n in range(1, int(steps.max()) + 1):
         y = (y - h * frequencies**2 * x) / (1.0 + (h * frequencies) ** 2)
         x = x + h * y
-        out[:, n] = out[:, n - 1] + np.stack([x[0] ** 2, x[0] * x[1], x[1] ** 2], axis=1)
-    return out
+        counts = (n <= steps)[:, None]
+        out += np.where(counts, np.stack([x[0] ** 2, x[0] * x[1], x[1] ** 2]), 0.0)
+    return out / steps[:, None]
