@@ -835,9 +835,9 @@ def test_stages_share_the_groups_that_are_alike(folder, tmp_path, monkeypatch):
     made = []
 
     class Counted(SceneGroup):
-        def __init__(self, recordings, base, device):
+        def __init__(self, recordings, *others):
             made.append([r.name for r in recordings])
-            super().__init__(recordings, base, device)
+            super().__init__(recordings, *others)
 
     monkeypatch.setattr("pdcorrect.training.scenes.SceneGroup", Counted)
     settings = samples.config(
