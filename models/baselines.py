@@ -14,13 +14,12 @@ discretised again and are refused.
 from __future__ import annotations
 
 import argparse
-import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from run_record import origin
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
@@ -30,7 +29,6 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybridResult
 from pdcorrect.data.config import EVALUATION, TRAINING
 from pdcorrect.data.schema import PLAIN
-from pdcorrect.environment import environment
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.cases import Case, read_cases
 from pdcorrect.evaluation.evaluation import Candidate, evaluate
@@ -146,13 +144,7 @@ def main() -> None:
         + (", the split itself: too good" if own and split == options.split else "")
     ]
     print(markdown(found), *notes, sep="\n")
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", "models/baselines.py", *sys.argv[1:]]),
-        "environment": environment(),
-        "stiffness_factor": factor,
-        "notes": notes,
-    }
+    record = {**origin(), "stiffness_factor": factor, "notes": notes}
     for path in write_evaluation(found, options.output, record, notes):
         print(f"wrote {path}")
 

@@ -12,20 +12,16 @@ reference, and ``first.json``, the errors of these runs.
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from run_record import write_record
 
 from pdcorrect.data.config import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.environment import environment
 from pdcorrect.evaluate import cases_with, compare
 from pdcorrect.figures import plot_node_trajectories, render_overlay
-from pdcorrect.replacement import write_text
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
@@ -44,13 +40,7 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     found = {name: draw(name, options.output, options.frames) for name in options.names}
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", "models/draw_first.py", *sys.argv[1:]]),
-        "environment": environment(),
-        "trajectories": found,
-    }
-    write_text(options.output / "first.json", json.dumps(record, indent=2) + "\n")
+    write_record(options.output / "first.json", trajectories=found)
 
 
 def draw(name: str, output: Path, frames: int | None) -> dict[str, Any]:

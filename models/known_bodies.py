@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from first_steps import scenes_of
+from run_record import write_record
 
 import pdcorrect as pc
 from pdcorrect.corrector.bodies import BodyGraph
@@ -25,8 +24,6 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import model_folder, weights_digest
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION, VALIDATION, DatasetConfig
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 
 def main() -> None:
@@ -47,14 +44,7 @@ def main() -> None:
         })  # fmt: skip
         print(json.dumps(rows[-1]), flush=True)
     if options.output:
-        record = {
-            "date": time.strftime("%Y-%m-%d"),
-            "command": " ".join(["python", "models/known_bodies.py", *sys.argv[1:]]),
-            "environment": environment(),
-            "gate": pc.Gate().model_dump(),
-            "models": rows,
-        }
-        write_text(options.output, json.dumps(record, indent=2) + "\n")
+        write_record(options.output, gate=pc.Gate().model_dump(), models=rows)
 
 
 def counted(corrector: Corrector, config: DatasetConfig, split: str) -> dict[str, Any]:

@@ -13,15 +13,13 @@ where the reference's step puts them, which no bound should refuse.
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from first_steps import first_steps, scenes_of
+from run_record import write_record
 
 import pdcorrect as pc
 from pdcorrect.batch.states import BatchResult
@@ -30,8 +28,6 @@ from pdcorrect.corrector.decision import corrected_step
 from pdcorrect.corrector.gate import refusals
 from pdcorrect.corrector.model_io import model_folder, weights_digest
 from pdcorrect.data.config import EVALUATION, DatasetConfig
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 BATCH = 20
 
@@ -55,14 +51,7 @@ def main() -> None:
         )
         print(rows[-1], flush=True)
     if options.output:
-        record = {
-            "date": time.strftime("%Y-%m-%d"),
-            "command": " ".join(["python", "models/refused_first_steps.py", *sys.argv[1:]]),
-            "environment": environment(),
-            "gate": pc.Gate().model_dump(),
-            "models": rows,
-        }
-        write_text(options.output, json.dumps(record, indent=2) + "\n")
+        write_record(options.output, gate=pc.Gate().model_dump(), models=rows)
 
 
 @torch.no_grad()

@@ -12,21 +12,17 @@ left out.  That takes no reference.
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import torch
 from first_steps import scenes_of, seen_in_rollouts
+from run_record import write_record
 
 import pdcorrect as pc
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.model_io import model_folder, weights_digest
 from pdcorrect.data.config import VALIDATION, DatasetConfig
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 BOUNDS = (3.5, 3.7, 4.0, 4.5, 5.0, 6.0)
 BATCH = 20
@@ -45,14 +41,8 @@ def main() -> None:
         name, _, config = pair.partition("=")
         rows.append(strange(name, DatasetConfig.load(config), options.split, options.loads))
         print(rows[-1], flush=True)
-        record = {
-            "date": time.strftime("%Y-%m-%d"),
-            "command": " ".join(["python", "models/rollout_strangeness.py", *sys.argv[1:]]),
-            "environment": environment(),
-            "models": rows,
-        }
         if options.output:
-            write_text(options.output, json.dumps(record, indent=2) + "\n")
+            write_record(options.output, models=rows)
 
 
 def strange(name: str, config: DatasetConfig, split: str, loads: int) -> dict[str, Any]:

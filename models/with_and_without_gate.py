@@ -19,13 +19,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from run_record import write_record
 
 import pdcorrect as pc
 from pdcorrect.corrector.gate import Reason
@@ -33,8 +32,6 @@ from pdcorrect.corrector.model_io import LoadedModel, model_folder, weights_dige
 from pdcorrect.data.config import EVALUATION, DatasetConfig, FamilyName, Split
 from pdcorrect.data.families import PUBLISHED, count_bodies
 from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 
 def main() -> None:
@@ -82,16 +79,13 @@ def main() -> None:
             scene = scene.model_copy(update={"clamps": scene.clamps[:1]})
         rows.append(repeated(models, config, plans[mesh], load, scene, options.frames))
         print(json.dumps(rows[-1]), flush=True)
-        record = {
-            "date": time.strftime("%Y-%m-%d"),
-            "command": " ".join(["python", "models/with_and_without_gate.py", *sys.argv[1:]]),
-            "environment": environment(),
+        write_record(
+            options.output,
             **about,
-            "omega": {name: summary(rows, name) for name in models},
-            "error_over_base": {name: harm(rows, name) for name in models},
-            "simulations": rows,
-        }
-        write_text(options.output, json.dumps(record, indent=2) + "\n")
+            omega={name: summary(rows, name) for name in models},
+            error_over_base={name: harm(rows, name) for name in models},
+            simulations=rows,
+        )
 
 
 def of_bodies(config: DatasetConfig, family: FamilyName, nodes: list[int]) -> DatasetConfig:

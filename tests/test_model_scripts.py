@@ -30,6 +30,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def script(name):
+    if str(ROOT / "models") not in sys.path:
+        sys.path.append(str(ROOT / "models"))  # as where it runs as a program
     spec = importlib.util.spec_from_file_location(name, ROOT / "models" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
