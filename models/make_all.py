@@ -3,8 +3,10 @@
 python models/make_all.py WORK [RECIPE | MODEL ...] [--device cuda] [--generators 8]
     [--together 4] [--measurers 16] [--seconds 1000] [--split evaluation ...]
 
-A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  MODEL is the name of a
-released model, which is evaluated only, beside what is trained for its data set.  WORK gets
+A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  In place of a data set
+there may be ``all-exact`` or ``all-as-published``, for all three of that setting together.  MODEL
+is the name of a released model, which is evaluated only, beside what is trained for its data sets.
+WORK gets
 
     data/DATASET                 splits as needed, by ``pdcorrect dataset generate``
     trainings/DATASET/NAME       by ``pdcorrect train``
@@ -32,7 +34,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pdcorrect.corrector.model_io import load_model
+from pdcorrect.corrector.model_io import JOINT, load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
 from pdcorrect.data.workers import visible_gpus
@@ -42,6 +44,11 @@ from pdcorrect.training.training import MODEL
 HERE = Path(__file__).resolve().parent
 DATASETS = HERE.parent / "datasets"
 LEARNT = (TRAINING, VALIDATION)
+TOGETHER = {
+    f"all-{setting}": [f"{motion}-{setting}" for motion in ("impulse", "stretch", "torsion")]
+    for setting in ("exact", "as-published")
+}
+"""Data sets of recipes that learn several."""
 STOPPED = 1
 """Exit status of a command whose time was up."""
 
@@ -172,13 +179,13 @@ def plan(
     until = None if options.seconds is None else time.time() + options.seconds
     starts = {recipe: TrainingConfig.load(recipe).start_from for recipe in recipes}
     _refuse_circles({_output(work, r) / MODEL: work / (starts[r] or "") for r in recipes})
-    known = {model: load_model(HERE / model).record.dataset for model in released}
-    names = list(dict.fromkeys([*(recipe.parent.name for recipe in recipes), *known.values()]))
-    learnt = {recipe.parent.name for recipe in recipes}
+    known = {model: load_model(HERE / model).record.dataset.split(JOINT) for model in released}
+    learnt = list(dict.fromkeys(name for recipe in recipes for name in _data_of(recipe)))
+    names = list(dict.fromkeys([*learnt, *(name for each in known.values() for name in each)]))
     before: dict[str, list[Job]] = {name: [] for name in names}
     ready: dict[str, list[Job]] = {name: [] for name in names}
     if options.generators:
-        for name in (name for name in names if name in learnt):
+        for name in learnt:
             ready[name] = before[name] = [_generation(work, name, LEARNT, options, [])]
     jobs = [job for name in names for job in ready[name]]
     judged: dict[tuple[str, str], list[Job]] = {}
@@ -194,12 +201,11 @@ def plan(
     }
     for job, recipe in zip(trainings.values(), recipes, strict=True):
         job.starts_from = trainings.get(work / (starts[recipe] or ""))
+    jobs += trainings.values()
     for name in names:
-        folder = work / "trainings" / name
-        own = [model for model in trainings if folder in model.parents]
-        models = own + [HERE / model for model in released if known[model] == name]
+        own = [_output(work, recipe) / MODEL for recipe in recipes if name in _data_of(recipe)]
+        models = own + [HERE / model for model in released if name in known[model]]
         each = [trainings[model] for model in own]
-        jobs += each
         jobs += [
             _evaluation(work, name, split, models, [*each, *judged[name, split]], options)
             for split in options.split
@@ -235,6 +241,12 @@ def _generation(
     )  # fmt: skip
 
 
+def _data_of(recipe: Path) -> list[str]:
+    """Names of the data sets that a recipe learns."""
+    name = recipe.parent.name
+    return TOGETHER.get(name, [name])
+
+
 def _output(work: Path, recipe: Path) -> Path:
     """Of a training."""
     return work / "trainings" / recipe.parent.name / recipe.stem
@@ -244,12 +256,14 @@ def _training(
     work: Path, recipe: Path, ready: dict[str, list[Job]], until: float | None,
     options: argparse.Namespace,
 ) -> Job:  # fmt: skip
-    name = recipe.parent.name
+    names = _data_of(recipe)
+    data = [word for name in names for word in ("--data", str(work / "data" / name))]
     arguments = [
-        "train", str(recipe), "--data", str(work / "data" / name),
-        "-o", str(_output(work, recipe)), "--device", options.device, "--resume",
+        "train", str(recipe), *data, "-o", str(_output(work, recipe)),
+        "--device", options.device, "--resume",
     ]  # fmt: skip
-    return Job(f"train-{name}-{recipe.stem}", arguments, ready[name], "train", until)
+    after = [job for name in names for job in ready[name]]
+    return Job(f"train-{recipe.parent.name}-{recipe.stem}", arguments, after, "train", until)
 
 
 def _refuse_circles(starts: dict[Path, Path]) -> None:

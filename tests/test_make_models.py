@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from argparse import Namespace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,27 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
         "generate-torsion-exact-training"
     ]
     assert tmp_path / "trainings/torsion-exact/force/model" in last.models
+
+
+def test_a_recipe_for_all_motions_waits_for_their_data_and_is_evaluated_on_each(tmp_path):
+    recipes = [
+        ROOT / "models/recipes" / name
+        for name in ("all-as-published/total-mass.toml", "stretch-as-published/total-mass.toml")
+    ]
+    jobs = {job.name: job for job in make.plan(tmp_path, recipes, [], OPTIONS)}
+    sets = ["impulse-as-published", "stretch-as-published", "torsion-as-published"]
+    together = jobs["train-all-as-published-total-mass"]
+    assert [job.name for job in together.after] == [f"generate-{name}-training" for name in sets]
+    given = [str(tmp_path / "data" / name) for name in sets]
+    arguments = together.arguments
+    assert [b for a, b in pairwise(arguments) if a == "--data"] == given
+    own = tmp_path / "trainings/stretch-as-published/total-mass/model"
+    model = tmp_path / "trainings/all-as-published/total-mass/model"
+    for name in sets:
+        job = jobs[f"evaluate-{name}"]
+        assert job.models == [model, own] if name in own.parts else [model]
+        assert together in job.after
+    assert len(jobs) == 3 * 2 + 2 + 3
 
 
 def test_a_training_waits_for_the_one_whose_model_it_starts_from(tmp_path):

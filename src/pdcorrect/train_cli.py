@@ -19,7 +19,10 @@ _UNFINISHED = 1
 
 def train(
     config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
-    data: Annotated[Path, typer.Option(help="Folder of the data set.")],
+    data: Annotated[
+        list[Path],
+        typer.Option(help="Folder of the data set; again for more, learned together."),
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     resume: Annotated[
@@ -57,9 +60,10 @@ def train(
         from pdcorrect.data.folder import shard_paths
         from pdcorrect.data.missing import check_whole
 
-        shard_paths(data, evaluate)  # refused now, not when the training has ended
-        if not incomplete:
-            check_whole(data, [evaluate])
+        for folder in data:
+            shard_paths(folder, evaluate)  # refused now, not when the training has ended
+            if not incomplete:
+                check_whole(folder, [evaluate])
     with joined(device) as (world, own):
         training = Training(
             loaded, data, output, device=own, resume=resume, incomplete=incomplete, world=world,
@@ -76,12 +80,15 @@ def train(
     told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
+        from pdcorrect.corrector.model_io import model_names
         from pdcorrect.evaluation_cli import evaluate as judge
 
-        judge(
-            [str(output / MODEL), str(data)], split=evaluate, device=own,
-            output=output / EVALUATION, incomplete=incomplete, figures=False,
-        )  # fmt: skip
+        several = model_names([folder.resolve() for folder in data]) if len(data) > 1 else [""]
+        for folder, name in zip(data, several, strict=True):
+            judge(
+                [str(output / MODEL), str(folder)], split=evaluate, device=own,
+                output=output / EVALUATION / name, incomplete=incomplete, figures=False,
+            )  # fmt: skip
 
 
 def _tell(at: Progress, row: Mapping[str, Any]) -> None:

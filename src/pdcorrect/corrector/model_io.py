@@ -48,6 +48,8 @@ FORMAT = "pdcorrect-model"
 VERSION = 3
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
+JOINT = "+"
+"""Between the names of data sets that a model was trained on together, and their hashes."""
 _NORMALISER = "normaliser."
 _CHECKSUM = "checksum"
 
@@ -58,7 +60,8 @@ class ModelRecord(Strict):
     Attributes
     ----------
     dataset, dataset_hash
-        Name of the data set, and the hash of its configuration or content.
+        Name of the data set, or names of several with a plus sign between them, and the hash of
+        their configuration or content.
     training, metrics
         Settings of the training, and what the model achieved; any JSON with finite numbers.
     code_version, code_digest

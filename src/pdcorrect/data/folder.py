@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
@@ -11,6 +12,29 @@ from pdcorrect.errors import InputError
 
 _NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
+
+
+Folders = str | Path | Iterable[str | Path]
+"""Of one data set, or of several."""
+
+
+def folders_of(data: Folders) -> tuple[Path, ...]:
+    """Folders of data sets whose files are read one after the other.
+
+    Raises
+    ------
+    InputError
+        If there is none, or one comes twice.
+    """
+    found = (Path(data),) if isinstance(data, (str, Path)) else tuple(map(Path, data))
+    if not found:
+        raise InputError("no data set: expected the folder of one or more.")
+    known: set[Path] = set()
+    for folder in found:
+        if folder.resolve() in known:
+            raise InputError(f"{folder}: expected each data set once.")
+        known.add(folder.resolve())
+    return found
 
 
 def all_shards(folder: str | Path) -> list[Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.cache import RecentlyUsed
 from pdcorrect.data.damage import Damage, whole_files
-from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.folder import Folders, folders_of, shard_paths
 from pdcorrect.data.sampling import ShardShuffle
 from pdcorrect.data.shard_arrays import ShardHeader, read_arrays, read_header
 from pdcorrect.errors import InputError, require_extra
@@ -62,8 +61,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     ``density``                     ``cell_`` before the name (c,), for each cell
     ``edge_index``                  (2, E), each edge of a cell once in both directions
     ``cells``                       (c, 8), VTK order
-    ``mesh``, ``simulation``,       (1,), number of the mesh in its split, of the simulation
-    ``frame``                       on the mesh, and t
+    ``file``, ``mesh``,             (1,), number of the file in `headers`, of the mesh in its
+    ``simulation``, ``frame``       split, of the simulation on the mesh, and t
     ``time``, ``time_step``         (1,), of frame t, and h, s
     ==============================  =========================================================
 
@@ -74,8 +73,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     Parameters
     ----------
-    folder : path
-        Of the data set.
+    folder : path, or sequence of paths
+        Of the data set; of several, whose files follow one another.
     split : str
     window : int
         k.
@@ -94,20 +93,23 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     Attributes
     ----------
+    headers : list of ShardHeader
+        Of the files.
     damaged : dict of Path to str
         Files that were left out, and what is wrong with them.
 
     Raises
     ------
     InputError
-        If there is no such split, its simulations lack a run, or all are shorter than k.
+        If there is no such split, its simulations lack a run, or all are shorter than k; if a
+        folder comes twice.
     FileFormatError
         If a file is damaged; with ``skip_damaged`` if all are.
     """
 
     def __init__(
         self,
-        folder: str | Path,
+        folder: Folders,
         split: str,
         *,
         window: int = 1,
@@ -122,11 +124,12 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             raise InputError(f"window = {window}: expected 1 step or more, a whole number.")
         if isinstance(runs, str):
             raise InputError(f"runs = {runs!r}: expected a list of names, such as [{runs!r}].")
-        self.folder, self.split = Path(folder), split
+        self.folders, self.split = folders_of(folder), split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
         self.damaged: Damage = {}
-        paths = whole_files(shard_paths(folder, split), self.damaged if skip_damaged else None)
+        every = [path for each in self.folders for path in shard_paths(each, split)]
+        paths = whole_files(every, self.damaged if skip_damaged else None)
         self.headers = [read_header(path) for path in paths]
         for header in self.headers:
             _check_runs(header, base, self.runs)
@@ -138,9 +141,10 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if not self._starts[-1]:
             longest = max((steps for h in self.headers for steps in h.steps), default=0)
+            names = ", ".join(map(str, self.folders))
             raise InputError(
-                f"{self.folder}, {split}: no simulation has {window} steps, the longest "
-                f"{longest}: expected a smaller window."
+                f"{names}, {split}: no simulation has {window} steps, the longest {longest}: "
+                "expected a smaller window."
             )
         self._shards = RecentlyUsed(self._load, decoded_bytes, cache_bytes)
 
@@ -225,7 +229,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
         return WindowPlace(
-            self.headers[number], shard, simulation, shard.motions[simulation],
+            number, self.headers[number], shard, simulation, shard.motions[simulation],
             idx - int(self._starts[row]),
         )  # fmt: skip
 

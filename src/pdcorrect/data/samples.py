@@ -21,7 +21,7 @@ from torch_geometric.data import Batch, Data  # noqa: E402
 
 _MESH = ("rest", "free", "mass", "young", "poisson", "density")
 _CELLS = ("cell_young", "cell_poisson", "cell_density")
-_GRAPHS = ("mesh", "simulation", "frame", "time", "time_step")
+_GRAPHS = ("file", "mesh", "simulation", "frame", "time", "time_step")
 _INDICES = ("cells", "edge_index")
 _ALIGNMENT = 64
 """Bytes."""
@@ -82,6 +82,7 @@ def decoded_bytes(shard: DecodedShard) -> int:
 class WindowPlace(NamedTuple):
     """Where a window is."""
 
+    file: int
     header: ShardHeader
     shard: DecodedShard
     simulation: int
@@ -120,13 +121,13 @@ def decode(
 
 def window_numbers(places: Sequence[WindowPlace], dtype: torch.dtype) -> dict[str, Tensor]:
     """One number a window, (B,)."""
-    which = np.array([(p.header.number, p.simulation, p.frame) for p in places])
+    which = np.array([(p.file, p.header.number, p.simulation, p.frame) for p in places])
     steps = np.array([p.header.time_step for p in places])
-    seconds = torch.from_numpy(np.stack([which[:, 2] * steps, steps])).to(dtype)
-    mesh, simulation, frame = torch.from_numpy(np.ascontiguousarray(which.T))
+    seconds = torch.from_numpy(np.stack([which[:, 3] * steps, steps])).to(dtype)
+    file, mesh, simulation, frame = torch.from_numpy(np.ascontiguousarray(which.T))
     return {
-        "mesh": mesh, "simulation": simulation, "frame": frame, "time": seconds[0],
-        "time_step": seconds[1],
+        "file": file, "mesh": mesh, "simulation": simulation, "frame": frame,
+        "time": seconds[0], "time_step": seconds[1],
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.folder import Folders, folders_of, shard_paths
 from pdcorrect.data.scene_mesh import discretise_stored
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
 from pdcorrect.data.shard_arrays import ShardHeader, read_header
@@ -35,6 +35,8 @@ class Recording:
 
     Attributes
     ----------
+    path : Path
+        The file, which has one mesh.
     dataset, config_hash, split : str
     mesh, number : int
         Of the mesh in its split, and on the mesh.
@@ -51,6 +53,7 @@ class Recording:
         To which the base model's density is scaled, kg; None where it is not.
     """
 
+    path: Path
     dataset: str
     config_hash: str
     split: str
@@ -73,17 +76,18 @@ class Recording:
     @property
     def name(self) -> str:
         """For messages and tables."""
-        return f"{self.split}/mesh-{self.mesh:04d}/{self.number}"
+        return f"{self.dataset}, {self.split}/mesh-{self.mesh:04d}/{self.number}"
 
 
 def load_recordings(
-    folder: str | Path, split: str, base: Base, *, scenes: bool = True
+    folder: Folders, split: str, base: Base, *, scenes: bool = True
 ) -> list[Recording]:
     """All simulations of a split, mesh by mesh.
 
     Parameters
     ----------
-    folder : path
+    folder : path, or sequence of paths
+        Of the data set; of several, one after the other.
     split : str
     base : {"plain", "best", "total-mass"}
     scenes : bool
@@ -98,11 +102,11 @@ def load_recordings(
         If a file is damaged.
     """
     found = []
-    for path in shard_paths(folder, split):
+    for path in _paths(folder, split):
         _check_complete(read_header(path), base, scenes)
         shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
         for number, simulation in enumerate(shard.simulations):
-            found.append(_recording(shard, simulation, number, split, base))
+            found.append(_recording(path, shard, simulation, number, split, base))
     return found
 
 
@@ -125,29 +129,33 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     InputError
         If a scene is not that of the recorded mesh.
     """
-    known: dict[tuple[str, int], Problem] = {}
+    known: dict[Path, Problem] = {}
     problems = []
     for recording in recordings:
         scene = Scene.from_toml(recording.scene_toml, recording.name)
-        key = recording.split, recording.mesh
-        if key not in known:
+        if recording.path not in known:
             model = best_coarse(scene) if base == BEST else scene
             problem = discretise_stored(model, recording.points, recording.cells)
             _check_mesh(recording, problem)
             if recording.total_mass is not None:
                 problem = problem.with_total_mass(recording.total_mass)
-            known[key] = problem
-        problems.append(known[key].with_loads(scene.loads))
+            known[recording.path] = problem
+        problems.append(known[recording.path].with_loads(scene.loads))
     return problems
 
 
-def data_hash(folder: str | Path, splits: Sequence[str]) -> str:
+def data_hash(folder: Folders, splits: Sequence[str]) -> str:
     """SHA-256 of the content hashes of the files of some splits."""
     digest = hashlib.sha256()
     for split in splits:
-        for path in shard_paths(folder, split):
+        for path in _paths(folder, split):
             digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
     return digest.hexdigest()
+
+
+def _paths(folder: Folders, split: str) -> list[Path]:
+    """Files of a split of all data sets."""
+    return [path for each in folders_of(folder) for path in shard_paths(each, split)]
 
 
 def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
@@ -168,11 +176,12 @@ def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
 
 
 def _recording(
-    shard: Shard, simulation: Simulation, number: int, split: str, base: Base
+    path: Path, shard: Shard, simulation: Simulation, number: int, split: str, base: Base
 ) -> Recording:
     """A simulation that lacks nothing, see `_check_complete`."""
     reference, plain, rollout = (_positions(simulation, run) for run in (REFERENCE, PLAIN, base))
     return Recording(
+        path=path,
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
         split=split,

@@ -31,8 +31,8 @@ class StoredWindows:
         Of the reference in the first frame, m and m/s.
     targets, predictions, forces : (k, n, 3)
         Of each step: where the reference goes and the base model would, m, and loads, N.
-    mesh, simulation : (B,) int64
-        Number of the mesh in its split, and of the simulation on it.
+    file, simulation : (B,) int64
+        Number of the file in the data set, and of the simulation in it.
     """
 
     bodies: BodyGraph
@@ -41,13 +41,13 @@ class StoredWindows:
     targets: Tensor
     predictions: Tensor
     forces: Tensor
-    mesh: Tensor
+    file: Tensor
     simulation: Tensor
 
     @property
     def num_graphs(self) -> int:
         """B."""
-        return len(self.mesh)
+        return len(self.file)
 
 
 class ResidentWindows:
@@ -75,7 +75,6 @@ class ResidentWindows:
         self._dataset, self._device = dataset, device
         headers = dataset.headers
         self._nodes = np.array([h.nodes for h in headers])
-        self._numbers = np.array([h.number for h in headers])
         most = max(len(h.steps) for h in headers)
         frames = np.zeros((len(headers), most), dtype=np.int64)
         for row, h in zip(frames, headers, strict=True):
@@ -111,9 +110,9 @@ class ResidentWindows:
         files, simulations, frames = self._dataset.places(indices)
         starts = self._starts[files, simulations] + frames * self._nodes[files]
         place = self._place[files]
-        numbers = np.stack([place, starts, self._numbers[files], simulations])
+        numbers = np.stack([place, starts, files, simulations])
         on_device = torch.from_numpy(numbers).to(self._device, non_blocking=True)
-        which, start, mesh, simulation = on_device.unbind()
+        which, start, file, simulation = on_device.unbind()
         bodies, nodes = self._bodies(place, which)
         first_rows = nodes.shifted(start)
         count = bodies.by_node(nodes.lengths)
@@ -132,7 +131,7 @@ class ResidentWindows:
             positions[1:],
             found("predictions", rows[:-1]),
             found("forces", rows[:-1]),
-            mesh,
+            file,
             simulation,
         )
 

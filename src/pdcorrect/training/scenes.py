@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,6 @@ from pdcorrect.training.recordings import Recording, base_errors, make_problems
 from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 
 Frames = NDArray[np.int64]
-Mesh = tuple[str, int]
-"""Split and number."""
 
 _LEAST_FREE = 0.2
 """Of a GPU's memory, when a group is set up."""
@@ -38,7 +37,7 @@ class SceneGroup:
     base : {"plain", "best", "total-mass"}
     device : str or torch.device
     modes : dict, optional
-        Modes of meshes that are known already, by split and number; new ones are added.
+        Modes of meshes that are known already, by file; new ones are added.
 
     Attributes
     ----------
@@ -56,7 +55,7 @@ class SceneGroup:
         recordings: Sequence[Recording],
         base: Base,
         device: str | torch.device,
-        modes: dict[Mesh, BodyModes] | None = None,
+        modes: dict[Path, BodyModes] | None = None,
     ) -> None:
         self.recordings = tuple(recordings)
         self._modes = {} if modes is None else modes
@@ -135,15 +134,15 @@ class SceneGroup:
                 f"loss.ahead with integrator {self.stepper.integrator!r}: expected backward-euler, "
                 "whose velocities are differences of positions, as the reference's are."
             )
-        meshes: dict[Mesh, int] = {}
+        meshes: dict[Path, int] = {}
         for recording, problem in zip(self.recordings, self.stepper.problems, strict=True):
-            key = recording.split, recording.mesh  # of which all simulations have one material
+            key = recording.path  # of which all simulations have one material
             meshes.setdefault(key, len(meshes))
             if key not in self._modes:
                 self._modes[key] = _modes(recording, problem)
         return Vibrations(
             [self._modes[key] for key in meshes],
-            [meshes[r.split, r.mesh] for r in self.recordings],
+            [meshes[r.path] for r in self.recordings],
             self.steps,
             self.time_step,
             self.mask.shape[1],
@@ -200,8 +199,8 @@ class SceneGroups:
         self.recordings, self.device = tuple(recordings), torch.device(device)
         self.rank = rank
         self._base, self._place = base, {"seed": seed, "rank": rank, "world_size": world_size}
-        self._known: dict[tuple[str, ...], SceneGroup] = {}
-        self._modes: dict[Mesh, BodyModes] = {}
+        self._known: dict[tuple[tuple[Path, int], ...], SceneGroup] = {}
+        self._modes: dict[Path, BodyModes] = {}
 
     def of(self, size: int, shortest: int) -> list[list[Recording]]:
         """The simulations of at least so many steps, in groups of at most ``size``.
@@ -222,7 +221,7 @@ class SceneGroups:
 
     def __call__(self, recordings: Sequence[Recording]) -> SceneGroup:
         """The group of some simulations."""
-        key = tuple(r.name for r in recordings)
+        key = tuple((r.path, r.number) for r in recordings)
         if key not in self._known:
             self._make_room()
             self._known[key] = SceneGroup(recordings, self._base, self.device, self._modes)
@@ -254,9 +253,9 @@ def grouped(
     Meshes are in random order and simulations of a mesh stay together, for they share
     factorisations.
     """
-    meshes = sorted({(r.split, r.mesh) for r in recordings})
+    meshes = list(dict.fromkeys(r.path for r in recordings))
     turn = np.random.default_rng((seed, 2)).permutation(len(meshes))
-    place = {mesh: int(k) for mesh, k in zip(meshes, turn, strict=True)}
-    ordered = sorted(recordings, key=lambda r: (place[r.split, r.mesh], r.number))
+    place = {path: int(k) for path, k in zip(meshes, turn, strict=True)}
+    ordered = sorted(recordings, key=lambda r: (place[r.path], r.number))
     groups = [ordered[i : i + size] for i in range(0, len(ordered), size)]
     return groups[rank::world_size]

@@ -6,7 +6,7 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from torch import Tensor
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import (
+    JOINT,
     LoadedModel,
     ModelRecord,
     load_model,
@@ -24,7 +25,7 @@ from pdcorrect.corrector.model_io import (
     weights_digest,
 )
 from pdcorrect.data.config import TRAINING, VALIDATION
-from pdcorrect.data.folder import splits_of
+from pdcorrect.data.folder import Folders, folders_of, splits_of
 from pdcorrect.data.missing import check_whole
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
@@ -55,8 +56,8 @@ class Training:
     Parameters
     ----------
     config : TrainingConfig
-    data : path
-        Folder of the data set.
+    data : path, or sequence of paths
+        Folder of the data set; of several, to be learned together.
     output : path
         For ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard`` and
         the best ``model``.
@@ -79,7 +80,8 @@ class Training:
     ------
     InputError
         If the folder holds a training and ``resume`` is not set, or it was another one; if
-        files of the data set are missing, or do not have what the configuration wants; if the
+        files of the data sets are missing, or do not have what the configuration wants; if one
+        has a validation split and another has none; if the
         model to start from is missing, or of another architecture, base or velocity; if a
         teacher is.
     FileFormatError
@@ -89,7 +91,7 @@ class Training:
     def __init__(
         self,
         config: TrainingConfig,
-        data: str | Path,
+        data: Folders,
         output: str | Path,
         *,
         device: str = "cpu",
@@ -101,9 +103,11 @@ class Training:
         self.config, self.world = config, World() if world is None else world
         self.device = usable_device(device)
         self.output, self._on_report = Path(output), on_report
+        data = folders_of(data)
         if not incomplete:
-            check_whole(data, (TRAINING, VALIDATION))
-        splits = [s for s in (TRAINING, VALIDATION) if s in splits_of(data)]
+            for folder in data:
+                check_whole(folder, (TRAINING, VALIDATION))
+        splits = _common_splits(data)
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
         )
@@ -305,11 +309,13 @@ class Training:
         self.progress.metrics = metrics
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
-            training = {**self._identity, "config_hash": self._recordings[0].config_hash,
+            known = dict.fromkeys((r.dataset, r.config_hash) for r in self._recordings)
+            names, hashes = zip(*known, strict=True)
+            training = {**self._identity, "config_hash": JOINT.join(hashes),
                         "iterations": self.progress.total,
                         "seconds": self.progress.seconds, "processes": self.world.size}  # fmt: skip
             record = ModelRecord(
-                dataset=self._recordings[0].dataset, dataset_hash=self._identity["data"],
+                dataset=JOINT.join(names), dataset_hash=self._identity["data"],
                 training=training, metrics=dict(metrics),
             )  # fmt: skip
             save_model(shown, self.output / MODEL, record=record)
@@ -352,6 +358,21 @@ class Training:
             self._averaged.load_state_dict(_part(moved, "averaged."))
             self._waiting = content["source"], tensors
         return int(content["history"])
+
+
+def _common_splits(folders: Sequence[Path]) -> list[str]:
+    """Training and, if there is one, validation split."""
+    found = [TRAINING]
+    with_validation = [folder for folder in folders if VALIDATION in splits_of(folder)]
+    if with_validation:
+        found.append(VALIDATION)
+        for folder in folders:
+            if folder not in with_validation:
+                raise InputError(
+                    f"{folder}: no split {VALIDATION!r}, which {with_validation[0]} has: "
+                    "expected one in all data sets, or in none."
+                )
+    return found
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -107,8 +107,8 @@ class Validation:
     def _rollout(self, group: SceneGroup, corrector: Corrector) -> tuple[Tensor, Tensor]:
         """Omega of a group, (B,), and which rollouts failed.
 
-        Those that failed, or are sure to end below `LEAST`, are put back to rest, where
-        they cost little.
+        Those that failed, are sure to end below `LEAST`, or have come to their last frame are
+        put back to rest, where they cost little.
         """
         hybrid = BatchHybrid(group.stepper, corrector, velocity=self._velocity)
         rest = group.stepper.rest_state()
@@ -131,7 +131,7 @@ class Validation:
             square = group.sums(error.square().sum(dim=2))
             total += torch.where(running & ok, square, 0.0)
             good &= ok & (total <= worst)
-            state = _where(good, state, rest)
+            state = _where(good & (steps > frame), state, rest)
         return torch.where(good, 100.0 * (1.0 - total / plain), LEAST), ~ok
 
 

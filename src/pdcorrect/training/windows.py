@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import TRAINING
+from pdcorrect.data.folder import Folders
 from pdcorrect.data.reader import CACHE_BYTES, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.sampling import ShardShuffle
 from pdcorrect.fem.coarse_models import Base
@@ -70,7 +70,7 @@ class StepWindows:
 
     Parameters
     ----------
-    folder : path
+    folder : path, or sequence of paths
     recordings : sequence of Recording
         Of the split, for the base model's errors.
     config : CorrectorConfig
@@ -85,7 +85,7 @@ class StepWindows:
 
     def __init__(
         self,
-        folder: str | Path,
+        folder: Folders,
         recordings: Sequence[Recording],
         config: CorrectorConfig,
         base: Base,
@@ -101,17 +101,15 @@ class StepWindows:
         size = int(self.dataset.shard_bytes().sum())
         self.resident = _fits(size, self.device) if resident is None else resident
         self._workers = 0 if self.resident else workers
-        rows = max(r.mesh for r in recordings) + 1
+        numbers = {header.path: k for k, header in enumerate(self.dataset.headers)}
         columns = max(r.number for r in recordings) + 1
-        errors = torch.full((rows, columns), float("nan"), dtype=torch.float64)
+        errors = torch.full((len(numbers), columns), float("nan"), dtype=torch.float64)
         for r in recordings:
-            errors[r.mesh, r.number] = r.one_step
-        self._masses = {r.mesh: r.total_mass for r in recordings}
+            errors[numbers[r.path], r.number] = r.one_step
+        self._masses = {numbers[r.path]: r.total_mass for r in recordings}
         self._errors = errors.to(self.device)
         files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
-        self._first = {
-            self.dataset.headers[k].number: int(i) for k, i in zip(files, first, strict=True)
-        }
+        self._first = dict(zip(files.tolist(), first.tolist(), strict=True))
         self._known: dict[int, BodyGraph] = {}
 
     def batch(self, indices: Sequence[int], *, last: bool = True) -> StepBatch:
@@ -163,26 +161,26 @@ class StepWindows:
             start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
-        return StepBatch(bodies, state, target, self._errors[stored.mesh, stored.simulation])
+        return StepBatch(bodies, state, target, self._errors[stored.file, stored.simulation])
 
     def _stored(self, found: Any) -> StoredWindows:
         """A batch of samples on the device."""
-        meshes = found.mesh.tolist()
+        files = found.file.tolist()
         found = found.to(self.device, non_blocking=True)
         positions, velocities, targets, predictions, forces = (
             getattr(found, name).to(torch.float64)
             for name in ("positions", "velocities", "targets", "predictions", "forces")
         )
         return StoredWindows(
-            self._bodies(found, meshes), positions, velocities, targets.transpose(0, 1),
-            predictions.transpose(0, 1), forces.transpose(0, 1), found.mesh, found.simulation,
+            self._bodies(found, files), positions, velocities, targets.transpose(0, 1),
+            predictions.transpose(0, 1), forces.transpose(0, 1), found.file, found.simulation,
         )  # fmt: skip
 
-    def _bodies(self, found: Any, meshes: Sequence[int]) -> BodyGraph:
-        """The bodies of a batch, with what is computed of them at rest once for each mesh."""
-        for mesh in set(meshes) - self._known.keys():
-            self._known[mesh] = self._alone(self._first[mesh])
-        known = [self._known[mesh] for mesh in meshes]
+    def _bodies(self, found: Any, files: Sequence[int]) -> BodyGraph:
+        """The bodies of a batch, with what is computed of them at rest once for each file."""
+        for file in set(files) - self._known.keys():
+            self._known[file] = self._alone(self._first[file])
+        known = [self._known[file] for file in files]
         bodies = replace(
             BodyGraph.of_batch(found).to(dtype=torch.float64),
             **{
@@ -198,7 +196,7 @@ class StepWindows:
         """The body of a window, of the base model's mass."""
         found = self.dataset.batch([window]).to(self.device)
         body = BodyGraph.of_batch(found).to(dtype=torch.float64)
-        mass = self._masses[int(found.mesh)]
+        mass = self._masses[int(found.file)]
         if mass is None:
             return body
         factor = mass / body.mass.sum()

@@ -1,0 +1,219 @@
+"""One training on several data sets, whose meshes have the same numbers and are others."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import pdcorrect as pc  # noqa: E402
+import training_samples as samples  # noqa: E402
+from pdcorrect.corrector.model_io import load_model  # noqa: E402
+from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
+from pdcorrect.data.schema import write_shard  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.errors import InputError  # noqa: E402
+from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
+from pdcorrect.training.recordings import data_hash, load_recordings, make_problems  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup  # noqa: E402
+from pdcorrect.training.training import Training  # noqa: E402
+from pdcorrect.training.validation import Validation  # noqa: E402
+
+ONE, OTHER = (0,), (3, 1)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Two data sets of tiny's meshes: one of five frames, one of eight; both have mesh 0."""
+    one = samples.dataset(tmp_path_factory.mktemp("one"), training=ONE, frames=5)
+    other = samples.dataset(tmp_path_factory.mktemp("other"), OTHER, validation=(0,), frames=8)
+    for split in ("training", "validation"):
+        for number, path in enumerate(sorted((other / split).iterdir(), reverse=True)):
+            shard = read_shard(path)
+            named = {"dataset": "other", "number": number, "config_hash": "0" * 64}
+            path.unlink()
+            write_shard(
+                other / split / f"mesh-{number:04d}.h5",
+                replace(shard, attributes={**shard.attributes, **named}), "float32",
+            )  # fmt: skip
+    return one, other
+
+
+def settings(*stages, **changes):
+    return samples.config(*stages, **changes)
+
+
+def test_windows_of_several_data_sets_follow_one_another(folders):
+    both = TrajectoryDataset(folders, "training", window=2)
+    each = [TrajectoryDataset(folder, "training", window=2) for folder in folders]
+    assert len(both) == sum(map(len, each))
+    assert [h.path.parent.parent for h in both.headers] == [folders[0], folders[1], folders[1]]
+    assert [h.number for h in both.headers] == [0, 0, 1]
+    first, last = both[len(each[0])], both[len(both) - 1]
+    assert [int(x.file) for x in (both[0], first, last)] == [0, 1, 2]
+    assert [int(x.mesh) for x in (both[0], first, last)] == [0, 0, 1]
+    for found, expected in ((first, each[1][0]), (last, each[1][len(each[1]) - 1])):
+        assert torch.equal(found.targets, expected.targets)
+        assert torch.equal(found.cells, expected.cells)
+
+
+@pytest.mark.parametrize("resident", [True, False])
+@pytest.mark.parametrize("remembers", [False, True])
+def test_steps_of_several_data_sets_are_those_of_each(folders, resident, remembers):
+    changes = {"changes": {"node_features": ("previous-correction",)}} if remembers else {}
+    config = settings(
+        samples.one_step(), corrector={**samples.SMALL, **changes} if remembers else samples.SMALL
+    )
+    together, recordings = samples.windows(folders, config, resident=resident)
+    assert len(recordings) == 5
+    begin = 0
+    for folder in folders:
+        alone, _ = samples.windows(folder, config, resident=True)
+        chosen = [0, len(alone.dataset) - 1, len(alone.dataset) // 2]
+        found = together.batch([begin + i for i in chosen])
+        expected = alone.batch(chosen)
+        assert torch.equal(found.target, expected.target)
+        assert torch.equal(found.scale, expected.scale)
+        for name in ("mass", "density", "young", "cells", "edge_index", "time_step"):
+            assert torch.equal(getattr(found.bodies, name), getattr(expected.bodies, name)), name
+        assert torch.equal(found.bodies.shapes, expected.bodies.shapes)
+        begin += len(alone.dataset)
+
+
+def test_batches_mix_the_data_sets(folders):
+    together, recordings = samples.windows(folders, settings(samples.one_step()), resident=True)
+    owners = {r.one_step: r.dataset for r in recordings}
+    batch = next(together.batches(12, seed=0))
+    assert {owners[scale] for scale in batch.scale.tolist()} == {"tiny", "other"}
+
+
+def test_recordings_of_several_data_sets_have_their_own_bodies(folders):
+    recordings = load_recordings(folders, "training", "plain")
+    assert [r.dataset for r in recordings] == ["tiny"] + ["other"] * 4
+    assert recordings[0].name == "tiny, training/mesh-0000/0"
+    assert recordings[1].name == "other, training/mesh-0000/0"
+    for problem, recording in zip(make_problems(recordings, "plain"), recordings, strict=True):
+        assert len(problem.positions) == len(recording.points)
+    group = SceneGroup(recordings, "plain", "cpu")
+    ends = group.truth(group.steps)
+    assert group.steps.tolist() == [5, 8, 8, 8, 8]
+    for end, recording in zip(ends.numpy(), recordings, strict=True):
+        np.testing.assert_array_equal(end[: len(recording.points)], recording.reference[-1])
+
+
+def test_rollouts_of_unlike_lengths_have_the_omegas_that_they_have_alone(folders):
+    corrector = samples.fitted(folders, settings(samples.one_step()))
+    with torch.no_grad():
+        corrector.network.decoder[-1].weight.mul_(0.1)
+    together, *alone = (
+        Validation(load_recordings(data, "validation", "plain"), "plain")(corrector).omegas
+        for data in (folders, *folders)
+    )
+    np.testing.assert_allclose(together, np.concatenate(alone), atol=1e-6)
+
+
+STAGES = (
+    samples.one_step(iterations=6, batch=6),
+    samples.unrolled(iterations=4, steps=(2,), start="pool", batch=3, loss={"ahead": 1.0}),
+)
+
+
+def test_a_training_learns_several_data_sets_and_goes_on_bit_by_bit(folders, tmp_path):
+    often = {"checkpoint_every": {"iterations": 1}, "validate_every": {"iterations": 4}}
+    config = settings(*STAGES, **often)
+    torch.set_num_threads(1)
+    Training(config, folders, tmp_path / "whole").run()
+    broken = Training(config, folders, tmp_path / "broken")
+    assert not broken.run(seconds=0.0)
+    for _ in range(20):
+        if Training(config, folders, tmp_path / "broken", resume=True).run(seconds=0.0):
+            break
+    one, other = (load_model(tmp_path / name / "model") for name in ("whole", "broken"))
+    for name, x in one.corrector.state_dict().items():
+        assert torch.equal(x, other.corrector.state_dict()[name]), name
+    record = one.record
+    assert record.dataset == "tiny+other"
+    assert record.dataset_hash == data_hash(folders, ("training", "validation"))
+    assert record.training["config_hash"].split("+")[1] == "0" * 64
+    with pytest.raises(InputError, match="was begun with data"):
+        Training(config, folders[:1], tmp_path / "whole", resume=True)
+
+
+def test_a_single_data_set_has_the_hash_that_it_had(folders):
+    assert data_hash(folders[0], ["training"]) == data_hash([folders[0]], ["training"])
+    assert data_hash(folders, ["training"]) != data_hash(folders[1], ["training"])
+
+
+@pytest.fixture(scope="module")
+def trained(folders, tmp_path_factory):
+    output = tmp_path_factory.mktemp("trained")
+    Training(settings(samples.one_step(iterations=2)), folders, output).run()
+    return output / "model"
+
+
+def test_such_a_model_knows_each_of_its_data_sets(folders, trained):
+    (found,) = saved_candidates([trained])
+    known = [r.config_hash for r in load_recordings(folders, "training", "plain")]
+    assert found.warnings("tiny", known[0], "evaluation") == []
+    assert found.warnings("other", known[-1], "evaluation") == []
+    assert "of another configuration" in found.warnings("other", "1" * 64, "evaluation")[0]
+    assert "not on 'third'" in found.warnings("third", known[0], "evaluation")[0]
+    assert "not unseen" in found.warnings("other", known[-1], "training")[0]
+
+
+def test_the_command_takes_several_data_sets_and_judges_each(folders, program, tmp_path):
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(settings(samples.one_step(iterations=2)).to_toml())
+    data = [word for folder in folders for word in ("--data", folder)]
+    status, _, err = program(
+        "train", recipe, *data, "-o", tmp_path / "out", "--evaluate", "validation"
+    )
+    assert status == 0, err
+    for folder in folders:
+        (path,) = (tmp_path / "out" / "evaluation" / folder.name).glob("*.json")
+        assert json.loads(path.read_text())["data"]["name"] in ("tiny", "other")
+
+
+def test_a_data_set_that_comes_twice_is_refused(folders, program, tmp_path):
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(settings(samples.one_step(iterations=2)).to_toml())
+    data = [word for folder in (*folders, folders[0]) for word in ("--data", folder)]
+    status, _, err = program("train", recipe, *data, "-o", tmp_path / "out")
+    assert status == 2
+    assert err == f"error: {folders[0]}: expected each data set once.\n"
+    with pytest.raises(InputError, match="expected the folder of one or more"):
+        TrajectoryDataset([], "training")
+
+
+def test_a_validation_split_in_one_of_two_is_refused(folders, tmp_path):
+    without = samples.dataset(tmp_path / "without", training=(2,), validation=(), frames=5)
+    (without / "validation").rmdir()
+    config = settings(samples.one_step(iterations=2))
+    with pytest.raises(InputError, match=r"without: no split 'validation', which .* has"):
+        Training(config, (folders[0], without), tmp_path / "out")
+
+
+def test_scenes_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tmp_path):
+    other = tmp_path / "other"
+    (other / "training").mkdir(parents=True)
+    shard = read_shard(folders[1] / "training" / "mesh-0000.h5")
+    step = 2.0 * shard.attributes["time_step"]
+    simulations = tuple(
+        replace(s, scene_toml=doubled(s.scene_toml, step)) for s in shard.simulations
+    )
+    write_shard(
+        other / "training" / "mesh-0000.h5",
+        replace(shard, simulations=simulations, attributes={**shard.attributes, "time_step": step}),
+        "float32",
+    )
+    both = [folders[0] / "training", other / "training"]
+    recordings = load_recordings([path.parent for path in both], "training", "plain")
+    with pytest.raises(InputError, match="expected the same"):
+        SceneGroup(recordings, "plain", "cpu")
+
+
+def doubled(text, step):
+    return pc.Scene.from_toml(text).with_changes(time={"step": step}).to_toml()
