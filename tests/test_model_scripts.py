@@ -51,6 +51,13 @@ def test_the_page_of_results_has_the_tables_of_the_records():
         assert len(found.splitlines()) == 2 + len(records) > 5  # each has its row
 
 
+def test_each_script_has_its_row_in_the_list():
+    lines = (ROOT / "models" / "README.md").read_text(encoding="utf-8").splitlines()
+    told = " ".join(line.split("|")[1] for line in lines if line.startswith("| `"))
+    for path in (ROOT / "models").glob("*.py"):
+        assert f"`{path.name}`" in told or path.name == "run_record.py"
+
+
 def as_version_2(folder):
     """A model as it was before there were ranges of bodies at rest."""
     description = json.loads((folder / "model.json").read_text())
