@@ -34,7 +34,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pdcorrect.corrector.model_io import JOINT, load_model
+from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
 from pdcorrect.data.workers import visible_gpus
@@ -179,7 +179,7 @@ def plan(
     until = None if options.seconds is None else time.time() + options.seconds
     starts = {recipe: TrainingConfig.load(recipe).start_from for recipe in recipes}
     _refuse_circles({_output(work, r) / MODEL: work / (starts[r] or "") for r in recipes})
-    known = {model: load_model(HERE / model).record.dataset.split(JOINT) for model in released}
+    known = {model: [name for name, _ in load_model(HERE / model).data_sets] for model in released}
     learnt = list(dict.fromkeys(name for recipe in recipes for name in _data_of(recipe)))
     names = list(dict.fromkeys([*learnt, *(name for each in known.values() for name in each)]))
     before: dict[str, list[Job]] = {name: [] for name in names}

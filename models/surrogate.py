@@ -1,16 +1,22 @@
 """Train a network without a solver on a data set and measure it: what the solver is worth.
 
-python models/surrogate.py DATA -o OUTPUT [--seconds 300] [--steps 1 2 4 8] [--batch 64]
-    [--noise 1.0] [--preset equivariant] [--changes layers=6 ...] [--seed 0] [--device cuda]
-    [--split evaluation]
+python models/surrogate.py DATA -o OUTPUT [--base plain | total-mass | best] [--seconds 300]
+    [--steps 1 2 4 8] [--batch 64] [--noise 1.0] [--at-rest 0.0] [--preset equivariant]
+    [--changes layers=6 ...] [--seed 0] [--device cuda] [--split evaluation]
 
 The network of a corrector is shown where inertia and loads alone would take the body, p + h v +
-h2 f/m, and says where it goes instead; no elastic solver is asked, in training or after it
-(MeshGraphNet as a surrogate, arXiv 2010.03409).  It is trained on windows of so many steps from
-states of the reference, whose velocities are made wrong by noise, derivatives through all of
-them; the steps share the time equally.  The weights that are best on the validation split by free
-rollouts, looked at ten times, are measured like correctors, by `pdcorrect.evaluation.evaluate`,
-beside the stored runs; OUTPUT gets the same files as by ``pdcorrect evaluate``.
+h2 f/m, with the masses of the coarse model ``--base``, and says where it goes instead; no elastic
+solver is asked, in training or after it (MeshGraphNet as a surrogate, arXiv 2010.03409).  It is
+trained on windows of so many steps from states of the reference that noise makes wrong, with
+derivatives through all of them, the losses, learning rate and averaged weights of correctors.  The
+steps share the time equally, which is that of training, validation and tables.  Loads in training
+are those of the reference's states, in rollouts those of the network's own, which differ for loads
+that follow the body.
+
+The averaged weights with the smallest errors of free rollouts on the validation split (by the
+geometric mean, for they may be of any size), looked at ten times, are measured like correctors, by
+`pdcorrect.evaluation.evaluate`, beside the stored runs.  OUTPUT gets the same files as by
+``pdcorrect evaluate``, and the weights.
 """
 
 from __future__ import annotations
@@ -18,46 +24,52 @@ from __future__ import annotations
 import argparse
 import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from run_record import origin
+from safetensors.torch import save_file
 from torch import Tensor
 
 from pdcorrect import metrics
-from pdcorrect.batch.states import BatchResult, BatchState
+from pdcorrect.batch.states import BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_step import BatchParts
-from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
-from pdcorrect.data.reader import TrajectoryDataset
+from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.schema import PLAIN
+from pdcorrect.data.shard_arrays import read_header
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.cases import Case, read_cases
 from pdcorrect.evaluation.evaluation import Candidate, evaluate
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.evaluation.tables import markdown, write_evaluation
+from pdcorrect.fem.coarse_models import Base
 from pdcorrect.state import Status
 from pdcorrect.training.config import Stage
 from pdcorrect.training.fitting import fit_normaliser
-from pdcorrect.training.losses import body_losses
+from pdcorrect.training.losses import BaseErrors, body_losses
 from pdcorrect.training.optimisation import Optimiser
 from pdcorrect.training.precision import network_precision
-from pdcorrect.training.recordings import Recording, load_recordings
-from pdcorrect.training.resident import ResidentWindows, StoredWindows
-from pdcorrect.training.validation import LEAST
+from pdcorrect.training.recordings import load_recordings
+from pdcorrect.training.resident import StoredWindows
 from pdcorrect.training.windows import StepBatch, StepWindows
 from pdcorrect.training.world import World
 
-NAME = "network alone"
+NAME, WEIGHTS = "network alone", "weights.safetensors"
 LOOKS = 10
 """At the validation split."""
+MOST_SKIPPED = 20
+"""Batches in a row without a finite gradient."""
 
 
 class Alone:
@@ -103,12 +115,12 @@ class AloneResult:
 
     state: BatchState
     correction: Tensor
-    coarse: BatchResult | Unasked
+    coarse: Unasked
     refused: Tensor
 
 
 class AloneWindows(StepWindows):
-    """Single steps of which all is to be given by the network."""
+    """Steps of which all is to be given by the network."""
 
     def step_batch(self, found: object, *, last: bool = True) -> StepBatch:
         """See `StepWindows`."""
@@ -117,148 +129,191 @@ class AloneWindows(StepWindows):
         return replace(batch, target=stored.targets[0] - batch.snapshot.proposed)
 
 
-class Windows:
-    """Windows of k steps of a training split in a device's memory, drawn at random.
+class Draws:
+    """Windows in random order, their first states wrong.
 
     Parameters
     ----------
-    folder : path
-    recordings : sequence of Recording
-        Of the split.
-    steps : int
-        k.
-    device : torch.device
+    windows : StepWindows
+    noise : float
+        Deviation of positions, in root mean squared one-step errors (a component) of the coarse
+        model on the same trajectory, and of velocities, in these over h.
+    at_rest : float
+        Share of the windows with which simulations begin.
     seed : int
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        recordings: Sequence[Recording],
-        steps: int,
-        device: torch.device,
-        seed: int,
-    ) -> None:
-        self.steps, self._device = steps, device
-        self._dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=PLAIN)
-        self._tables = ResidentWindows(self._dataset, self._body, device)
-        self._rng = np.random.default_rng((seed, steps))
-        self._generator = torch.Generator(device).manual_seed(seed)
-        numbers = {header.path: k for k, header in enumerate(self._dataset.headers)}
-        scales = torch.zeros(len(numbers), max(r.number for r in recordings) + 1).double()
-        for r in recordings:
-            scales[numbers[r.path], r.number] = r.one_step
-        self._scales = scales.to(device)
+    def __init__(self, windows: StepWindows, noise: float, at_rest: float, seed: int) -> None:
+        self._windows, self._noise, self._at_rest = windows, noise, at_rest
+        every = np.arange(len(windows.dataset))
+        self._beginnings = every[windows.dataset.places(every)[2] == 0]
+        self._rng = np.random.default_rng((seed, windows.dataset.window))
+        self._generator = torch.Generator(windows.device).manual_seed(seed)
 
-    def _body(self, window: int) -> BodyGraph:
-        found = self._dataset.batch([window]).to(self._device)
-        return BodyGraph.of_batch(found).to(dtype=torch.float64)
+    def __call__(self, size: int) -> tuple[StoredWindows, BaseErrors]:
+        """A batch, and the coarse model's errors on the trajectories."""
+        chosen = self._rng.integers(0, len(self._windows.dataset), size)
+        first = self._rng.choice(self._beginnings, size)
+        chosen = np.where(self._rng.random(size) < self._at_rest, first, chosen)
+        stored = self._windows.windows(chosen.tolist())
+        errors, bodies = self._windows.errors(stored), stored.bodies
+        deviation = self._noise * bodies.by_node((errors.one_step / 3.0).sqrt())[:, None]
+        h = bodies.by_node(bodies.time_step)[:, None]
+        moved = self._gauss(stored.positions, deviation)
+        pushed = self._gauss(stored.positions, deviation / h)
+        free = bodies.free
+        return replace(
+            stored, positions=stored.positions + torch.where(free, moved, 0.0),
+            velocities=stored.velocities + torch.where(free, pushed, 0.0),
+        ), errors  # fmt: skip
 
-    def draw(self, size: int, noise: float) -> tuple[StoredWindows, Tensor]:
-        """A batch, and the plain mesh's mean squared one-step error on each trajectory, (B,), m2.
-
-        Velocities are off by Gaussian noise, ``noise`` times the root of that error over h.
-        """
-        stored = self._tables.batch(self._rng.integers(0, len(self._dataset), size))
-        scale, bodies = self._scales[stored.file, stored.simulation], stored.bodies
-        wrong = torch.randn(
-            stored.positions.shape, generator=self._generator, dtype=torch.float64,
-            device=self._device,
-        )  # fmt: skip
-        size_of = bodies.by_node((scale / 3.0).sqrt() / bodies.time_step)[:, None]
-        wrong = torch.where(bodies.free, noise * size_of * wrong, 0.0)
-        return replace(stored, velocities=stored.velocities + wrong), scale
+    def _gauss(self, like: Tensor, deviation: Tensor) -> Tensor:
+        return deviation * torch.randn(
+            like.shape, generator=self._generator, dtype=like.dtype, device=like.device
+        )
 
 
-def unrolled_loss(
-    corrector: Corrector, stored: StoredWindows, scale: Tensor, stage: Stage
-) -> Tensor:
-    """Mean loss of some steps of the network's own.
+def unrolled(corrector: Corrector, stored: StoredWindows, amp: Any = "none") -> Iterator[Tensor]:
+    """Positions (n, 3) after each of a window's steps, by the network alone.
 
     Parameters
     ----------
     corrector : Corrector
     stored : StoredWindows
-        Of k steps.
-    scale : (B,)
-        Mean squared one-step error of the plain mesh on each trajectory, m2; an error counts as
-        that over it, and over the square of how far errors of one step carry, see
-        `pdcorrect.training.losses`.
-    stage : Stage
+        Of k steps, with the first state.
+    amp
+        See `Stage`.
     """
-    bodies, total = stored.bodies, torch.zeros((), dtype=torch.float64, device=scale.device)
+    bodies = stored.bodies
     h = bodies.by_node(bodies.time_step)[:, None]
     positions, velocities = stored.positions, stored.velocities
-    for j in range(len(stored.targets)):
-        truth, forces = stored.targets[j], stored.forces[j]
+    for truth, forces in zip(stored.targets, stored.forces, strict=True):
         state = Snapshot(positions, velocities, positions, forces, None)
         start = ballistic(state, h, forces, bodies.mass, bodies.free, truth)
-        with network_precision(corrector, stage.amp):
-            correction = corrector(bodies, replace(state, proposed=start))
-        after = start + correction
+        with network_precision(corrector, amp):
+            after = start + corrector(bodies, replace(state, proposed=start))
         positions, velocities = after, (after - positions) / h
-        carried = scale * (0.5 * (j + 1) * (j + 2)) ** 2
-        each = body_losses(stage.loss, after - truth, bodies.node_sums, bodies.node_counts, carried)
-        total = total + each.mean()
+        yield positions
+
+
+def unrolled_loss(
+    corrector: Corrector, stored: StoredWindows, errors: BaseErrors, stage: Stage
+) -> Tensor:
+    """Mean loss of the steps of some windows, as correctors have it."""
+    bodies, total = stored.bodies, torch.zeros((), dtype=torch.float64, device=stored.file.device)
+    for j, after in enumerate(unrolled(corrector, stored, stage.amp)):
+        wrong, scale = after - stored.targets[j], errors.after(j + 1)
+        total = (
+            total
+            + body_losses(stage.loss, wrong, bodies.node_sums, bodies.node_counts, scale).mean()
+        )
     return total / len(stored.targets)
 
 
-def omegas(cases: Sequence[Case], corrector: Corrector, device: str, batch: int) -> list[float]:
-    """Omega of free rollouts, per cent, at least `LEAST`."""
+def over_plain(
+    cases: Sequence[Case], corrector: Corrector, base: str, device: str, batch: int
+) -> NDArray[np.float64]:
+    """RMS errors of free rollouts over those of the plain mesh, (S,)."""
     found = []
     for first in range(0, len(cases), batch):
         some = cases[first : first + batch]
-        stepper = BatchStepper([case.problems[PLAIN] for case in some], device=device)
+        stepper = BatchStepper([case.problems[base] for case in some], device=device)
         runs = roll_out(Alone(stepper, corrector), stepper, [case.steps for case in some])
         for run, case in zip(runs, some, strict=True):
-            omega = metrics.error_corrected(run.positions, case.runs[PLAIN], case.reference)
-            found.append(max(float(omega), LEAST))
-    return found
+            error, plain = (
+                metrics.rms_error(x, case.reference) for x in (run.positions, case.runs[PLAIN])
+            )
+            found.append(error / plain)
+    return np.array(found)
 
 
-def train(options: argparse.Namespace) -> tuple[Corrector, list[dict[str, float]]]:
-    """The network with the best weights, and what validation said."""
-    device = torch.device(options.device)
-    config = preset(options.preset, placement="guess", **dict(options.changes))
-    recordings = load_recordings(options.data, TRAINING, PLAIN, scenes=False)
-    cases = read_cases(options.data, VALIDATION, skip_damaged=False).cases[: options.validation]
-    torch.manual_seed(options.seed)
-    corrector = Corrector(config).to(device)
-    single = AloneWindows(options.data, recordings, config, PLAIN, device=device)
-    fit_normaliser(corrector, single, options.fit, options.seed)
-    del single  # a table less
-    stage = Stage(
-        kind="one-step", seconds=options.seconds, batch=options.batch, amp=options.amp,
-        rate={"peak": 1e-3, "last": 1e-5}, loss={"bend": 0.3},
-    )  # fmt: skip
-    optimiser = Optimiser(corrector, stage, None, World())
-    best, history = copy.deepcopy(corrector.state_dict()), []
-    windows: Windows | None = None
-    spent, iterations = 0.0, 0
-    while spent < options.seconds:
-        share = spent / options.seconds
-        steps = options.steps[int(share * len(options.steps))]
-        if windows is None or windows.steps != steps:
-            windows = None
-            windows = Windows(options.data, recordings, steps, device, options.seed)
-        started = time.perf_counter()
-        stored, scale = windows.draw(options.batch, options.noise)
-        optimiser.step(unrolled_loss(corrector, stored, scale, stage), share)
-        if device.type == "cuda":
-            torch.cuda.synchronize()
-        spent += time.perf_counter() - started
-        iterations += 1
-        if spent >= (len(history) + 1) / LOOKS * options.seconds:
-            found = omegas(cases, corrector, options.device, options.batch)
-            row = {"seconds": spent, "iterations": iterations, "steps": steps,
-                   "loss": optimiser.take_report()["loss"], "omega_mean": float(np.mean(found)),
-                   "omega_median": float(np.median(found))}  # fmt: skip
-            print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
-            if row["omega_mean"] > max((r["omega_mean"] for r in history), default=-np.inf):
-                best = copy.deepcopy(corrector.state_dict())
-            history.append(row)
-    corrector.load_state_dict(best)
-    return corrector, history
+class Learner:
+    """A training, looked at from time to time.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+        See `main`.
+
+    Attributes
+    ----------
+    best : Corrector
+        With the averaged weights that were best so far.
+    history : list of dict
+        What was seen at each look.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options, self._device = options, torch.device(options.device)
+        self._config = preset(options.preset, placement="guess", **dict(options.changes))
+        self._recordings = load_recordings(options.data, TRAINING, options.base, scenes=False)
+        found = read_cases(options.data, VALIDATION, [options.base], skip_damaged=False).cases
+        self._cases = found[: options.validation]
+        torch.manual_seed(options.seed)
+        self._corrector = Corrector(self._config).to(self._device)
+        fit_normaliser(self._corrector, self._windows(1), options.fit, options.seed)
+        self._averaged = copy.deepcopy(self._corrector)
+        self._stage = Stage(
+            kind="one-step", seconds=options.seconds, batch=options.batch, amp=options.amp,
+            rate={"peak": 1e-3, "last": 1e-5}, loss={"bend": 0.3}, ema=0.99,
+        )  # fmt: skip
+        self._optimiser = Optimiser(self._corrector, self._stage, self._averaged, World())
+        self.best = copy.deepcopy(self._corrector)
+        self.history: list[dict[str, float]] = []
+
+    def _windows(self, steps: int) -> StepWindows:
+        return AloneWindows(
+            self._options.data, self._recordings, self._config, self._options.base,
+            device=self._device, steps=steps,
+        )  # fmt: skip
+
+    def run(self) -> None:
+        """Train until time is up.
+
+        Raises
+        ------
+        ConvergenceError
+            If too many batches in a row had no finite gradient.
+        """
+        options, started = self._options, time.perf_counter()
+        draws: Draws | None = None
+        length = iterations = 0
+        while (spent := time.perf_counter() - started) < options.seconds:
+            share = spent / options.seconds
+            steps = options.steps[int(share * len(options.steps))]
+            if steps != length:
+                draws, length = None, steps  # a table less before there is another
+                draws = Draws(self._windows(steps), options.noise, options.at_rest, options.seed)
+            stored, errors = draws(options.batch)
+            loss = unrolled_loss(self._corrector, stored, errors, self._stage)
+            self._optimiser.step(loss, share)
+            iterations += 1
+            if self._device.type == "cuda":
+                torch.cuda.synchronize()
+            if time.perf_counter() - started >= len(self.history) * options.seconds / LOOKS:
+                self._look(time.perf_counter() - started, iterations, steps)
+        self._look(options.seconds, iterations, length)
+
+    def _look(self, seconds: float, iterations: int, steps: int) -> None:
+        """Roll out, and keep these weights if none were better."""
+        options, told = self._options, self._optimiser.take_report()
+        if told["longest"] >= MOST_SKIPPED:
+            raise ConvergenceError(
+                f"iteration {iterations}: {told['longest']:.0f} batches in a row had a loss or "
+                "gradient that is not finite. Expected fewer --steps, or less --noise."
+            )
+        found = over_plain(self._cases, self._averaged, options.base, options.device, options.batch)
+        row = {
+            "seconds": seconds, "iterations": iterations, "steps": steps,
+            "skipped": told["skipped"], "error_over_plain": float(np.exp(np.log(found).mean())),
+            **({"loss": told["loss"]} if told["count"] else {}),
+        }  # fmt: skip
+        print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
+        if row["error_over_plain"] < min(
+            (r["error_over_plain"] for r in self.history), default=np.inf
+        ):
+            self.best.load_state_dict(self._averaged.state_dict())
+        self.history.append(row)
 
 
 def changed(text: str) -> tuple[str, int]:
@@ -267,19 +322,30 @@ def changed(text: str) -> tuple[str, int]:
     return name, int(number)
 
 
+def check(options: argparse.Namespace) -> None:
+    """Refuse now what would be found out when the training has ended."""
+    shard_paths(options.data, options.split)
+    steps = [n for p in shard_paths(options.data, TRAINING) for n in read_header(p).steps]
+    if not 1 <= min(options.steps) <= max(options.steps) <= max(steps):
+        raise InputError(f"--steps {options.steps}: expected 1 to {max(steps)}.")
+    if not options.seconds > 0.0:
+        raise InputError(f"--seconds {options.seconds:g}: expected more than 0.")
+
+
 def main() -> None:
     """Train and measure."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--base", default=PLAIN, choices=get_args(Base), help="whose masses")
     parser.add_argument("--split", default=EVALUATION)
     parser.add_argument("--preset", default="equivariant")
     parser.add_argument("--changes", type=changed, nargs="*", default=[], metavar="NAME=NUMBER")
-    parser.add_argument("--seconds", type=float, default=300.0, help="of training")
+    parser.add_argument("--seconds", type=float, default=300.0)
     parser.add_argument("--steps", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--noise", type=float, default=1.0,
-                        help="of velocities, in the plain mesh's errors over h")  # fmt: skip
+    parser.add_argument("--noise", type=float, default=1.0, help="in the coarse model's errors")
+    parser.add_argument("--at-rest", type=float, default=0.0, help="share of first windows")
     parser.add_argument("--amp", default="none", choices=["none", "bf16"])
     parser.add_argument("--fit", type=int, default=10_000, help="windows of the normalisation")
     parser.add_argument("--validation", type=int, default=100, help="simulations")
@@ -287,21 +353,27 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes that measure")
     options = parser.parse_args()
-    corrector, history = train(options)
-    candidate = Candidate(NAME, PLAIN, lambda stepper: Alone(stepper, corrector))
+    check(options)
+    learner = Learner(options)
+    learner.run()
+    corrector = learner.best
     found = evaluate(
-        [candidate], options.data, options.split, device=options.device, batch=100,
-        workers=options.workers,
+        [Candidate(NAME, options.base, lambda stepper: Alone(stepper, corrector))],
+        options.data, options.split, device=options.device, batch=100, workers=options.workers,
     )  # fmt: skip
     parameters = sum(x.numel() for x in corrector.network.parameters())
     notes = [
         f"{NAME}: preset {options.preset}, {parameters} parameters, {options.seconds:g} s of "
-        f"training, {history[-1]['iterations']} iterations, seed {options.seed}"
+        f"training, {learner.history[-1]['iterations']} iterations, seed {options.seed}"
     ]
     print(markdown(found), *notes, sep="\n")
-    record = {**origin(), "history": history, "notes": notes}
+    record = {**origin(), "history": learner.history, "notes": notes}
     for path in write_evaluation(found, options.output, record, notes):
         print(f"wrote {path}")
+    save_file(
+        {name: x.contiguous() for name, x in corrector.state_dict().items()},
+        options.output / WEIGHTS,
+    )
 
 
 if __name__ == "__main__":

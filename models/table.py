@@ -4,7 +4,8 @@ python models/table.py
 
 The first has models on unseen meshes of their evaluation splits, the second scenes unlike those
 of the training, with the default gate of then and without one, the third bodies of other sizes and
-families, the fourth, for the models of the first, errors of single steps beside those of rollouts.
+families, the fourth, for the models of the first, errors of single steps beside those of rollouts,
+the fifth what needs no network, the sixth the model of all motions beside those of one.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ _KICKED = "impulse-as-published-total-mass"
 _HEAVY = "torsion-as-published-total-mass"
 ROWS = (
     Row("impulse-as-published", "impulse-as-published-fourth", "model", _IMPULSE),
-    Row(_KICKED, f"{_KICKED}-third", _KICKED, _IMPULSE),
+    Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
     Row("stretch-as-published", "stretch-as-published-third", "model", _STRETCH),
     Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),
     Row("torsion-as-published", "torsion-as-published-second", "torsion-as-published", _TORSION),
@@ -88,10 +89,29 @@ STEP_HEADINGS = (
     f"rollouts above {HARM}", "their single steps: largest",
 )  # fmt: skip
 
+PUBLISHED = ("impulse-as-published", "stretch-as-published", "torsion-as-published")
+WITHOUT_NETWORK = {
+    "consistent mass": "consistent mass",
+    "hex8-mean": "element `hex8-mean`",
+    "hex8-bubble": "element `hex8-bubble`",
+    "hex8-bubble-mean": "element `hex8-bubble-mean`",
+    "fitted stiffness": "Young's modulus times {factors}, fitted",
+    "total-mass": "the reference's total mass",
+    "intermediate": "intermediate mesh",
+}
+"""Runs of the fifth table, in its order, and what they are called there."""
+TOGETHER = "all-as-published"
+TOGETHER_HEADINGS = (
+    "data set", "one model for all: Ω mean", "95 %", "median", "worst",
+    "model of this motion: Ω mean, worst", "difference", f"rollouts above {HARM}",
+    "intermediate mesh: Ω mean", "stress error, %: one model, of this motion, intermediate",
+)  # fmt: skip
+
 
 def main() -> None:
     """Print them."""
-    print("\n\n".join((table(), others_table(), bodies_table(), steps_table())))
+    every = (table, others_table, bodies_table, steps_table, baselines_table, together_table)
+    print("\n\n".join(make() for make in every))
 
 
 def table() -> str:
@@ -134,6 +154,58 @@ def steps_table() -> str:
     """The fourth table in Markdown."""
     head = [_line(STEP_HEADINGS), _line(["---", *["---:"] * (len(STEP_HEADINGS) - 1)])]
     return "\n".join([*head, *(_line(_step_cells(row)) for row in ROWS)])
+
+
+def baselines_table() -> str:
+    """The fifth table in Markdown."""
+    folder = RESULTS / "baselines"
+    records = [
+        json.loads((folder / name / "summary.json").read_text(encoding="utf-8"))
+        for name in PUBLISHED
+    ]
+    headings = ("coarse mesh with", *(name.replace("-", " ") for name in PUBLISHED))
+    lines = [_line(headings), _line(["---", *["---:"] * len(PUBLISHED)])]
+    for run, name in WITHOUT_NETWORK.items():
+        cells = [_baseline_cell(record, run) for record in records]
+        factors = ", ".join(f"{record['stiffness_factor']:.2f}" for record in records)
+        lines.append(_line([name.format(factors=factors), *cells]))
+    return "\n".join(lines)
+
+
+def together_table() -> str:
+    """The sixth table in Markdown."""
+    lines = [_line(TOGETHER_HEADINGS), _line(["---", *["---:"] * (len(TOGETHER_HEADINGS) - 1)])]
+    for name in PUBLISHED:
+        own = next(row for row in ROWS if row.model == f"{name}-total-mass")
+        row = Row(TOGETHER, f"{TOGETHER}/{name.split('-')[0]}", "model", own.thesis)
+        found, alone = (
+            json.loads((RESULTS / one.record / "summary.json").read_text(encoding="utf-8"))["runs"]
+            for one in (row, own)
+        )
+        omega, other = (
+            runs[one.run]["measures"]["omega"] for runs, one in ((found, row), (alone, own))
+        )
+        ratios = _over_base(row, found["model"]["base"], "rms_error").values()
+        stress = (
+            100.0 * runs[run]["measures"]["stress_error"]["mean"]
+            for runs, run in ((found, "model"), (alone, own.run), (found, "intermediate"))
+        )
+        low, high = omega["interval"]
+        lines.append(_line([
+            f"`{name}`", f"**{omega['mean']:.1f}**", f"{low:.1f} – {high:.1f}",
+            f"{omega['median']:.1f}", f"{omega['smallest']:.1f}",
+            f"{other['mean']:.1f}, {other['smallest']:.1f}",
+            _signed(f"{omega['mean'] - other['mean']:.1f}"),
+            f"{sum(x > HARM for x in ratios)} of {len(ratios)}",
+            f"{found['intermediate']['measures']['omega']['mean']:.1f}",
+            ", ".join(f"{x:.1f}" for x in stress),
+        ]))  # fmt: skip
+    return "\n".join(lines)
+
+
+def _baseline_cell(record: dict[str, Any], run: str) -> str:
+    omega = record["runs"][run]["measures"]["omega"]
+    return _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}")
 
 
 def _step_cells(row: Row) -> list[str]:

@@ -144,7 +144,7 @@ def test_the_examples_and_recipes_can_be_read(path):
     TrainingConfig.load(path)
 
 
-def told(settings):
+def told(settings, own):
     """What the table of recipes has in its columns "corrects", "seconds" and "goes on with"."""
     parts = []
     for stage in settings.stages:
@@ -154,12 +154,11 @@ def told(settings):
         steps = stage.steps if isinstance(stage.steps, tuple) else (stage.steps,)
         detached = "" if stage.through_solver else " detached"
         parts.append(f"{', '.join(map(str, steps))}{detached}: {stage.seconds:g}")
-    start = settings.start_from
-    return (
-        settings.base.replace("-", " "),
-        "; ".join(parts),
-        f"`{Path(start).parent.name}`" if start else "",
-    )
+    start = ""
+    if settings.start_from:
+        name = Path(settings.start_from).parent
+        start = f"`{name.name}`" if name.parent.name == own else f"`{name.parent.name}/{name.name}`"
+    return settings.base.replace("-", " "), "; ".join(parts), start
 
 
 def test_each_recipe_has_its_row_in_the_table():
@@ -168,7 +167,9 @@ def test_each_recipe_has_its_row_in_the_table():
     cells = [[c.strip() for c in line.split("|")[1:-1]] for line in lines if line.startswith("| `")]
     rows = {row[0].strip("`"): tuple(row[1:4]) for row in cells}
     recipes = {str(p.relative_to(folder).with_suffix("")): p for p in folder.glob("*/*.toml")}
-    assert rows == {name: told(TrainingConfig.load(path)) for name, path in recipes.items()}
+    assert rows == {
+        name: told(TrainingConfig.load(path), path.parent.name) for name, path in recipes.items()
+    }
 
 
 def test_the_thesis_is_an_example():

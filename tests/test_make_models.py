@@ -106,7 +106,7 @@ def test_a_recipe_for_all_motions_waits_for_their_data_and_is_evaluated_on_each(
     model = tmp_path / "trainings/all-as-published/total-mass/model"
     for name in sets:
         job = jobs[f"evaluate-{name}"]
-        assert job.models == [model, own] if name in own.parts else [model]
+        assert job.models == ([model, own] if name in own.parts else [model])
         assert together in job.after
     assert len(jobs) == 3 * 2 + 2 + 3
 

@@ -1,7 +1,10 @@
 """One training on several data sets, whose meshes have the same numbers and are others."""
 
+import hashlib
 import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +15,19 @@ pytest.importorskip("torch_geometric")
 import pdcorrect as pc  # noqa: E402
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
+from pdcorrect.data.config import DatasetConfig  # noqa: E402
+from pdcorrect.data.plan import make_plan  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.data.schema import write_shard  # noqa: E402
+from pdcorrect.data.shard_arrays import read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.training.recordings import data_hash, load_recordings, make_problems  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402
+from pdcorrect.training.windows import StepWindows  # noqa: E402
 
 ONE, OTHER = (0,), (3, 1)
 
@@ -137,14 +144,26 @@ def test_a_training_learns_several_data_sets_and_goes_on_bit_by_bit(folders, tmp
     record = one.record
     assert record.dataset == "tiny+other"
     assert record.dataset_hash == data_hash(folders, ("training", "validation"))
-    assert record.training["config_hash"].split("+")[1] == "0" * 64
+    own = load_recordings(folders[0], "training", "plain")[0].config_hash
+    assert one.data_sets == [("tiny", own), ("other", "0" * 64)]
     with pytest.raises(InputError, match="was begun with data"):
         Training(config, folders[:1], tmp_path / "whole", resume=True)
 
 
-def test_a_single_data_set_has_the_hash_that_it_had(folders):
-    assert data_hash(folders[0], ["training"]) == data_hash([folders[0]], ["training"])
-    assert data_hash(folders, ["training"]) != data_hash(folders[1], ["training"])
+def test_the_hash_is_that_of_the_files_in_their_order(folders):
+    def by_hand(*chosen):
+        digest = hashlib.sha256()
+        for split in ("training", "validation"):
+            for folder in chosen:
+                for path in sorted((folder / split).iterdir()):
+                    digest.update(
+                        f"{split}/{path.name} {read_header(path).content_hash}\n".encode()
+                    )
+        return digest.hexdigest()
+
+    splits = ("training", "validation")
+    assert data_hash(folders[0], splits) == by_hand(folders[0])
+    assert data_hash(list(folders), splits) == by_hand(*folders)
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +179,7 @@ def test_such_a_model_knows_each_of_its_data_sets(folders, trained):
     assert found.warnings("tiny", known[0], "evaluation") == []
     assert found.warnings("other", known[-1], "evaluation") == []
     assert "of another configuration" in found.warnings("other", "1" * 64, "evaluation")[0]
+    assert "of another configuration" in found.warnings("other", known[0], "evaluation")[0]
     assert "not on 'third'" in found.warnings("third", known[0], "evaluation")[0]
     assert "not unseen" in found.warnings("other", known[-1], "training")[0]
 
@@ -174,7 +194,8 @@ def test_the_command_takes_several_data_sets_and_judges_each(folders, program, t
     assert status == 0, err
     for folder in folders:
         (path,) = (tmp_path / "out" / "evaluation" / folder.name).glob("*.json")
-        assert json.loads(path.read_text())["data"]["name"] in ("tiny", "other")
+        name = "other" if folder == folders[1] else "tiny"
+        assert json.loads(path.read_text())["data"]["name"] == name
 
 
 def test_a_data_set_that_comes_twice_is_refused(folders, program, tmp_path):
@@ -196,7 +217,7 @@ def test_a_validation_split_in_one_of_two_is_refused(folders, tmp_path):
         Training(config, (folders[0], without), tmp_path / "out")
 
 
-def test_scenes_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tmp_path):
+def test_sets_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tmp_path):
     other = tmp_path / "other"
     (other / "training").mkdir(parents=True)
     shard = read_shard(folders[1] / "training" / "mesh-0000.h5")
@@ -209,11 +230,58 @@ def test_scenes_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, 
         replace(shard, simulations=simulations, attributes={**shard.attributes, "time_step": step}),
         "float32",
     )
-    both = [folders[0] / "training", other / "training"]
-    recordings = load_recordings([path.parent for path in both], "training", "plain")
-    with pytest.raises(InputError, match="expected the same"):
+    without = tmp_path / "without" / "training"
+    without.mkdir(parents=True)
+    shutil.copy(folders[0] / "training" / "mesh-0000.h5", without)
+    config = settings(samples.one_step(iterations=2))
+    told = r"mesh-0000.h5: time_step 0.02, unlike 0.01 of .*mesh-0000.h5: expected the same in all"
+    with pytest.raises(InputError, match=told):
+        Training(config, (without.parent, other), tmp_path / "out")
+    recordings = load_recordings((without.parent, other), "training", "plain")
+    with pytest.raises(InputError, match=r"time\.step .*expected the same"):
         SceneGroup(recordings, "plain", "cpu")
 
 
 def doubled(text, step):
     return pc.Scene.from_toml(text).with_changes(time={"step": step}).to_toml()
+
+
+def test_recordings_that_are_not_the_windows_own_are_refused(folders):
+    architecture = settings(samples.one_step()).architecture()
+    recordings = load_recordings(folders[1], "training", "plain")
+    for wrong in (recordings[1:], load_recordings(folders[0], "training", "plain")):
+        with pytest.raises(InputError, match=r"recordings for 4 simulations: expected those of"):
+            StepWindows(folders[1], wrong, architecture, "plain")
+
+
+def test_ranks_share_the_groups_of_all_data_sets(folders):
+    recordings = load_recordings(folders, "training", "plain")
+    of_ranks = [grouped(recordings, 2, seed=0, rank=rank, world_size=2) for rank in (0, 1)]
+    names = sorted(r.name for groups in of_ranks for group in groups for r in group)
+    assert names == sorted(r.name for r in recordings)
+    assert len(set(names)) == 5
+
+
+def test_models_of_before_know_their_one_data_set():
+    assert load_model("tiny").data_sets[0][0] == "tiny"
+    assert len(load_model("tiny").data_sets) == 1
+
+
+def test_what_published_sets_share_is_what_the_lab_book_says():
+    folder = Path(__file__).parents[1] / "datasets"
+    designs = {}
+    for motion in ("impulse", "stretch", "torsion"):
+        config = DatasetConfig.load(folder / f"{motion}-as-published" / "config.toml")
+        for plan in make_plan(config):
+            designs.setdefault((motion, plan.split), set()).add(plan.design.key())
+    shared = {
+        (one, other): len(designs[one] & designs[other])
+        for one in designs for other in designs
+        if one[0] != other[0] and one[1] == "training" and designs[one] & designs[other]
+    }  # fmt: skip
+    assert shared == {
+        (("impulse", "training"), ("stretch", "training")): 3,
+        (("stretch", "training"), ("impulse", "training")): 3,
+        (("impulse", "training"), ("stretch", "evaluation")): 1,
+        (("stretch", "training"), ("impulse", "validation")): 1,
+    }

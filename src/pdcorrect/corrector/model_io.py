@@ -49,7 +49,7 @@ VERSION = 3
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 JOINT = "+"
-"""Between the names of data sets that a model was trained on together, and their hashes."""
+"""Between the names of data sets that a model was trained on together."""
 _NORMALISER = "normaliser."
 _CHECKSUM = "checksum"
 
@@ -107,6 +107,17 @@ class LoadedModel:
     def base(self) -> str:
         """Run of the coarse model that it corrects: "plain", "best" or "total-mass"."""
         return str(self.configuration.get("base", "plain"))
+
+    @property
+    def data_sets(self) -> list[tuple[str, str | None]]:
+        """Names of the data sets that it was trained on, and the hashes of their configurations.
+
+        None where a hash is not recorded.
+        """
+        training: dict[str, Any] = self.record.training
+        if "data_sets" in training:
+            return [(one["name"], one["config_hash"]) for one in training["data_sets"]]
+        return [(self.record.dataset, training.get("config_hash"))]
 
     @property
     def velocity(self) -> Any:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
@@ -14,7 +15,7 @@ _NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
 
 
-Folders = str | Path | Iterable[str | Path]
+Folders = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """Of one data set, or of several."""
 
 
@@ -26,7 +27,9 @@ def folders_of(data: Folders) -> tuple[Path, ...]:
     InputError
         If there is none, or one comes twice.
     """
-    found = (Path(data),) if isinstance(data, (str, Path)) else tuple(map(Path, data))
+    if isinstance(data, (str, os.PathLike)):
+        return (Path(data),)
+    found = tuple(map(Path, data))
     if not found:
         raise InputError("no data set: expected the folder of one or more.")
     known: set[Path] = set()

@@ -93,6 +93,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     Attributes
     ----------
+    folders : tuple of Path
+        Of the data sets.
     headers : list of ShardHeader
         Of the files.
     damaged : dict of Path to str

@@ -13,7 +13,6 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import (
-    JOINT,
     LoadedModel,
     load_model,
     model_folder,
@@ -63,10 +62,9 @@ class SavedCandidate:
     def warnings(self, dataset: str, config_hash: str, split: str) -> list[str]:
         """What speaks against taking its errors for those on unseen meshes of its own data."""
         record, name = self.model.record, self.candidate.name
-        names, hashes = record.dataset.split(JOINT), record.training.get("config_hash")
-        known = None if hashes is None else str(hashes).split(JOINT)
-        if dataset not in names or (known is not None and config_hash not in known):
-            other = "" if dataset not in names else " of another configuration"
+        known = [x for own, x in self.model.data_sets if own == dataset]
+        if not {config_hash, None}.intersection(known):
+            other = " of another configuration" if known else ""
             return [
                 f"{name} was trained on {record.dataset!r}{other}, not on {dataset!r}: bodies, "
                 "loads, materials and the coarse model's setting may be others than it knows, and "

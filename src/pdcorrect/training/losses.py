@@ -52,6 +52,10 @@ class BaseErrors:
         factor = (steps * (steps + 1) / 2) ** 2
         return torch.minimum(factor * self.one_step, self.largest)
 
+    def of(self, trajectories: Tensor) -> BaseErrors:
+        """Those of some, by their numbers."""
+        return BaseErrors(self.one_step[trajectories], self.rollout[trajectories])
+
     @property
     def largest(self) -> Tensor:
         """D, at least d1, (B,)."""

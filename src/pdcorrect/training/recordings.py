@@ -37,9 +37,11 @@ class Recording:
     ----------
     path : Path
         The file, which has one mesh.
-    dataset, config_hash, split : str
+    dataset, config_hash, setting, split : str
     mesh, number : int
         Of the mesh in its split, and on the mesh.
+    time_step : float
+        s.
     scene_toml : str
     points : (N, 3) float64
         Rest positions, m.
@@ -56,9 +58,11 @@ class Recording:
     path: Path
     dataset: str
     config_hash: str
+    setting: str
     split: str
     mesh: int
     number: int
+    time_step: float
     scene_toml: str
     points: Array
     cells: Array
@@ -146,9 +150,9 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
 
 def data_hash(folder: Folders, splits: Sequence[str]) -> str:
     """SHA-256 of the content hashes of the files of some splits."""
-    digest = hashlib.sha256()
+    digest, folders = hashlib.sha256(), folders_of(folder)
     for split in splits:
-        for path in _paths(folder, split):
+        for path in _paths(folders, split):
             digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
     return digest.hexdigest()
 
@@ -184,9 +188,11 @@ def _recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
+        setting=str(shard.attributes["setting"]),
         split=split,
         mesh=int(shard.attributes["number"]),
         number=number,
+        time_step=float(shard.attributes["time_step"]),
         scene_toml=simulation.scene_toml,
         points=shard.points,
         cells=shard.cells,

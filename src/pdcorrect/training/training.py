@@ -36,7 +36,7 @@ from pdcorrect.training.fitting import fit_normaliser, widen_ranges
 from pdcorrect.training.history import History
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
-from pdcorrect.training.recordings import data_hash, load_recordings
+from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
 from pdcorrect.training.teachers import check_trained_alike, load_teachers
@@ -81,7 +81,7 @@ class Training:
     InputError
         If the folder holds a training and ``resume`` is not set, or it was another one; if
         files of the data sets are missing, or do not have what the configuration wants; if one
-        has a validation split and another has none; if the
+        has a validation split and another has none, or their settings or time steps differ; if the
         model to start from is missing, or of another architecture, base or velocity; if a
         teacher is.
     FileFormatError
@@ -119,6 +119,7 @@ class Training:
         found = self._checkpoint(resume)
         unrolled = any(stage.kind == "unrolled" for stage in config.stages)
         self._recordings = load_recordings(data, TRAINING, config.base, scenes=unrolled)
+        _check_alike(self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
             workers=config.workers,
@@ -310,13 +311,16 @@ class Training:
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
             known = dict.fromkeys((r.dataset, r.config_hash) for r in self._recordings)
-            names, hashes = zip(*known, strict=True)
-            training = {**self._identity, "config_hash": JOINT.join(hashes),
-                        "iterations": self.progress.total,
-                        "seconds": self.progress.seconds, "processes": self.world.size}  # fmt: skip
             record = ModelRecord(
-                dataset=JOINT.join(names), dataset_hash=self._identity["data"],
-                training=training, metrics=dict(metrics),
+                dataset=JOINT.join(dict.fromkeys(name for name, _ in known)),
+                dataset_hash=self._identity["data"],
+                training={
+                    **self._identity,
+                    "data_sets": [{"name": name, "config_hash": x} for name, x in known],
+                    "iterations": self.progress.total, "seconds": self.progress.seconds,
+                    "processes": self.world.size,
+                },
+                metrics=dict(metrics),
             )  # fmt: skip
             save_model(shown, self.output / MODEL, record=record)
 
@@ -373,6 +377,19 @@ def _common_splits(folders: Sequence[Path]) -> list[str]:
                     "expected one in all data sets, or in none."
                 )
     return found
+
+
+def _check_alike(recordings: Sequence[Recording]) -> None:
+    """Refuse data sets whose simulations one batch cannot hold, or that have other references."""
+    first = recordings[0]
+    for other in recordings:
+        for name in ("setting", "time_step"):
+            here, there = getattr(first, name), getattr(other, name)
+            if here != there:
+                raise InputError(
+                    f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
+                    "the same in all data sets."
+                )
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -22,8 +22,10 @@ from pdcorrect.data.config import TRAINING
 from pdcorrect.data.folder import Folders
 from pdcorrect.data.reader import CACHE_BYTES, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.sampling import ShardShuffle
+from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import Base
-from pdcorrect.training.recordings import Recording
+from pdcorrect.training.losses import BaseErrors
+from pdcorrect.training.recordings import Recording, base_errors
 from pdcorrect.training.resident import ResidentWindows, StoredWindows
 
 _SHARE_OF_DEVICE = 0.3
@@ -72,12 +74,14 @@ class StepWindows:
     ----------
     folder : path, or sequence of paths
     recordings : sequence of Recording
-        Of the split, for the base model's errors.
+        All of the split, for the base model's errors.
     config : CorrectorConfig
     base : {"plain", "best", "total-mass"}
     device : str or torch.device
     workers : int
         Processes that read ahead; none are needed where the split is kept in memory.
+    steps : int
+        Of what `windows` gives, at least; `batch` takes the first one or two.
     resident : bool, optional
         Whether all windows are kept in the device's memory, see `ResidentWindows`.  By
         default if they take less than 0.3 of what is free on a GPU, or 4 GiB on the CPU.
@@ -92,22 +96,30 @@ class StepWindows:
         *,
         device: str | torch.device = "cpu",
         workers: int = 0,
+        steps: int = 1,
         resident: bool | None = None,
     ) -> None:
         self.config, self.device = config, torch.device(device)
         self._history = "previous-correction" in config.node_features
-        window = 2 if self._history else 1
-        self.dataset = TrajectoryDataset(folder, TRAINING, window=window, base=base)
+        steps = max(steps, 2 if self._history else 1)
+        self.dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=base)
         size = int(self.dataset.shard_bytes().sum())
         self.resident = _fits(size, self.device) if resident is None else resident
         self._workers = 0 if self.resident else workers
         numbers = {header.path: k for k, header in enumerate(self.dataset.headers)}
+        wanted = sum(len(header.steps) for header in self.dataset.headers)
+        if len(recordings) != wanted or any(r.path not in numbers for r in recordings):
+            raise InputError(
+                f"{len(recordings)} recordings for {wanted} simulations: expected those of the "
+                "same data sets, one each."
+            )
         columns = max(r.number for r in recordings) + 1
-        errors = torch.full((len(numbers), columns), float("nan"), dtype=torch.float64)
-        for r in recordings:
-            errors[numbers[r.path], r.number] = r.one_step
+        self._recordings = torch.zeros(len(numbers), columns, dtype=torch.int64)
+        for k, r in enumerate(recordings):
+            self._recordings[numbers[r.path], r.number] = k
+        self._recordings = self._recordings.to(self.device)
         self._masses = {numbers[r.path]: r.total_mass for r in recordings}
-        self._errors = errors.to(self.device)
+        self._errors = base_errors(recordings, self.device)
         files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
         self._first = dict(zip(files.tolist(), first.tolist(), strict=True))
         self._known: dict[int, BodyGraph] = {}
@@ -118,8 +130,17 @@ class StepWindows:
         A window has two steps where the network sees the correction of the step before, else one.
         Of a window's first step that correction is None, as where a simulation begins.
         """
-        source = self._tables if self.resident else self.dataset
-        return self.step_batch(source.batch(indices), last=last)
+        return self.step_batch(self.windows(indices), last=last)
+
+    def windows(self, indices: Sequence[int]) -> StoredWindows:
+        """All steps of chosen windows."""
+        if self.resident:
+            return self._tables.batch(indices)
+        return self._stored(self.dataset.batch(indices))
+
+    def errors(self, stored: StoredWindows) -> BaseErrors:
+        """The base model's on the trajectory of each window."""
+        return self._errors.of(self._recordings[stored.file, stored.simulation])
 
     @cached_property
     def _tables(self) -> ResidentWindows:
@@ -161,7 +182,7 @@ class StepWindows:
             start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
-        return StepBatch(bodies, state, target, self._errors[stored.file, stored.simulation])
+        return StepBatch(bodies, state, target, self.errors(stored).after(1))
 
     def _stored(self, found: Any) -> StoredWindows:
         """A batch of samples on the device."""
