@@ -4,9 +4,8 @@ python models/make_all.py WORK [RECIPE | MODEL ...] [--device cuda] [--generator
     [--together 4] [--measurers 16] [--seconds 1000] [--split evaluation ...]
 
 A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  In place of a data set
-there may be ``all-exact`` or ``all-as-published``, for all three of that setting together.  MODEL
-is the name of a released model, which is evaluated only, beside what is trained for its data sets.
-WORK gets
+there may be ``all-as-published``, for the three of that setting together.  MODEL is the name of a
+released model, which is evaluated only, beside what is trained for its data sets.  WORK gets
 
     data/DATASET                 splits as needed, by ``pdcorrect dataset generate``
     trainings/DATASET/NAME       by ``pdcorrect train``
@@ -44,11 +43,10 @@ from pdcorrect.training.training import MODEL
 HERE = Path(__file__).resolve().parent
 DATASETS = HERE.parent / "datasets"
 LEARNT = (TRAINING, VALIDATION)
-TOGETHER = {
-    f"all-{setting}": [f"{motion}-{setting}" for motion in ("impulse", "stretch", "torsion")]
-    for setting in ("exact", "as-published")
+SETS_OF = {
+    "all-as-published": ["impulse-as-published", "stretch-as-published", "torsion-as-published"],
 }
-"""Data sets of recipes that learn several."""
+"""Data sets of recipes that learn several, by the recipes' folder."""
 STOPPED = 1
 """Exit status of a command whose time was up."""
 
@@ -244,7 +242,7 @@ def _generation(
 def _data_of(recipe: Path) -> list[str]:
     """Names of the data sets that a recipe learns."""
     name = recipe.parent.name
-    return TOGETHER.get(name, [name])
+    return SETS_OF.get(name, [name])
 
 
 def _output(work: Path, recipe: Path) -> Path:

@@ -1,22 +1,24 @@
-"""Train a network without a solver on a data set and measure it: what the solver is worth.
+"""Train a network without a solver on a data set and measure it, as a baseline for correctors.
 
 python models/surrogate.py DATA -o OUTPUT [--base plain | total-mass | best] [--seconds 300]
     [--steps 1 2 4 8] [--batch 64] [--noise 1.0] [--at-rest 0.0] [--preset equivariant]
-    [--changes layers=6 ...] [--seed 0] [--device cuda] [--split evaluation]
+    [--changes layers=6 ...] [--amp bf16] [--fit 10000] [--validation 100] [--seed 0]
+    [--device cuda] [--split evaluation] [--workers 1]
 
 The network of a corrector is shown where inertia and loads alone would take the body, p + h v +
-h2 f/m, with the masses of the coarse model ``--base``, and says where it goes instead; no elastic
-solver is asked, in training or after it (MeshGraphNet as a surrogate, arXiv 2010.03409).  It is
-trained on windows of so many steps from states of the reference that noise makes wrong, with
-derivatives through all of them, the losses, learning rate and averaged weights of correctors.  The
-steps share the time equally, which is that of training, validation and tables.  Loads in training
-are those of the reference's states, in rollouts those of the network's own, which differ for loads
-that follow the body.
+h^2 f/m, and says where it goes instead; no elastic solver is asked, in training or after it
+(MeshGraphNet as a surrogate, arXiv 2010.03409).  Masses are those of the coarse model ``--base``,
+whose errors are the unit of noise and losses, as for correctors.  Training takes windows of 1, 2, 4
+and 8 steps (``--steps``), each for an equal share of ``--seconds``, which include making tables and
+looking at the validation split.  Windows begin with states of the reference that noise makes wrong,
+and derivatives go through all of their steps; losses, learning rate and averaged weights are those
+of correctors.  Loads in training are those of the reference's states, in rollouts those of the
+network's own, which differ for loads that follow the body.
 
-The averaged weights with the smallest errors of free rollouts on the validation split (by the
-geometric mean, for they may be of any size), looked at ten times, are measured like correctors, by
-`pdcorrect.evaluation.evaluate`, beside the stored runs.  OUTPUT gets the same files as by
-``pdcorrect evaluate``, and the weights.
+The averaged weights with the fewest failed and the nearest free rollouts on the validation split
+(by the geometric mean of errors, which may be of any size), looked at ten times, are measured like
+correctors, by `pdcorrect.evaluation.evaluate`, beside the stored runs.  OUTPUT gets the same files
+as by ``pdcorrect evaluate``, and the weights.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from __future__ import annotations
 import argparse
 import copy
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -46,6 +48,7 @@ from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.missing import check_whole
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.errors import ConvergenceError, InputError
@@ -54,6 +57,7 @@ from pdcorrect.evaluation.evaluation import Candidate, evaluate
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.evaluation.tables import markdown, write_evaluation
 from pdcorrect.fem.coarse_models import Base
+from pdcorrect.replacement import make_folder
 from pdcorrect.state import Status
 from pdcorrect.training.config import Stage
 from pdcorrect.training.fitting import fit_normaliser
@@ -120,7 +124,7 @@ class AloneResult:
 
 
 class AloneWindows(StepWindows):
-    """Steps of which all is to be given by the network."""
+    """Steps of which all is to be given by the network, which sees no correction before it."""
 
     def step_batch(self, found: object, *, last: bool = True) -> StepBatch:
         """See `StepWindows`."""
@@ -210,21 +214,38 @@ def unrolled_loss(
     return total / len(stored.targets)
 
 
-def over_plain(
-    cases: Sequence[Case], corrector: Corrector, base: str, device: str, batch: int
-) -> NDArray[np.float64]:
-    """RMS errors of free rollouts over those of the plain mesh, (S,)."""
-    found = []
-    for first in range(0, len(cases), batch):
-        some = cases[first : first + batch]
-        stepper = BatchStepper([case.problems[base] for case in some], device=device)
-        runs = roll_out(Alone(stepper, corrector), stepper, [case.steps for case in some])
-        for run, case in zip(runs, some, strict=True):
-            error, plain = (
-                metrics.rms_error(x, case.reference) for x in (run.positions, case.runs[PLAIN])
-            )
-            found.append(error / plain)
-    return np.array(found)
+class Looks:
+    """Free rollouts of some simulations, set up once.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    base : str
+        Whose masses count.
+    device : str
+    """
+
+    def __init__(self, cases: Sequence[Case], base: str, device: str) -> None:
+        groups: dict[str, list[Case]] = {}
+        for case in cases:
+            groups.setdefault(case.problems[base].element, []).append(case)
+        self._groups = [
+            (BatchStepper([case.problems[base] for case in some], device=device), some)
+            for some in groups.values()
+        ]
+
+    def __call__(self, corrector: Corrector) -> tuple[NDArray[np.float64], int]:
+        """RMS errors over those of the plain mesh, (S,), and how many rollouts failed."""
+        found, failed = [], 0
+        for stepper, cases in self._groups:
+            runs = roll_out(Alone(stepper, corrector), stepper, [case.steps for case in cases])
+            for run, case in zip(runs, cases, strict=True):
+                error, plain = (
+                    metrics.rms_error(x, case.reference) for x in (run.positions, case.runs[PLAIN])
+                )
+                found.append(error / plain)
+                failed += run.failed is not None
+        return np.array(found), failed
 
 
 class Learner:
@@ -248,7 +269,7 @@ class Learner:
         self._config = preset(options.preset, placement="guess", **dict(options.changes))
         self._recordings = load_recordings(options.data, TRAINING, options.base, scenes=False)
         found = read_cases(options.data, VALIDATION, [options.base], skip_damaged=False).cases
-        self._cases = found[: options.validation]
+        self._looks = Looks(found[: options.validation], options.base, options.device)
         torch.manual_seed(options.seed)
         self._corrector = Corrector(self._config).to(self._device)
         fit_normaliser(self._corrector, self._windows(1), options.fit, options.seed)
@@ -290,30 +311,36 @@ class Learner:
             iterations += 1
             if self._device.type == "cuda":
                 torch.cuda.synchronize()
-            if time.perf_counter() - started >= len(self.history) * options.seconds / LOOKS:
-                self._look(time.perf_counter() - started, iterations, steps)
-        self._look(options.seconds, iterations, length)
+            spent = time.perf_counter() - started
+            if spent >= (len(self.history) + 1) * options.seconds / LOOKS:
+                self._look(spent, iterations, steps)
+        if len(self.history) < LOOKS:
+            self._look(spent, iterations, length)
 
     def _look(self, seconds: float, iterations: int, steps: int) -> None:
         """Roll out, and keep these weights if none were better."""
-        options, told = self._options, self._optimiser.take_report()
+        told = self._optimiser.take_report()
         if told["longest"] >= MOST_SKIPPED:
             raise ConvergenceError(
                 f"iteration {iterations}: {told['longest']:.0f} batches in a row had a loss or "
                 "gradient that is not finite. Expected fewer --steps, or less --noise."
             )
-        found = over_plain(self._cases, self._averaged, options.base, options.device, options.batch)
+        errors, failed = self._looks(self._averaged)
         row = {
             "seconds": seconds, "iterations": iterations, "steps": steps,
-            "skipped": told["skipped"], "error_over_plain": float(np.exp(np.log(found).mean())),
+            "skipped": told["skipped"], "failed": failed,
+            "error_over_plain": float(np.exp(np.log(errors).mean())),
             **({"loss": told["loss"]} if told["count"] else {}),
         }  # fmt: skip
         print("  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
-        if row["error_over_plain"] < min(
-            (r["error_over_plain"] for r in self.history), default=np.inf
-        ):
+        if all(_rank(row) < _rank(before) for before in self.history):
             self.best.load_state_dict(self._averaged.state_dict())
         self.history.append(row)
+
+
+def _rank(row: Mapping[str, float]) -> tuple[float, float]:
+    """Smaller is better: a rollout that failed is held, and so may be near by chance."""
+    return row["failed"], row["error_over_plain"]
 
 
 def changed(text: str) -> tuple[str, int]:
@@ -325,6 +352,9 @@ def changed(text: str) -> tuple[str, int]:
 def check(options: argparse.Namespace) -> None:
     """Refuse now what would be found out when the training has ended."""
     shard_paths(options.data, options.split)
+    check_whole(options.data, (TRAINING, VALIDATION, options.split))
+    if options.workers < 1:
+        raise InputError(f"--workers {options.workers}: expected 1 or more.")
     steps = [n for p in shard_paths(options.data, TRAINING) for n in read_header(p).steps]
     if not 1 <= min(options.steps) <= max(options.steps) <= max(steps):
         raise InputError(f"--steps {options.steps}: expected 1 to {max(steps)}.")
@@ -357,6 +387,11 @@ def main() -> None:
     learner = Learner(options)
     learner.run()
     corrector = learner.best
+    make_folder(options.output)
+    save_file(
+        {name: x.contiguous() for name, x in corrector.state_dict().items()},
+        options.output / WEIGHTS,
+    )
     found = evaluate(
         [Candidate(NAME, options.base, lambda stepper: Alone(stepper, corrector))],
         options.data, options.split, device=options.device, batch=100, workers=options.workers,
@@ -370,10 +405,6 @@ def main() -> None:
     record = {**origin(), "history": learner.history, "notes": notes}
     for path in write_evaluation(found, options.output, record, notes):
         print(f"wrote {path}")
-    save_file(
-        {name: x.contiguous() for name, x in corrector.state_dict().items()},
-        options.output / WEIGHTS,
-    )
 
 
 if __name__ == "__main__":

@@ -100,8 +100,8 @@ WITHOUT_NETWORK = {
     "intermediate": "intermediate mesh",
 }
 """Runs of the fifth table, in its order, and what they are called there."""
-TOGETHER = "all-as-published"
-TOGETHER_HEADINGS = (
+JOINT_RECORD = "all-as-published"
+JOINT_HEADINGS = (
     "data set", "one model for all: Ω mean", "95 %", "median", "worst",
     "model of this motion: Ω mean, worst", "difference", f"rollouts above {HARM}",
     "intermediate mesh: Ω mean", "stress error, %: one model, of this motion, intermediate",
@@ -174,10 +174,10 @@ def baselines_table() -> str:
 
 def together_table() -> str:
     """The sixth table in Markdown."""
-    lines = [_line(TOGETHER_HEADINGS), _line(["---", *["---:"] * (len(TOGETHER_HEADINGS) - 1)])]
+    lines = [_line(JOINT_HEADINGS), _line(["---", *["---:"] * (len(JOINT_HEADINGS) - 1)])]
     for name in PUBLISHED:
         own = next(row for row in ROWS if row.model == f"{name}-total-mass")
-        row = Row(TOGETHER, f"{TOGETHER}/{name.split('-')[0]}", "model", own.thesis)
+        row = Row(JOINT_RECORD, f"{JOINT_RECORD}/{name.split('-')[0]}", "model", own.thesis)
         found, alone = (
             json.loads((RESULTS / one.record / "summary.json").read_text(encoding="utf-8"))["runs"]
             for one in (row, own)

@@ -111,6 +111,16 @@ def test_a_recipe_for_all_motions_waits_for_their_data_and_is_evaluated_on_each(
     assert len(jobs) == 3 * 2 + 2 + 3
 
 
+def test_a_released_model_of_all_motions_is_evaluated_on_each(tmp_path):
+    jobs = make.plan(tmp_path, [], ["all-as-published-total-mass", "torsion-exact"], OPTIONS)
+    models = {job.name: [path.name for path in job.models] for job in jobs if job.models}
+    each = ["all-as-published-total-mass"]
+    assert models == {
+        "evaluate-impulse-as-published": each, "evaluate-stretch-as-published": each,
+        "evaluate-torsion-as-published": each, "evaluate-torsion-exact": ["torsion-exact"],
+    }  # fmt: skip
+
+
 def test_a_training_waits_for_the_one_whose_model_it_starts_from(tmp_path):
     folder = ROOT / "models/recipes/impulse-as-published"
     recipes = [folder / f"{name}.toml" for name in ("total-mass-kicks", "total-mass", "through")]

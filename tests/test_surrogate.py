@@ -38,6 +38,11 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def published(tmp_path_factory):
+    return samples.published(tmp_path_factory.mktemp("published") / "data")
+
+
+@pytest.fixture(scope="module")
 def recordings(folder):
     return load_recordings(folder, "training", "plain", scenes=False)
 
@@ -155,16 +160,24 @@ def test_a_share_of_windows_begins_at_rest(alone, folder, recordings):
     assert draws(alone, folder, recordings, 1)[1](200)[0].velocities.any()
 
 
-def test_masses_are_those_of_the_base(alone, tmp_path):
-    from pdcorrect.training.recordings import make_problems
-
-    best = samples.dataset(tmp_path / "best", frames=3)
-    recordings = load_recordings(best, "training", "best")
-    windows = alone.AloneWindows(best, recordings, CONFIG, "best", steps=2)
-    bodies = windows.windows([0]).bodies
-    torch.testing.assert_close(
-        bodies.mass, torch.as_tensor(make_problems(recordings, "best")[0].mass), rtol=1e-6, atol=0.0
-    )
+def test_masses_are_those_of_the_base(alone, published):
+    recordings = load_recordings(published, "training", "total-mass", scenes=False)
+    windows = alone.AloneWindows(published, recordings, CONFIG, "total-mass", steps=2)
+    mass = windows.windows([0]).bodies.mass
+    assert mass.sum().item() == pytest.approx(recordings[0].total_mass, rel=1e-12)
+    cases = read_cases(published, "validation", ["total-mass"], skip_damaged=False).cases
+    silent_one = silent(Corrector(CONFIG))
+    fit_normaliser(silent_one, windows, 10)
+    for case in cases:
+        problem = case.problems["total-mass"]
+        assert problem.mass.sum() < 0.9 * case.problems["plain"].mass.sum()
+        stepper = BatchStepper([problem])
+        (run,) = roll_out(alone.Alone(stepper, silent_one), stepper, [1])
+        h, free, x = problem.time_step, problem.free, run.positions
+        force = (x[1] - x[0])[free] / h**2 * problem.mass[:, None].repeat(3, axis=1)[free]
+        np.testing.assert_allclose(
+            force, problem.external_forces(x[0], h)[free], rtol=1e-6, atol=1e-9
+        )
 
 
 def test_derivatives_go_through_all_steps(alone, folder, recordings, corrector):
@@ -202,7 +215,8 @@ def test_the_program_trains_and_measures(alone, tmp_path, monkeypatch, capsys):
     again = Corrector(CONFIG)
     again.load_state_dict(load_file(output / "weights.safetensors"))
     cases = read_cases(whole, "validation", skip_damaged=False).cases
-    found = alone.over_plain(cases, again, "plain", "cpu", 8)
+    found, failed = alone.Looks(cases, "plain", "cpu")(again)
+    assert failed == 0
     best = min(row["error_over_plain"] for row in record["history"])
     assert np.exp(np.log(found).mean()) == pytest.approx(best, rel=1e-6)
 
@@ -214,6 +228,7 @@ def test_the_program_trains_and_measures(alone, tmp_path, monkeypatch, capsys):
         (("--steps", "1", "7"), "expected 1 to 6"),
         (("--steps", "0"), "expected 1 to 6"),
         (("--seconds", "0"), "expected more than 0"),
+        (("--workers", "0"), "expected 1 or more"),
     ],
 )
 def test_what_cannot_work_is_refused_before_the_training(
@@ -237,15 +252,17 @@ def learner(alone, folder, monkeypatch):
 
 
 def test_the_best_weights_by_validation_are_kept(alone, folder, monkeypatch):
-    seen, kept = iter([9.0, 3.0, *[5.0] * 20]), []
+    seen, kept = iter([(9.0, 0), (3.0, 0), (1.0, 1), *[(5.0, 0)] * 20]), []
 
-    def told(cases, corrector, base, device, batch):
+    def told(corrector):
         kept.append([x.clone() for x in corrector.network.parameters()])
-        return np.array([next(seen)])
+        error, failed = next(seen)
+        return np.array([error]), failed
 
-    monkeypatch.setattr(alone, "over_plain", told)
     training = learner(alone, folder, monkeypatch)
+    training._looks = told
     training.run()
+    assert len(training.history) == alone.LOOKS
     assert [row["steps"] for row in training.history] == sorted(
         row["steps"] for row in training.history
     )

@@ -8,7 +8,6 @@ import pytest
 
 import pdcorrect as pc
 from conftest import cross
-from dataset_configs import small
 from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import BASES
 
@@ -73,15 +72,9 @@ def test_coarse_models_are_known_by_name():
 def published(tmp_path_factory):
     """A small data set as published, with its validation split."""
     pytest.importorskip("torch_geometric")
-    from pdcorrect.data.generate import generate
+    from training_samples import published
 
-    folder = tmp_path_factory.mktemp("published") / "data"
-    config = small(
-        setting="as-published", frames=4, training={"meshes": 3, "simulations": 5},
-        validation_share=0.34,
-    )  # fmt: skip
-    assert generate(config, folder, splits=["training", "validation", "evaluation"])
-    return folder
+    return published(tmp_path_factory.mktemp("published") / "data")
 
 
 def settings(**changes):

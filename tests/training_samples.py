@@ -6,6 +6,8 @@ from pathlib import Path
 
 import torch
 
+from dataset_configs import small
+from pdcorrect.data.generate import generate
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.training.config import Stage, TrainingConfig
@@ -27,6 +29,16 @@ def dataset(folder, training=(0, 3), validation=(1,), frames=20):
                 shutil.copy(TINY / name, folder / name)
             else:
                 write_shard(folder / name, shortened(read_shard(TINY / name), frames), "float32")
+    return folder
+
+
+def published(folder):
+    """A small data set as published, all three splits."""
+    config = small(
+        setting="as-published", frames=4, training={"meshes": 3, "simulations": 5},
+        validation_share=0.34,
+    )  # fmt: skip
+    assert generate(config, folder, splits=["training", "validation", "evaluation"])
     return folder
 
 

@@ -189,9 +189,9 @@ def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
     """
     if not models:
         return CASES
-    from pdcorrect.corrector.model_io import load_model, model_folder, model_names
+    from pdcorrect.corrector.model_io import load_model, model_folder, unlike_ends
 
-    names = model_names([model_folder(model).resolve() for model in models])
+    names = unlike_ends([model_folder(model).resolve() for model in models])
     bases = [load_model(model).base for model in models]
     for name, base in zip(names, bases, strict=True):
         if base not in BASES:

@@ -80,10 +80,10 @@ def train(
     told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
-        from pdcorrect.corrector.model_io import model_names
+        from pdcorrect.corrector.model_io import unlike_ends
         from pdcorrect.evaluation_cli import evaluate as judge
 
-        several = model_names([folder.resolve() for folder in data]) if len(data) > 1 else [""]
+        several = unlike_ends([folder.resolve() for folder in data]) if len(data) > 1 else [""]
         for folder, name in zip(data, several, strict=True):
             judge(
                 [str(output / MODEL), str(folder)], split=evaluate, device=own,

@@ -26,24 +26,24 @@ FINEST = {"as-published": 4, "exact": 8}
 """Cut of the reference's cells: that of the thesis, and one finer than the data set's."""
 TOLERANCES = (1e-2, 1e-3, 1e-6)
 """Of the coarse cell size, beside the scene's own."""
-TOGETHER = "all-as-published-total-mass"
+ALL_MOTIONS = "all-as-published-total-mass"
 MODELS: Mapping[tuple[str, str], Sequence[str]] = {
     ("impulse", "as-published"): (
         "impulse-as-published",
         "impulse-as-published-total-mass",
-        TOGETHER,
+        ALL_MOTIONS,
     ),
     ("impulse", "exact"): ("impulse-exact",),
     ("stretch", "as-published"): (
         "stretch-as-published",
         "stretch-as-published-total-mass",
-        TOGETHER,
+        ALL_MOTIONS,
     ),
     ("stretch", "exact"): ("stretch-exact",),
     ("torsion", "as-published"): (
         "torsion-as-published",
         "torsion-as-published-total-mass",
-        TOGETHER,
+        ALL_MOTIONS,
     ),
     ("torsion", "exact"): ("torsion-exact", "torsion-exact-compact"),
 }

@@ -125,8 +125,8 @@ class LoadedModel:
         return self.configuration.get("velocity", "recomputed")
 
 
-def model_names(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of models' paths that are all unlike, such as "seed-1/model".
+def unlike_ends(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of paths that are all unlike, such as "seed-1/model".
 
     Raises
     ------
@@ -135,7 +135,7 @@ def model_names(folders: Sequence[Path]) -> list[str]:
     """
     for folder in folders:
         if folders.count(folder) > 1:
-            raise InputError(f"{folder}: this model comes twice: expected each one once.")
+            raise InputError(f"{folder} comes twice: expected each one once.")
     longest = max((len(folder.parts) for folder in folders), default=0)
     for length in range(1, longest + 1):
         names = ["/".join(folder.parts[-length:]) for folder in folders]

@@ -16,7 +16,7 @@ from pdcorrect.corrector.model_io import (
     LoadedModel,
     load_model,
     model_folder,
-    model_names,
+    unlike_ends,
     weights_digest,
 )
 from pdcorrect.data.config import TRAINING, VALIDATION
@@ -70,6 +70,11 @@ class SavedCandidate:
                 "loads, materials and the coarse model's setting may be others than it knows, and "
                 "its training meshes may be among these."
             ]
+        if split not in (TRAINING, VALIDATION) and len(self.model.data_sets) > 1:
+            return [
+                f"{name} was trained on {record.dataset!r}: meshes of this split may be among the "
+                "training meshes of the other sets."
+            ]
         if split == TRAINING:
             return [f"{name} was trained on this split: these are not unseen meshes."]
         if split == VALIDATION:
@@ -101,7 +106,7 @@ def saved_candidates(
     FileFormatError
         If one is damaged.
     """
-    names = model_names([model_folder(path).resolve() for path in paths])
+    names = unlike_ends([model_folder(path).resolve() for path in paths])
     return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
 
 

@@ -32,7 +32,7 @@ class StoredWindows:
     targets, predictions, forces : (k, n, 3)
         Of each step: where the reference goes and the base model would, m, and loads, N.
     file, simulation : (B,) int64
-        Number of the file in the data set, and of the simulation in it.
+        Number of the file in `TrajectoryDataset.headers`, and of the simulation in it.
     """
 
     bodies: BodyGraph

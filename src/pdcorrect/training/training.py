@@ -119,7 +119,8 @@ class Training:
         found = self._checkpoint(resume)
         unrolled = any(stage.kind == "unrolled" for stage in config.stages)
         self._recordings = load_recordings(data, TRAINING, config.base, scenes=unrolled)
-        _check_alike(self._recordings)
+        if len(data) > 1:
+            _check_alike(self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
             workers=config.workers,
@@ -380,7 +381,10 @@ def _common_splits(folders: Sequence[Path]) -> list[str]:
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:
-    """Refuse data sets whose simulations one batch cannot hold, or that have other references."""
+    """Refuse data sets of unlike settings or time steps.
+
+    What else a batch asks to be the same is told when one is made, see `BatchStepper`.
+    """
     first = recordings[0]
     for other in recordings:
         for name in ("setting", "time_step"):

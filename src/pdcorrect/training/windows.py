@@ -107,17 +107,17 @@ class StepWindows:
         self.resident = _fits(size, self.device) if resident is None else resident
         self._workers = 0 if self.resident else workers
         numbers = {header.path: k for k, header in enumerate(self.dataset.headers)}
-        wanted = sum(len(header.steps) for header in self.dataset.headers)
-        if len(recordings) != wanted or any(r.path not in numbers for r in recordings):
+        wanted = [(h.path, k) for h in self.dataset.headers for k in range(len(h.steps))]
+        if sorted((r.path, r.number) for r in recordings) != sorted(wanted):
             raise InputError(
-                f"{len(recordings)} recordings for {wanted} simulations: expected those of the "
-                "same data sets, one each."
+                f"{len(recordings)} recordings for {len(wanted)} simulations: expected those of "
+                "the same files, one each."
             )
         columns = max(r.number for r in recordings) + 1
-        self._recordings = torch.zeros(len(numbers), columns, dtype=torch.int64)
+        places = torch.full((len(numbers), columns), -1, dtype=torch.int64)
         for k, r in enumerate(recordings):
-            self._recordings[numbers[r.path], r.number] = k
-        self._recordings = self._recordings.to(self.device)
+            places[numbers[r.path], r.number] = k
+        self._recordings = places.to(self.device)
         self._masses = {numbers[r.path]: r.total_mass for r in recordings}
         self._errors = base_errors(recordings, self.device)
         files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
@@ -125,10 +125,10 @@ class StepWindows:
         self._known: dict[int, BodyGraph] = {}
 
     def batch(self, indices: Sequence[int], *, last: bool = True) -> StepBatch:
-        """The last steps of chosen windows, or their first ones.
+        """The first steps of chosen windows, or the last of those that `batch` looks at.
 
-        A window has two steps where the network sees the correction of the step before, else one.
-        Of a window's first step that correction is None, as where a simulation begins.
+        These are two where the network sees the correction of the step before, else one.  Of a
+        window's first step that correction is None, as where a simulation begins.
         """
         return self.step_batch(self.windows(indices), last=last)
 
