@@ -124,3 +124,13 @@ def program(capsys, monkeypatch):
         return status, out, err
 
     return call
+
+
+@pytest.fixture
+def few_threads():
+    """One thread of torch: small networks are quicker so, and trainings go on bit by bit."""
+    torch = pytest.importorskip("torch")
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

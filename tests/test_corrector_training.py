@@ -66,15 +66,6 @@ def short(tmp_path_factory):
     return samples.dataset(tmp_path_factory.mktemp("short"), frames=5)
 
 
-@pytest.fixture
-def few_threads():
-    """Small networks are quicker on one thread."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 pytestmark = pytest.mark.usefixtures("few_threads")
 
 

@@ -50,15 +50,6 @@ def folders(tmp_path_factory):
     return one, other
 
 
-@pytest.fixture
-def few_threads():
-    """On which a training goes on bit by bit."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def settings(*stages, **changes):
     return samples.config(*stages, **changes)
 
@@ -81,9 +72,7 @@ def test_windows_of_several_data_sets_follow_one_another(folders):
 @pytest.mark.parametrize("remembers", [False, True])
 def test_steps_of_several_data_sets_are_those_of_each(folders, resident, remembers):
     changes = {"changes": {"node_features": ("previous-correction",)}} if remembers else {}
-    config = settings(
-        samples.one_step(), corrector={**samples.SMALL, **changes} if remembers else samples.SMALL
-    )
+    config = settings(samples.one_step(), corrector={**samples.SMALL, **changes})
     together, recordings = samples.windows(folders, config, resident=resident)
     assert len(recordings) == 5
     begin = 0
