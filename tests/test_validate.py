@@ -251,3 +251,45 @@ def test_figures_are_judged_by_value_or_status():
     assert outside({"x": "A"}, aims) == ["x"]
     assert missing(["z"], aims, quick=True) == ["x"]
     assert missing(["z"], aims, quick=False) == ["x", "y"]
+
+
+def test_a_changed_model_or_data_file_is_a_reason_to_run_a_case_again(program, home):
+    root = home.parents[1]
+    (root / "models" / "m").mkdir(parents=True)
+    (root / "models" / "m" / "weights").write_bytes(b"1")
+    (root / "models" / "m" / "README.md").write_text("words")
+    (home / "inputs.txt").write_text("models/m\n")
+    program("validate", "sums", "--quick", "--no-figures")
+    assert calls(home) == "ab"
+    record = json.loads((root.parent / "report" / "sums.json").read_text())
+    assert list(record["inputs"]) == ["models/m/weights"]
+    (root / "models" / "m" / "README.md").write_text("other words")
+    program("validate", "sums", "--quick", "--no-figures")
+    assert calls(home) == ""
+    (root / "models" / "m" / "weights").write_bytes(b"2")
+    program("validate", "sums", "--quick", "--no-figures")
+    assert calls(home) == "ab"
+
+
+def test_an_input_that_is_not_there_is_named(home):
+    (home / "inputs.txt").write_text("models/none\n")
+    with pytest.raises(InputError, match=r"inputs\.txt: 'models/none'"):
+        ValidationCase(home).digest()
+
+
+def test_the_page_begins_with_the_summary_and_says_what_each_case_found(program, home):
+    (home.parent / "summary.md").write_text("## Which?\n\n| a | b |\n|---|---|\n| 1 | *two* |\n")
+    (home / "README.md").write_text(
+        "# Sums\n\n**Question.** Is it?\n\nHow, [here](../there.md).\n\n"
+        "**What it says.** <b>Yes</b>, `c`.\n\n**Limits.** None.\n"
+    )
+    program("validate", "sums", "--quick", "--no-figures")
+    page = (home.parents[2] / "report" / "index.html").read_text()
+    assert page.index("<h2>Which?</h2>") < page.index("<em>two</em>") < page.index("Is it?")
+    found, method = page.index("&lt;b&gt;Yes&lt;/b&gt;"), page.index("How, here.")
+    assert found < method < page.index("<strong>Limits.</strong>")
+    text = (home.parents[2] / "report" / "report.md").read_text()
+    assert "**What it says.** <b>Yes</b>, `c`." in text
+    assert "(../there.md)" not in text
+    assert "Made 20" in text
+    assert "load at the beginning" in text

@@ -5,8 +5,11 @@ import json
 import pytest
 
 import pdcorrect as pc
-from pdcorrect.validation.cases import find_cases
+from pdcorrect.validation.cases import find_cases, read_summary
 from pdcorrect.validation.outcome import missing, outside
+from pdcorrect.validation.page import Section, to_csv, to_html, to_markdown
+from pdcorrect.validation.records import Record, table_csv
+from pdcorrect.validation.running import slug
 
 CASES = {case.name: case for case in find_cases()}
 QUICK = [name for name, case in CASES.items() if case.has_quick_part]
@@ -41,6 +44,37 @@ def test_results_recorded_are_those_expected(name):
     # figures that are no number, where there is no equilibrium, are recorded as None
     known = {key: value for key, value in record["figures"].items() if value is not None}
     assert outside(known, case.expected) == record["outside"] == []
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_tables_beside_a_record_are_the_record_s(name):
+    results = CASES[name].folder.parent / "results"
+    record = json.loads((results / f"{name}.json").read_text())
+    told = {f"{slug(table['name'])}.csv": table_csv(table) for table in record["tables"]}
+    kept = {path.name: path.read_text() for path in (results / name).glob("*.csv")}
+    assert kept == told
+
+
+def test_the_page_recorded_is_that_of_the_records():
+    results = find_cases()[0].folder.parent / "results"
+    sections = [
+        Section(case, Record(**json.loads((results / f"{name}.json").read_text())))
+        for name, case in CASES.items()
+    ]
+    assert (results / "figures.csv").read_text() == to_csv(sections)
+    assert (results / "report.md").read_text() == to_markdown(sections, read_summary())
+    assert (results / "index.html").read_text() == to_html(sections, results, read_summary())
+
+
+def test_the_report_and_the_documentation_recommend_the_same():
+    folder = find_cases()[0].folder.parents[1]
+
+    def advice(path):
+        lines = (folder / path).read_text().splitlines()
+        first = lines.index("| you want | take | why |")
+        return [line for line in lines[first : first + 9] if "midpoint" not in line]
+
+    assert advice("validation/summary.md") == advice("docs/choosing.md")
 
 
 @pytest.mark.slow

@@ -37,11 +37,11 @@ def validate(
     """Run the validation cases, judge them by figures written down before, and report.
 
     Cases are those in `validation` of the checkout, or of the folder PDCORRECT_HOME.  Results
-    that are in OUTPUT already are kept if neither code nor expectations have changed.  Exit
+    that are in OUTPUT already are kept if neither code, expectations nor inputs have changed.  Exit
     status 1 if a figure is not as expected.
     """
     from pdcorrect.errors import require_extra
-    from pdcorrect.validation.cases import find_cases
+    from pdcorrect.validation.cases import find_cases, read_summary
     from pdcorrect.validation.page import write_page
 
     found = find_cases(cases or ())
@@ -58,7 +58,7 @@ def validate(
     sections = _run(chosen, output, quick, again, figures)
     for section in sections:
         _tell(section)
-    typer.echo(f"report: {write_page(sections, output)}")
+    typer.echo(f"report: {write_page(sections, output, read_summary())}")
     if not all(section.record.passed for section in sections):
         raise typer.Exit(_OUTSIDE)
 

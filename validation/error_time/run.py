@@ -50,8 +50,10 @@ MODELS: Mapping[tuple[str, str], Sequence[str]] = {
 """Released correctors that were trained on such scenes, by motion and setting."""
 ROWS = {"plain": "plain", "best": "best", "total-mass": "right mass"}
 """Methods that correctors are added to, by the name of their base."""
-OTHERS = ("plain", "best", "plain 2×2×2", "hex27")
-"""Named in figures, besides those on the front."""
+FITTED = "fitted stiffness"
+"""Fitted to the very scene: shown, but no one's rival."""
+NEARER = 0.99
+"""Of the error of what is quicker: more is no gain."""
 FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
             "other tolerance", "Newton", "hybrid")  # fmt: skip
 
@@ -144,7 +146,7 @@ class Comparison:
         plain = partial(pc.discretise, self.scene)
         yield "plain", Method(coarse, lambda: pc.ProjectiveDynamics(plain()))
         yield "right mass", Method(coarse, self._right_mass)
-        yield "fitted stiffness", Method(coarse, self._fitted)
+        yield FITTED, Method(coarse, self._fitted)
         elements = ("hex8-mean", "hex8-bubble", "hex27")
         for element in elements[:1] if self.quick else elements:
             yield element, Method(other, self._pd(plain, element=element))
@@ -220,12 +222,17 @@ def smallest_scene(motion: str, setting: str) -> pc.Scene:
 
 
 def front(rows: Sequence[Row]) -> list[Row]:
-    """Those that no other is quicker and nearer than, quickest first."""
+    """Those that nothing quicker is as near as, to `NEARER`, quickest first."""
     out: list[Row] = []
-    for row in sorted(rows, key=lambda r: (r.milliseconds, r.error)):
-        if not out or row.error < out[-1].error:
+    for row in sorted(rivals(rows), key=lambda r: (r.milliseconds, r.error)):
+        if not out or row.error < NEARER * out[-1].error:
             out.append(row)
     return out
+
+
+def rivals(rows: Sequence[Row]) -> list[Row]:
+    """All but what was fitted to the scene."""
+    return [row for row in rows if row.name != FITTED]
 
 
 def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
@@ -233,18 +240,22 @@ def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    figure = Figure(figsize=(9, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     axis = figure.subplots()
     best = front(rows)
     points = [(r.milliseconds, 100.0 * r.error / scale) for r in best]
-    axis.plot(*zip(*points, strict=True), color="0.6", linewidth=1.5, label="Pareto front")
+    axis.step(*zip(*points, strict=True), where="post", color="0.6", label="Pareto front")
     for k, family in enumerate(FAMILIES):
-        some = [r for r in rows if r.family == family]
-        if some:
-            x, y = zip(*((r.milliseconds, 100.0 * r.error / scale) for r in some), strict=True)
-            marker = "osD^vP"[k]
-            axis.scatter(x, y, 42, common.COLOURS[k], marker, label=family, zorder=3)
+        label: str | None = family
+        for row in (r for r in rows if r.family == family):
+            face = "none" if row.name == FITTED else common.COLOURS[k]
+            axis.scatter(
+                row.milliseconds, 100.0 * row.error / scale, 42, marker="osD^vP"[k], zorder=3,
+                facecolors=face, edgecolors=common.COLOURS[k],
+                label=None if row.name == FITTED else label,
+            )  # fmt: skip
+            label = label if row.name == FITTED else None
     axis.set(
         xscale="log", yscale="log", xlabel="ms a frame",
         ylabel="RMS error, per cent of the largest displacement",
@@ -254,41 +265,88 @@ def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
         side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
     axis.grid(alpha=0.3, which="both")
     axis.spines[["top", "right"]].set_visible(False)
-    axis.margins(x=0.12)
+    axis.margins(x=0.14, y=0.08)
     figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=9)
-    last = [row for row in rows if row not in best and row.name in OTHERS]
-    write_names(axis, [(r.name, r.milliseconds, 100.0 * r.error / scale) for r in [*best, *last]])
+    last = [r for r in rows if r not in best and r.family != FAMILIES[3]]  # tolerances crowd
+    named = [*(r for r in best if r.family != FAMILIES[3]), *last]
+    write_names(axis, [(r.name, r.milliseconds, 100.0 * r.error / scale) for r in named])
     figure.savefig(path, dpi=150)
 
 
 def write_names(axis: Any, points: Sequence[tuple[str, float, float]]) -> None:
     """Names beside points, those that come first where there is no room for all."""
+    from matplotlib.transforms import Bbox
+
     axis.figure.canvas.draw()  # for the sizes of texts
-    taken: list[Any] = []
+    centres = axis.transData.transform([(x, y) for _, x, y in points])
+    taken: list[Any] = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in centres]
     for name, x, y in points:
-        for dx, dy in ((6, 5), (6, -12), (-6, 5), (-6, -12)):
+        for dx, dy in (
+            (7, 4),
+            (7, -11),
+            (-7, 4),
+            (-7, -11),
+            (7, 14),
+            (-7, 14),
+            (7, -21),
+            (-7, -21),
+        ):
             side = "left" if dx > 0 else "right"
             text = axis.annotate(
-                name, (x, y), (dx, dy), textcoords="offset points", fontsize=8, ha=side
-            )
+                name.removeprefix("hybrid, "), (x, y), (dx, dy), textcoords="offset points",
+                fontsize=7.5, ha=side,
+            )  # fmt: skip
             box = text.get_window_extent()
-            if not any(box.overlaps(other) for other in taken):
+            inside = axis.bbox.x0 <= box.x0 and box.x1 <= axis.bbox.x1
+            if inside and not any(box.overlaps(other) for other in taken):
                 taken.append(box)
                 break
             text.remove()
 
 
-def outcome(motion: str, setting: str, quick: bool) -> common.Outcome:
-    """One scene."""
+@dataclass(frozen=True)
+class Measured:
+    """What was measured in a scene, of which figures, tables and the picture are made.
+
+    Attributes
+    ----------
+    motion, setting : str
+    rows : sequence of Row
+    reference : Row
+        The reference's own time and nodes.
+    scale : float
+        Largest displacement, m.
+    """
+
+    motion: str
+    setting: str
+    rows: Sequence[Row]
+    reference: Row
+    scale: float
+
+
+def measure(motion: str, setting: str, quick: bool) -> common.Outcome:
+    """One scene, computed in all ways."""
     comparison = Comparison(motion, setting, quick)
     scale = pc.metrics.largest_displacement(comparison.truth)
     rows = [comparison.row(name, method) for name, method in comparison.methods()]
+    run = comparison.reference
+    last = Row("reference", FAMILIES[2], len(run.problem.positions), 1e3 * median_step(run), 0.0)
+    caption = (
+        f"{motion}, {setting}: error against time for {comparison.frames} frames; distances from "
+        f"{comparison.finest}×{comparison.finest}×{comparison.finest} cells a cell."
+    )
+    return outcome(Measured(motion, setting, rows, last, scale), quick, caption)
+
+
+def outcome(measured: Measured, quick: bool, caption: str) -> common.Outcome:
+    """What a scene says."""
+    rows, scale = measured.rows, measured.scale
+    label = f"{measured.motion}, {measured.setting}"
     by_name = {row.name: row for row in rows}
     plain, middle = by_name["plain"], by_name["plain 2×2×2"]
-    label = f"{motion}, {setting}"
-    as_near = min((r for r in rows if r.error <= middle.error), key=lambda r: r.milliseconds)
-    as_quick = min((r for r in rows if r.milliseconds <= 1.1 * middle.milliseconds),
-                   key=lambda r: r.error)  # fmt: skip
+    as_near = quickest(rivals(rows), middle.error)
+    as_quick = nearest(rivals(rows), 1.1 * middle.milliseconds)
     figures: dict[str, float] = {
         f"{label}, largest displacement, mm": 1e3 * scale,
         f"{label}, plain, error, per cent": 100.0 * plain.error / scale,
@@ -299,32 +357,47 @@ def outcome(motion: str, setting: str, quick: bool) -> common.Outcome:
         speed_up = middle.milliseconds / as_near.milliseconds
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
-    for row in (row for row in rows if row.family == "hybrid"):
+    hybrids = [row for row in rows if row.family == "hybrid"]
+    for row in hybrids:
         base = by_name[ROWS[released(row.name.removeprefix("hybrid, ")).base]]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
     for name in ("plain", "best"):
         if f"{name}, 1e-06" in by_name:
             tight, newton = by_name[f"{name}, 1e-06"], by_name[f"{name}, Newton"]
             figures[f"{label}, {name}, PD's error over Newton's"] = tight.error / newton.error
-    reference = comparison.reference
-    last = Row("reference", FAMILIES[2], len(reference.problem.positions),
-               1e3 * median_step(reference), 0.0)  # fmt: skip
-    heads = ("method", "kind", "nodes", "ms a frame", "RMS error, mm", "per cent", "front")
-    on_front = {row.name for row in front(rows)}
-    body = tuple(
-        (r.name, r.family, float(r.nodes), r.milliseconds, 1e3 * r.error, 100.0 * r.error / scale,
-         "yes" if r.name in on_front else "")
-        for r in sorted([*rows, last], key=lambda r: r.milliseconds)
-    )  # fmt: skip
-    caption = (
-        f"{label}: error against time for {comparison.frames} frames; distances from "
-        f"{comparison.finest}×{comparison.finest}×{comparison.finest} cells a cell."
-    )
+    tables = [methods_table(measured), winners(label, as_near, as_quick)]
+    if hybrids:
+        untrained = [r for r in [*rivals(rows), measured.reference] if r not in hybrids]
+        tables.append(beside(label, hybrids, untrained))
+    picture = f"{measured.motion}-{measured.setting}"
     return common.Outcome(
-        figures,
-        (common.Table(label, heads, body), winners(label, as_near, as_quick)),
-        (common.Picture(f"{motion}-{setting}", caption, lambda path: draw(path, rows, scale)),),
-    )
+        figures, tuple(tables),
+        (common.Picture(picture, caption, lambda path: draw(path, rows, scale)),),
+    )  # fmt: skip
+
+
+def quickest(rows: Sequence[Row], error: float) -> Row:
+    """With at most so much error."""
+    return min((r for r in rows if r.error <= error), key=lambda r: r.milliseconds)
+
+
+def nearest(rows: Sequence[Row], milliseconds: float) -> Row:
+    """In at most so much time."""
+    return min((r for r in rows if r.milliseconds <= milliseconds), key=lambda r: r.error)
+
+
+HEADS = ("method", "kind", "nodes", "ms a frame", "RMS error, mm", "per cent", "front")
+
+
+def methods_table(measured: Measured) -> common.Table:
+    """All rows, quickest first."""
+    on_front = {row.name for row in front(measured.rows)}
+    body = tuple(
+        (r.name, r.family, float(r.nodes), r.milliseconds, 1e3 * r.error,
+         100.0 * r.error / measured.scale, "yes" if r.name in on_front else "")
+        for r in sorted([*measured.rows, measured.reference], key=lambda r: r.milliseconds)
+    )  # fmt: skip
+    return common.Table(f"{measured.motion}, {measured.setting}", HEADS, body)
 
 
 def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
@@ -334,10 +407,26 @@ def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
     return common.Table("Beside the intermediate mesh (plain 2×2×2)", heads, (row,))
 
 
+def beside(label: str, hybrids: Sequence[Row], untrained: Sequence[Row]) -> common.Table:
+    """Each hybrid beside the quickest as near, and the nearest as quick, without training."""
+    heads = (
+        "scene", "hybrid", "as near without training", "takes of its time",
+        "as quick without training", "its error of that one's",
+    )  # fmt: skip
+    body = []
+    for row in hybrids:
+        near, quick = quickest(untrained, row.error), nearest(untrained, row.milliseconds)
+        body.append((
+            label, row.name.removeprefix("hybrid, "), near.name,
+            near.milliseconds / row.milliseconds, quick.name, row.error / quick.error,
+        ))  # fmt: skip
+    return common.Table("Hybrids beside what needs no training", heads, tuple(body))
+
+
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
     """A part for each scene; quick runs have one."""
     pairs = [("torsion", "exact")] if quick else [(m, s) for m in MOTIONS for s in SETTINGS]
-    return {f"{m}, {s}": partial(outcome, m, s, quick) for m, s in pairs}
+    return {f"{m}, {s}": partial(measure, m, s, quick) for m, s in pairs}
 
 
 if __name__ == "__main__":

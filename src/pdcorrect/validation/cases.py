@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -16,7 +17,8 @@ from pdcorrect.errors import InputError
 from pdcorrect.home import home_folder
 from pdcorrect.validation.outcome import Expectations, Outcome, read_expectations
 
-CODE, EXPECTED, README = "run.py", "expected.json", "README.md"
+CODE, EXPECTED, README, INPUTS = "run.py", "expected.json", "README.md", "inputs.txt"
+SUMMARY = "summary.md"
 Parts = Mapping[str, Callable[[], Outcome]]
 
 
@@ -59,21 +61,79 @@ class ValidationCase:
         return " ".join(found.group(1).split()) if found else ""
 
     @cached_property
+    def findings(self) -> str:
+        """What its README says of the results: what begins with **What ...**, as Markdown."""
+        return "\n\n".join(text for head, text in self._marked if head.startswith("What "))
+
+    @cached_property
+    def method(self) -> str:
+        """The rest of its README below the title, without the question, as Markdown."""
+        rest = [t for head, t in self._marked if not head.startswith(("What ", "Question"))]
+        return "\n\n".join(rest)
+
+    @cached_property
+    def _marked(self) -> list[tuple[str, str]]:
+        """Parts of the README that begin with **Words.**, each with its words.
+
+        Those that follow the question without such words have none.
+        """
+        body = re.sub(r"\A\s*# .+\n", "", self._readme)
+        found = []
+        for text in re.split(r"\n\s*\n(?=\*\*)", body.strip()):
+            head = re.match(r"\*\*(.+?)\.?\*\*", text)
+            words = head.group(1) if head else ""
+            if words == "Question":  # one paragraph
+                question, _, rest = text.partition("\n\n")
+                found += [(words, question), ("", rest.strip())]
+            else:
+                found.append((words, text))
+        return [(words, text) for words, text in found if text]
+
+    @cached_property
     def _readme(self) -> str:
         path = self.folder / README
         return path.read_text(encoding="utf-8") if path.is_file() else ""
 
+    def inputs(self) -> dict[str, str]:
+        """SHA-256 of models and data that its code reads, by path.
+
+        `INPUTS` in the case's folder names files and folders, whose READMEs do not count, one a
+        line, from the folder that has the cases' folder in it.
+
+        Raises
+        ------
+        InputError
+            If one is not there.
+        """
+        listed, root = self.folder / INPUTS, self.folder.parents[1]
+        if not listed.is_file():
+            return {}
+        found = {}
+        for line in filter(None, map(str.strip, listed.read_text(encoding="utf-8").splitlines())):
+            if not (root / line).exists():
+                raise InputError(f"{listed}: {line!r} is neither a file nor a folder of {root}.")
+            for path in _files(root / line):
+                content = path.read_bytes()
+                found[path.relative_to(root).as_posix()] = hashlib.sha256(content).hexdigest()
+        return found
+
     def digest(self) -> str:
         """SHA-256 of what its result depends on.
 
-        The package's code, the case's modules and expectations, and the modules that cases
-        share.
+        The package's code, the case's modules and expectations, the modules that cases share,
+        and its `inputs`.
+
+        Raises
+        ------
+        InputError
+            If an input is not there.
         """
         found = hashlib.sha256(code_digest().encode())
         paths = [*self.folder.parent.glob("*.py"), *self.folder.rglob("*.py")]
         for path in [*sorted(paths), self.folder / EXPECTED]:
             found.update(path.relative_to(self.folder.parent).as_posix().encode())
             found.update(path.read_bytes())
+        found.update(json.dumps(self.inputs()).encode())
         return found.hexdigest()
 
     def parts(self, quick: bool) -> Parts:
@@ -101,6 +161,19 @@ class ValidationCase:
         sys.modules[name] = module  # dataclasses look their module up
         spec.loader.exec_module(module)
         return module
+
+
+def _files(path: Path) -> list[Path]:
+    """A file, or those of a folder but its README."""
+    if path.is_file():
+        return [path]
+    return sorted(p for p in path.rglob("*") if p.is_file() and p.name != README)
+
+
+def read_summary(folder: str | Path | None = None) -> str:
+    """What the report begins with, Markdown: ``summary.md`` beside the cases, if it is there."""
+    path = (home_folder("validation") if folder is None else Path(folder)) / SUMMARY
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
 
 
 def find_cases(names: Sequence[str] = (), folder: str | Path | None = None) -> list[ValidationCase]:

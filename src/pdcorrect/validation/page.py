@@ -15,6 +15,7 @@ from pdcorrect.errors import OutputError
 from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.validation.cases import ValidationCase
 from pdcorrect.validation.outcome import Figure
+from pdcorrect.validation.prose import as_html, without_links
 from pdcorrect.validation.records import Record
 
 Rows = Sequence[Sequence[str]]
@@ -30,6 +31,7 @@ _MARKS = {
 _OVERVIEW = ("case", "question", "figures judged", "outside", "known to fail", "seconds")
 _KNOWN = "fails, known:"
 _JUDGED = ("figure", "found", "expected", "source", "")
+_TIMES = "Times were taken as they came, whatever else ran."
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,15 @@ class Section:
             rows, key=lambda row: [row[-1].startswith(mark) for mark in order].index(True)
         )
 
+    @property
+    def made(self) -> str:
+        """How, when and beside how much else it was made."""
+        record = self.record
+        return (
+            f"{record.date}, by `{record.command}`, {record.seconds:.0f} s; load at the "
+            f"beginning {record.load:.2g}"
+        )
+
     def overview(self) -> tuple[str, ...]:
         """A row of `_OVERVIEW`."""
         judged = self.judged()
@@ -80,8 +91,15 @@ class Section:
         )  # fmt: skip
 
 
-def write_page(sections: Sequence[Section], folder: str | Path) -> Path:
+def write_page(sections: Sequence[Section], folder: str | Path, summary: str = "") -> Path:
     """Write ``index.html``, ``report.md`` and ``figures.csv``; pictures are there already.
+
+    Parameters
+    ----------
+    sections : sequence of Section
+    folder : path
+    summary : str
+        Markdown to begin with.
 
     Returns
     -------
@@ -95,8 +113,8 @@ def write_page(sections: Sequence[Section], folder: str | Path) -> Path:
     """
     folder = make_folder(folder)
     write_text(folder / "figures.csv", to_csv(sections))
-    write_text(folder / "report.md", to_markdown(sections))
-    write_text(folder / "index.html", to_html(sections, folder))
+    write_text(folder / "report.md", to_markdown(sections, summary))
+    write_text(folder / "index.html", to_html(sections, folder, summary))
     return folder / "index.html"
 
 
@@ -108,16 +126,14 @@ def shown_figure(value: Figure | None) -> str:
 
 
 def conditions(sections: Sequence[Section]) -> str:
-    """How the results were made, in one paragraph."""
-    if not sections:
-        return ""
-    first = sections[0].record
-    mode = "quick parts only" if first.quick else "all parts"
-    loads = [one.record.load for one in sections]
-    made = ", ".join(f"{key} {value}" for key, value in first.environment.items())
-    return (
-        f"{first.date}, {mode}, by `{first.command}`. {made}. Other processes at the start of the "
-        f"cases: load {min(loads):.2g} to {max(loads):.2g}; times were taken as they came."
+    """On what the results were made, in one paragraph for each machine, or state of one."""
+    told: dict[tuple[str, bool], list[str]] = {}
+    for one in sections:
+        made = ", ".join(f"{key} {value}" for key, value in one.record.environment.items())
+        told.setdefault((made, one.record.quick), []).append(one.case.name)
+    return "\n\n".join(
+        f"{', '.join(names)}: {'quick parts only' if quick else 'all parts'}. {made}."
+        for (made, quick), names in told.items()
     )
 
 
@@ -147,24 +163,31 @@ def _number(value: float | None) -> str:
 # --- Markdown --------------------------------------------------------------------------------
 
 
-def to_markdown(sections: Sequence[Section]) -> str:
+def to_markdown(sections: Sequence[Section], summary: str = "") -> str:
     """The report; pictures are links."""
-    lines = ["# Validation report", "", conditions(sections), ""]
+    lines = ["# Validation report", "", *_paragraphs(summary)]
     lines += _markdown_table(_OVERVIEW, [one.overview() for one in sections])
+    lines += ["", *_paragraphs(conditions(sections)), _TIMES]
     for one in sections:
-        lines += ["", f"## {one.case.title}", "", f"Case `{one.case.name}`: {one.verdict}.", ""]
-        lines += [one.case.question, ""]
+        lines += ["", f"## {one.case.title}", "", f"Case `{one.case.name}`: {one.verdict}."]
+        lines += [f"Made {one.made}.", "", one.case.question, ""]
         if one.record.error:
             lines += ["```", one.record.error.rstrip(), "```", ""]
+        lines += _paragraphs(one.case.findings)
+        for name, caption in one.record.pictures.items():
+            lines += [f"![{caption}]({name})", "", caption, ""]
         for table in one.record.tables:
             lines += [f"**{table['name']}**", ""]
             lines += [*_markdown_table(table["headings"], _texts(table)), ""]
-        for name, caption in one.record.pictures.items():
-            lines += [f"![{caption}]({name})", "", caption, ""]
+        lines += _paragraphs(one.case.method)
         judged = one.judged()
         if judged:
             lines += ["**Figures with an expectation**", "", *_markdown_table(_JUDGED, judged)]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _paragraphs(text: str) -> list[str]:
+    return [without_links(text).strip(), ""] if text else []
 
 
 def _markdown_table(headings: Sequence[str], rows: Rows) -> list[str]:
@@ -183,28 +206,37 @@ def _texts(table: Mapping[str, Any]) -> list[list[str]]:
 # --- HTML ------------------------------------------------------------------------------------
 
 
-def to_html(sections: Sequence[Section], folder: Path) -> str:
+def to_html(sections: Sequence[Section], folder: Path, summary: str = "") -> str:
     """The report on one page, pictures in it."""
-    body = ["<h1>Validation report</h1>", f"<p class=made>{_text(conditions(sections))}</p>"]
+    body = ["<h1>Validation report</h1>", _prose(summary)]
     links = [[f"#{one.case.name}"] for one in sections]
     body.append(_html_table(_OVERVIEW, [one.overview() for one in sections], links))
+    body.append(f"<div class=made>{_prose(conditions(sections))}<p>{_TIMES}</p></div>")
     for one in sections:
         body.append(f'<section id="{_text(one.case.name)}"><h2>{_text(one.case.title)}</h2>')
         body.append(f"<p>{_text(one.case.question)}</p>")
         body.append(f"<p class={one.verdict[:4]}>{_text(one.verdict)}</p>")
         if one.record.error:
             body.append(f"<pre>{_text(one.record.error)}</pre>")
+        body.append(_prose(one.case.findings))
         body += [_picture(folder / n, text) for n, text in one.record.pictures.items()]
         for table in one.record.tables:
             body.append(f"<h3>{_text(table['name'])}</h3>")
             body.append(_html_table(table["headings"], _texts(table)))
+        if one.case.method:
+            body.append("<details><summary>How it was done, and limits</summary>")
+            body.append(_prose(one.case.method) + "</details>")
         judged = one.judged()
         if judged:
             opened = " open" if one.record.outside else ""
             body.append(f"<details{opened}><summary>{len(judged)} figures judged</summary>")
             body.append(_html_table(_JUDGED, judged) + "</details>")
-        body.append("</section>")
-    return _PAGE.format(style=_STYLE, body="\n".join(body))
+        body.append(f"<p class=made>Made {_text(one.made)}.</p></section>")
+    return _PAGE.format(style=_STYLE, body="\n".join(filter(None, body)))
+
+
+def _prose(text: str) -> str:
+    return f"<div class=wide>{as_html(without_links(text))}</div>" if text else ""
 
 
 def _text(text: str) -> str:

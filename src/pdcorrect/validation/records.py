@@ -79,6 +79,8 @@ class Record(PartRecord):
         Why there is no result; such records are not kept.
     environment : dict of str to str
         Hardware, threads, precision, versions.
+    inputs : dict of str to str
+        SHA-256 of models and data that it read, see `ValidationCase.inputs`.
     """
 
     command: str = ""
@@ -88,6 +90,7 @@ class Record(PartRecord):
     outside: list[str] = field(default_factory=list)
     error: str = ""
     environment: dict[str, str] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:

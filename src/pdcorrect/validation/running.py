@@ -72,7 +72,7 @@ def run_case(
     output = make_folder(output)
     record = Record(
         case.digest(), quick, draw, command=command, date=time.strftime("%Y-%m-%d"),
-        load=round(os.getloadavg()[0], 2), environment=environment(),
+        load=round(os.getloadavg()[0], 2), environment=environment(), inputs=case.inputs(),
     )  # fmt: skip
     kept = None if again else load(record_path(output, case), record)
     if kept is not None:
