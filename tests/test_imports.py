@@ -228,6 +228,7 @@ ORDER = [
     "validation.cases",
     "validation.records",
     "validation.running",
+    "validation.prose",
     "validation.page",
     "evaluate",
     "report",

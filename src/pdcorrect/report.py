@@ -17,6 +17,7 @@ from pdcorrect.environment import environment
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
 from pdcorrect.replacement import make_folder, write_text
+from pdcorrect.scene import Scene
 from pdcorrect.state import Status, Trajectory
 
 HEADINGS = (
@@ -53,6 +54,12 @@ def _percent(share: float) -> str:
     return "" if np.isnan(share) else f"{round(share, 1) + 0.0:.1f} %"  # no minus zero
 
 
+def _elsewhere(scene: Scene) -> str:
+    """What a scene's regions change of its material."""
+    count = len(scene.materials)
+    return f"; {count} region{'s' if count > 1 else ''} with other values" if count else ""
+
+
 def notes(comparison: Comparison) -> list[str]:
     """What the table's numbers mean on this scene, one sentence each."""
     scene = comparison.scene
@@ -67,7 +74,10 @@ def notes(comparison: Comparison) -> list[str]:
         f"Material: E = {scene.material.young:.6g} Pa and Poisson's ratio "
         f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
         f"E = {effective.young:.6g} Pa and {effective.poisson:.4g} "
-        f"(volume weight '{scene.material.volume_weight}').",
+        f"(volume weight '{scene.material.volume_weight}'){_elsewhere(scene)}.",
+        f"Of the scene itself: element {scene.solver.element}, mass {scene.solver.mass}, time "
+        f"integrator {scene.time.integrator}. They are those of all rows whose names do not tell "
+        "another.",
         f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
         "Newton.",
     ]
