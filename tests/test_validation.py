@@ -1,6 +1,8 @@
 """The cases of validation/, as far as they are quick: theory and published values."""
 
+import importlib
 import json
+import sys
 
 import pytest
 
@@ -8,7 +10,7 @@ import pdcorrect as pc
 from pdcorrect.validation.cases import find_cases, read_summary
 from pdcorrect.validation.outcome import missing, outside
 from pdcorrect.validation.page import Section, to_csv, to_html, to_markdown
-from pdcorrect.validation.records import Record, table_csv
+from pdcorrect.validation.records import PartRecord, Record, table_csv
 from pdcorrect.validation.running import slug
 
 CASES = {case.name: case for case in find_cases()}
@@ -64,6 +66,26 @@ def test_the_page_recorded_is_that_of_the_records():
     assert (results / "figures.csv").read_text() == to_csv(sections)
     assert (results / "report.md").read_text() == to_markdown(sections, read_summary())
     assert (results / "index.html").read_text() == to_html(sections, results, read_summary())
+
+
+def test_recorded_rows_give_the_recorded_figures_and_tables(monkeypatch):
+    pytest.importorskip("torch")  # for the models' bases
+    case = CASES["error_time"]
+    monkeypatch.syspath_prepend(case.folder)
+    redraw = importlib.import_module("redraw")
+    for name in ("redraw", "run"):  # other cases have modules of these names
+        del sys.modules[name]
+    record = json.loads((case.folder.parent / "results" / "error_time.json").read_text())
+    again = PartRecord("", quick=False, drawn=False)
+    for motion in redraw.MOTIONS:
+        for setting in redraw.SETTINGS:
+            again.add(redraw.outcome(redraw.measured(record, motion, setting), False, ""))
+    assert again.figures == pytest.approx(record["figures"], rel=1e-12)
+    for table, kept in zip(again.tables, record["tables"], strict=True):
+        assert (table["name"], list(table["headings"])) == (kept["name"], kept["headings"])
+        for row, other in zip(table["rows"], kept["rows"], strict=True):
+            for cell, told in zip(row, other, strict=True):
+                assert cell == (pytest.approx(told, rel=1e-9) if isinstance(told, float) else told)
 
 
 def test_the_report_and_the_documentation_recommend_the_same():
