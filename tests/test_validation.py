@@ -73,7 +73,7 @@ def test_recorded_rows_give_the_recorded_figures_and_tables(monkeypatch):
     case = CASES["error_time"]
     monkeypatch.syspath_prepend(case.folder)
     redraw = importlib.import_module("redraw")
-    for name in ("redraw", "run"):  # other cases have modules of these names
+    for name in ("redraw", "run"):  # other cases have a module of the second name
         del sys.modules[name]
     record = json.loads((case.folder.parent / "results" / "error_time.json").read_text())
     again = PartRecord("", quick=False, drawn=False)
@@ -86,6 +86,12 @@ def test_recorded_rows_give_the_recorded_figures_and_tables(monkeypatch):
         for row, other in zip(table["rows"], kept["rows"], strict=True):
             for cell, told in zip(row, other, strict=True):
                 assert cell == (pytest.approx(told, rel=1e-9) if isinstance(told, float) else told)
+
+
+def test_the_models_of_error_against_time_are_inputs_of_the_case():
+    case = CASES["error_time"]
+    models = {name for names in case._module().MODELS.values() for name in names}
+    assert {path.split("/")[1] for path in case.inputs() if path.startswith("models/")} == models
 
 
 def test_the_report_and_the_documentation_recommend_the_same():

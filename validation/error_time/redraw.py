@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
-from run import HEADS, MOTIONS, SETTINGS, Measured, Row, outcome
+from rows import Measured, Row
+from run import HEADS, MOTIONS, SETTINGS, outcome
 
 from pdcorrect.replacement import write_text
 from pdcorrect.validation.cases import find_cases
@@ -30,12 +31,12 @@ def measured(record: Mapping[str, Any], motion: str, setting: str) -> Measured:
     """The rows of a scene."""
     label = f"{motion}, {setting}"
     (table,) = (t for t in record["tables"] if t["name"] == label)
+    assert tuple(table["headings"]) == HEADS, "a record of other tables: measure anew"
     cells = [dict(zip(table["headings"], row, strict=True)) for row in table["rows"]]
     rows = [
         Row(c["method"], c["kind"], int(c["nodes"]), c["ms a frame"], 1e-3 * c["RMS error, mm"])
         for c in cells
     ]
-    assert tuple(table["headings"]) == HEADS
     (reference,) = (row for row in rows if row.name == "reference")
     rows.remove(reference)
     scale = 1e-3 * record["figures"][f"{label}, largest displacement, mm"]

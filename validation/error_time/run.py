@@ -13,7 +13,10 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parent))
 import common
+from drawing import draw
+from rows import FAMILIES, FITTED, Measured, Row, front, nearest, quickest, rivals
 
 import pdcorrect as pc
 from pdcorrect.data.config import EVALUATION, DatasetConfig
@@ -50,12 +53,6 @@ MODELS: Mapping[tuple[str, str], Sequence[str]] = {
 """Released correctors that were trained on such scenes, by motion and setting."""
 ROWS = {"plain": "plain", "best": "best", "total-mass": "right mass"}
 """Methods that correctors are added to, by the name of their base."""
-FITTED = "fitted stiffness"
-"""Fitted to the very scene: shown, but no one's rival."""
-NEARER = 0.99
-"""Of the error of what is quicker: more is no gain."""
-FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
-            "other tolerance", "Newton", "hybrid")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,17 +72,6 @@ class Method:
     family: str
     stepper: Callable[[], Any]
     every: float = 1.0
-
-
-@dataclass(frozen=True)
-class Row:
-    """What a method reached: nodes, ms a frame, RMS error in m on the coarse nodes."""
-
-    name: str
-    family: str
-    nodes: int
-    milliseconds: float
-    error: float
 
 
 class Comparison:
@@ -221,110 +207,6 @@ def smallest_scene(motion: str, setting: str) -> pc.Scene:
     return draw_scene(config, min(plans, key=lambda plan: plan.design.nodes), 0)
 
 
-def front(rows: Sequence[Row]) -> list[Row]:
-    """Those that nothing quicker is as near as, to `NEARER`, quickest first."""
-    out: list[Row] = []
-    for row in sorted(rivals(rows), key=lambda r: (r.milliseconds, r.error)):
-        if not out or row.error < NEARER * out[-1].error:
-            out.append(row)
-    return out
-
-
-def rivals(rows: Sequence[Row]) -> list[Row]:
-    """All but what was fitted to the scene."""
-    return [row for row in rows if row.name != FITTED]
-
-
-def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
-    """Error, per cent of the largest displacement, against time, with the Pareto front."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 6.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    best = front(rows)
-    points = [(r.milliseconds, 100.0 * r.error / scale) for r in best]
-    axis.step(*zip(*points, strict=True), where="post", color="0.6", label="Pareto front")
-    for k, family in enumerate(FAMILIES):
-        label: str | None = family
-        for row in (r for r in rows if r.family == family):
-            face = "none" if row.name == FITTED else common.COLOURS[k]
-            axis.scatter(
-                row.milliseconds, 100.0 * row.error / scale, 42, marker="osD^vP"[k], zorder=3,
-                facecolors=face, edgecolors=common.COLOURS[k],
-                label=None if row.name == FITTED else label,
-            )  # fmt: skip
-            label = label if row.name == FITTED else None
-    axis.set(
-        xscale="log", yscale="log", xlabel="ms a frame",
-        ylabel="RMS error, per cent of the largest displacement",
-    )  # fmt: skip
-    for side in (axis.xaxis, axis.yaxis):
-        side.set_major_formatter("{x:g}")
-        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
-    axis.grid(alpha=0.3, which="both")
-    axis.spines[["top", "right"]].set_visible(False)
-    axis.margins(x=0.14, y=0.08)
-    figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=9)
-    last = [r for r in rows if r not in best and r.family != FAMILIES[3]]  # tolerances crowd
-    named = [*(r for r in best if r.family != FAMILIES[3]), *last]
-    write_names(axis, [(r.name, r.milliseconds, 100.0 * r.error / scale) for r in named])
-    figure.savefig(path, dpi=150)
-
-
-def write_names(axis: Any, points: Sequence[tuple[str, float, float]]) -> None:
-    """Names beside points, those that come first where there is no room for all."""
-    from matplotlib.transforms import Bbox
-
-    axis.figure.canvas.draw()  # for the sizes of texts
-    centres = axis.transData.transform([(x, y) for _, x, y in points])
-    taken: list[Any] = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in centres]
-    for name, x, y in points:
-        for dx, dy in (
-            (7, 4),
-            (7, -11),
-            (-7, 4),
-            (-7, -11),
-            (7, 14),
-            (-7, 14),
-            (7, -21),
-            (-7, -21),
-        ):
-            side = "left" if dx > 0 else "right"
-            text = axis.annotate(
-                name.removeprefix("hybrid, "), (x, y), (dx, dy), textcoords="offset points",
-                fontsize=7.5, ha=side,
-            )  # fmt: skip
-            box = text.get_window_extent()
-            inside = axis.bbox.x0 <= box.x0 and box.x1 <= axis.bbox.x1
-            if inside and not any(box.overlaps(other) for other in taken):
-                taken.append(box)
-                break
-            text.remove()
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What was measured in a scene, of which figures, tables and the picture are made.
-
-    Attributes
-    ----------
-    motion, setting : str
-    rows : sequence of Row
-    reference : Row
-        The reference's own time and nodes.
-    scale : float
-        Largest displacement, m.
-    """
-
-    motion: str
-    setting: str
-    rows: Sequence[Row]
-    reference: Row
-    scale: float
-
-
 def measure(motion: str, setting: str, quick: bool) -> common.Outcome:
     """One scene, computed in all ways."""
     comparison = Comparison(motion, setting, quick)
@@ -374,16 +256,6 @@ def outcome(measured: Measured, quick: bool, caption: str) -> common.Outcome:
         figures, tuple(tables),
         (common.Picture(picture, caption, lambda path: draw(path, rows, scale)),),
     )  # fmt: skip
-
-
-def quickest(rows: Sequence[Row], error: float) -> Row:
-    """With at most so much error."""
-    return min((r for r in rows if r.error <= error), key=lambda r: r.milliseconds)
-
-
-def nearest(rows: Sequence[Row], milliseconds: float) -> Row:
-    """In at most so much time."""
-    return min((r for r in rows if r.milliseconds <= milliseconds), key=lambda r: r.error)
 
 
 HEADS = ("method", "kind", "nodes", "ms a frame", "RMS error, mm", "per cent", "front")
