@@ -16,6 +16,7 @@ from dataset_samples import sample_config, sample_shard, with_run, with_simulati
 from motion import trajectory
 from pdcorrect.data import seal
 from pdcorrect.data.check import check_dataset
+from pdcorrect.data.check_file import same_scene
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import dataset_info
@@ -913,6 +914,22 @@ def renumbered(shard):
             for s in shard.simulations
         ),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("young", "same"),
+    [
+        ("1.0000000000000002e5", True),  # the last digit, in which processors differ
+        ("1.0000000000001e5", False),
+        ("true", False),
+        ("nonsense", False),
+    ],
+)
+def test_scenes_are_compared_to_the_last_digits_only(young, same):
+    text = '[material]\nyoung = {}\n[[loads]]\nkind = "gravity"\nacceleration = [0.0, 0.0, 1.0]\n'
+    assert same_scene(text.format(young), text.format("1.0e5")) == same
+    assert not same_scene(text.format("1.0e5").replace("0.0, 1.0]", "1.0]"), text.format("1.0e5"))
+    assert not same_scene(text.format("1.0e5").replace("gravity", "force"), text.format("1.0e5"))
 
 
 def body_of(shard, other):
