@@ -5,7 +5,8 @@ python models/table.py
 The first has models on unseen meshes of their evaluation splits, the second scenes unlike those
 of the training, with the default gate of then and without one, the third bodies of other sizes and
 families, the fourth, for the models of the first, errors of single steps beside those of rollouts,
-the fifth what needs no network, the sixth the model of all motions beside those of one.
+the fifth what needs no network, the sixth the model of all motions beside those of one, the
+seventh other trainings in the exact setting: seeds, numbers of bodies, the plain base.
 """
 
 from __future__ import annotations
@@ -14,9 +15,28 @@ import csv
 import json
 import statistics
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from table_rows import (
+    BODIES,
+    BODY_HEADINGS,
+    HARM,
+    HEADINGS,
+    JOINT_HEADINGS,
+    JOINT_RECORD,
+    MEASURED,
+    OTHER_HEADINGS,
+    OTHERS,
+    PUBLISHED,
+    ROWS,
+    STEP_HEADINGS,
+    TRAINING_HEADINGS,
+    TRAININGS,
+    TRAININGS_RECORDS,
+    WITHOUT_NETWORK,
+    Row,
+)
 
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import make_plan
@@ -25,92 +45,12 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "validation" / "results"
 
 
-@dataclass(frozen=True)
-class Row:
-    """A released model's evaluation on unseen meshes.
-
-    Attributes
-    ----------
-    model, record, run : str
-        The record is a folder of `RESULTS`; the run is the corrected one.
-    thesis : float
-        Reported mean Omega of the thesis's own model of this motion, %.
-    """
-
-    model: str
-    record: str
-    run: str
-    thesis: float
-
-
-_IMPULSE, _STRETCH, _TORSION = 95.9, 99.1, 91.3
-_KICKED = "impulse-as-published-total-mass"
-_HEAVY = "torsion-as-published-total-mass"
-ROWS = (
-    Row("impulse-as-published", "impulse-as-published-fourth", "model", _IMPULSE),
-    Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
-    Row("stretch-as-published", "stretch-as-published-third", "model", _STRETCH),
-    Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),
-    Row("torsion-as-published", "torsion-as-published-second", "torsion-as-published", _TORSION),
-    Row(_HEAVY, "torsion-as-published-second", _HEAVY, _TORSION),
-    Row("impulse-exact", "impulse-exact", "impulse-exact", _IMPULSE),
-    Row("stretch-exact", "stretch-exact", "stretch-exact", _STRETCH),
-    Row("torsion-exact", "torsion-exact-third", "torsion-exact", _TORSION),
-)
-HEADINGS = (
-    "model", "base", "thesis", "corrected: Ω mean", "95 %", "median", "worst",
-    "RMS error removed, %", "base alone: Ω mean, worst", "of the base's error: mean, median",
-    "intermediate mesh: Ω mean, worst", "RMS, mm", "to converged in time, mm: base, corrected",
-)  # fmt: skip
-
-
-OTHERS = (
-    "other-family", "stiffer", "more-compressible", "stronger", "half-step", "double-step",
-    "half-refined",
-)  # fmt: skip
-"""Splits of the second table, in its order."""
-OTHER_HEADINGS = (
-    "model", "split", "simulations", "steps refused, %", "base alone: Ω mean",
-    "corrected: Ω mean, worst", "error over the base's: median, largest",
-    "without a gate: the same",
-)  # fmt: skip
-
-BODIES = ("larger", "smaller", "beams", "one-clamp", "other-family")
-"""Records of the third table, in its order."""
-BODY_HEADINGS = (
-    "model", "bodies", "nodes", "simulations", "farthest measure of all", "steps refused, %",
-    "base alone: Ω mean", "corrected: Ω mean, worst", "error over the base's: each",
-)  # fmt: skip
-
-HARM = 1.05
-"""Times the base's RMS error: what is more counts as harm."""
-STEP_HEADINGS = (
-    "model", "single steps: error over the base's, median, largest", "rollouts: the same",
-    f"rollouts above {HARM}", "their single steps: largest",
-)  # fmt: skip
-
-PUBLISHED = ("impulse-as-published", "stretch-as-published", "torsion-as-published")
-WITHOUT_NETWORK = {
-    "consistent mass": "consistent mass",
-    "hex8-mean": "element `hex8-mean`",
-    "hex8-bubble": "element `hex8-bubble`",
-    "hex8-bubble-mean": "element `hex8-bubble-mean`",
-    "fitted stiffness": "Young's modulus times {factors}, fitted",
-    "total-mass": "the reference's total mass",
-    "intermediate": "intermediate mesh",
-}
-"""Runs of the fifth table, in its order, and what they are called there."""
-JOINT_RECORD = "all-as-published"
-JOINT_HEADINGS = (
-    "data set", "one model for all: Ω mean", "95 %", "median", "worst",
-    "model of this motion: Ω mean, worst", "difference", f"rollouts above {HARM}",
-    "intermediate mesh: Ω mean", "stress error, %: one model, of this motion, intermediate",
-)  # fmt: skip
-
-
 def main() -> None:
     """Print them."""
-    every = (table, others_table, bodies_table, steps_table, baselines_table, together_table)
+    every = (
+        table, others_table, bodies_table, steps_table, baselines_table, together_table,
+        trainings_table,
+    )  # fmt: skip
     print("\n\n".join(make() for make in every))
 
 
@@ -158,13 +98,9 @@ def steps_table() -> str:
 
 def baselines_table() -> str:
     """The fifth table in Markdown."""
-    folder = RESULTS / "baselines"
-    records = [
-        json.loads((folder / name / "summary.json").read_text(encoding="utf-8"))
-        for name in PUBLISHED
-    ]
-    headings = ("coarse mesh with", *(name.replace("-", " ") for name in PUBLISHED))
-    lines = [_line(headings), _line(["---", *["---:"] * len(PUBLISHED)])]
+    records = [_summary(f"baselines/{name}") for name in MEASURED]
+    headings = ("coarse mesh with", *(name.replace("-", " ") for name in MEASURED))
+    lines = [_line(headings), _line(["---", *["---:"] * len(MEASURED)])]
     for run, name in WITHOUT_NETWORK.items():
         cells = [_baseline_cell(record, run) for record in records]
         factors = ", ".join(f"{record['stiffness_factor']:.2f}" for record in records)
@@ -178,14 +114,11 @@ def together_table() -> str:
     for name in PUBLISHED:
         own = next(row for row in ROWS if row.model == f"{name}-total-mass")
         row = Row(JOINT_RECORD, f"{JOINT_RECORD}/{name.split('-')[0]}", "model", own.thesis)
-        found, alone = (
-            json.loads((RESULTS / one.record / "summary.json").read_text(encoding="utf-8"))["runs"]
-            for one in (row, own)
-        )
+        found, alone = (_summary(one.record)["runs"] for one in (row, own))
         omega, other = (
             runs[one.run]["measures"]["omega"] for runs, one in ((found, row), (alone, own))
         )
-        ratios = _over_base(row, found["model"]["base"], "rms_error").values()
+        ratios = _over(row, found["model"]["base"], "rms_error").values()
         stress = (
             100.0 * runs[run]["measures"]["stress_error"]["mean"]
             for runs, run in ((found, "model"), (alone, own.run), (found, "intermediate"))
@@ -203,15 +136,38 @@ def together_table() -> str:
     return "\n".join(lines)
 
 
+def trainings_table() -> str:
+    """The seventh table in Markdown."""
+    lines = [_line(TRAINING_HEADINGS), _line(["---"] * 3 + ["---:"] * 7)]
+    for key, run, what in TRAININGS:
+        row = Row(run, TRAININGS_RECORDS[key], run, 0.0)
+        found = _summary(row.record)["runs"][run]
+        omega, base = found["measures"]["omega"], found["base"]
+        harmed, nearer = (
+            sum(x > bound for x in _over(row, other, "rms_error").values())
+            for other, bound in ((base, HARM), ("intermediate", 1.0))
+        )
+        lines.append(_line([
+            key.replace("many", "exact").replace("-", " "), what, base, f"**{omega['mean']:.1f}**",
+            _signed("{:.1f} – {:.1f}".format(*omega["interval"])), f"{omega['median']:.1f}",
+            _signed(f"{omega['smallest']:.1f}"),
+            f"{found['measures']['omega_base']['mean']:.1f}", f"{harmed} of {omega['count']}",
+            f"{nearer}",
+        ]))  # fmt: skip
+    return "\n".join(lines)
+
+
 def _baseline_cell(record: dict[str, Any], run: str) -> str:
+    if run not in record["runs"]:  # total mass as published only, best coarse model in exact only
+        return ""
     omega = record["runs"][run]["measures"]["omega"]
     return _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}")
 
 
 def _step_cells(row: Row) -> list[str]:
-    summary = json.loads((RESULTS / row.record / "summary.json").read_text(encoding="utf-8"))
+    summary = _summary(row.record)
     base = summary["runs"][row.run]["base"]
-    single, rolled = (_over_base(row, base, name) for name in ("step_rms_error", "rms_error"))
+    single, rolled = (_over(row, base, name) for name in ("step_rms_error", "rms_error"))
     harmed = [key for key, ratio in rolled.items() if ratio > HARM]
     spread = (
         f"{statistics.median(found.values()):.2f}, {max(found.values()):.2f}"
@@ -223,7 +179,7 @@ def _step_cells(row: Row) -> list[str]:
     ]  # fmt: skip
 
 
-def _over_base(row: Row, base: str, name: str) -> dict[tuple[str, str], float]:
+def _over(row: Row, base: str, name: str) -> dict[tuple[str, str], float]:
     """A measure of the corrected run over that of its base, by mesh and simulation."""
     found: dict[str, dict[tuple[str, str], float]] = {row.run: {}, base: {}}
     path = RESULTS / row.record / "trajectories.csv"
@@ -266,8 +222,7 @@ def _other_cells(record: dict[str, Any], model: str, split: str, frames: int) ->
 
 
 def _cells(row: Row) -> list[str]:
-    summary = json.loads((RESULTS / row.record / "summary.json").read_text(encoding="utf-8"))
-    runs = summary["runs"]
+    runs = _summary(row.record)["runs"]
     found, base = runs[row.run]["measures"], runs[row.run]["base"]
     omega = found["omega"]
     low, high = omega["interval"]
@@ -281,14 +236,24 @@ def _cells(row: Row) -> list[str]:
         _signed(f"{alone['mean']:.1f}, {alone['smallest']:.1f}"),
         "{mean:.1f}, {median:.1f}".format(**found["omega_base"]),
         f"{intermediate['mean']:.1f}, {intermediate['smallest']:.1f}",
-        f"{1e3 * found['rms_error']['mean']:.2f}", _converged(runs, base, row.run),
+        f"{1e3 * found['rms_error']['mean']:.2f}", _converged(row, runs, base),
     ]  # fmt: skip
 
 
-def _converged(runs: dict[str, Any], base: str, run: str) -> str:
-    """Mean RMS distances from the run that is converged in time, mm."""
+def _converged(row: Row, runs: dict[str, Any], base: str) -> str:
+    """Mean RMS distances from the run converged in time, mm; starred if of another record."""
+    run, star = row.run, ""
+    if row.converged is not None:
+        runs, run, star = _summary(row.converged)["runs"], row.model, "*"
     each = [runs[name]["measures"].get("converged_rms_error") for name in (base, run)]
-    return "" if None in each else ", ".join(f"{1e3 * one['mean']:.1f}" for one in each)
+    return "" if None in each else ", ".join(f"{1e3 * one['mean']:.1f}" for one in each) + star
+
+
+def _summary(record: str) -> dict[str, Any]:
+    """What `pdcorrect evaluate` wrote there."""
+    path = RESULTS / record / "summary.json"
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
 
 
 def _signed(text: str) -> str:
