@@ -20,7 +20,9 @@ from pdcorrect import (
 )
 from pdcorrect.cli_parts import BAD_INPUT, FAILED, say
 from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
-from pdcorrect.interruption import TERMINATED, Terminated, terminable
+from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated, terminable
+
+__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "TERMINATED", "app", "main"]
 
 app = typer.Typer(
     no_args_is_help=True,
