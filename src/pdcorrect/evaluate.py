@@ -4,83 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pdcorrect import metrics
+from pdcorrect.comparison_cases import CASES, Case, cases_for, cases_with
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.coarse_models import BASES, coarse_model
+from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem, discretise
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
 from pdcorrect.state import Status, Stepper, StepResult, Trajectory
 
+__all__ = [
+    "CASES", "Case", "Comparison", "Row", "case_stepper", "cases_for", "cases_with", "compare",
+    "make_stepper",
+]  # fmt: skip
+
 _FALLBACKS = [Status.RECOVERED.name, Status.SUBSTEPPED.name]
 OnStep = Callable[[str, int, StepResult], None]
 """Called with a case's label, its frame, and the step's result."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One solver on one mesh.
-
-    Attributes
-    ----------
-    label : str
-    solver : str
-        "pd" or "newton".
-    refine : int
-    base : {"plain", "best", "total-mass"}
-        As of `coarse_model`; "best" on any mesh, "total-mass" on the coarse one only.
-    model : str or None
-        Name or folder of a corrector of the steps.
-    gate : bool
-        Whether a default `Gate` lets the corrector pass.
-    """
-
-    label: str
-    solver: str
-    refine: int
-    base: str = "plain"
-    model: str | None = None
-    gate: bool = True
-
-    @property
-    def plain(self) -> bool:
-        """Whether it is the scene itself on the coarse mesh."""
-        return self.refine == 1 and self.base == "plain" and self.model is None
-
-    def problem(self, scene: Scene) -> Problem:
-        """What is stepped.
-
-        Raises
-        ------
-        InputError
-            If there is no such base on its mesh.
-        """
-        if self.refine == 1:
-            return coarse_model(scene, self.base)
-        if self.base not in ("plain", "best"):
-            raise InputError(
-                f"{self.label}: base {self.base!r} refined {self.refine} times: expected 'plain' "
-                "or 'best'."
-            )
-        return discretise(best_coarse(scene) if self.base == "best" else scene, self.refine)
-
-
-CASES = (
-    Case("fine PD", "pd", 4),
-    Case("intermediate PD", "pd", 2),
-    Case("coarse PD", "pd", 1),
-    Case("coarse Newton", "newton", 1),
-)
-"""The default comparison; the first case is the reference of all errors."""
-
-_COARSE = {"best": "best coarse PD", "total-mass": "coarse PD, total mass"}
-"""Labels of coarse models by their base."""
 
 
 @dataclass(frozen=True)
@@ -169,54 +115,6 @@ def _stepper(problem: Problem, solver: str) -> Stepper:
     return kinds[solver](problem).prepare()
 
 
-def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
-    """The default comparison with correctors.
-
-    Those of the best coarse model have learned references with its element: all errors
-    are then distances from such a one.  The coarse models that they correct are among the cases.
-
-    Parameters
-    ----------
-    models : sequence of str
-        Names or folders.
-    gate : bool
-        Of the correctors.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, or they learned from references of unlike elements.
-    """
-    if not models:
-        return CASES
-    from pdcorrect.corrector.model_io import load_model, model_folder, unlike_ends
-
-    names = unlike_ends([model_folder(model).resolve() for model in models])
-    bases = [load_model(model).base for model in models]
-    for name, base in zip(names, bases, strict=True):
-        if base not in BASES:
-            raise InputError(f"{name}: corrects {base!r}: expected one of {', '.join(BASES)}.")
-    reference, *others = CASES
-    if "best" in bases:
-        if set(bases) != {"best"}:
-            raise InputError(
-                f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: "
-                "expected of 'best' or of the others, as their references have unlike elements; "
-                "compare the others apart."
-            )
-        reference = replace(reference, label="fine best PD", base="best")
-    without = "" if gate else ", no gate"
-    return (
-        reference,
-        *others,
-        *(Case(_COARSE[b], "pd", 1, b) for b in dict.fromkeys(bases) if b != "plain"),
-        *(
-            Case(f"hybrid {name}{without}", "pd", 1, base, model, gate)
-            for name, base, model in zip(names, bases, models, strict=True)
-        ),
-    )
-
-
 def case_stepper(scene: Scene, case: Case) -> Stepper:
     """What steps a case, factorised and with its kernels compiled.
 
@@ -228,19 +126,15 @@ def case_stepper(scene: Scene, case: Case) -> Stepper:
     problem = case.problem(scene)
     if case.model is None:
         return _stepper(problem, case.solver)
-    from pdcorrect.corrector.gate import Gate
-    from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.corrector.model_io import load_model
+    from pdcorrect.corrector.released import hybrid_of
 
-    model, gate = load_model(case.model), Gate() if case.gate else None
-    coarse = ProjectiveDynamics(problem)
-    return HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=gate).prepare()
+    return hybrid_of(scene, case.model, gate=case.gate, problem=problem).prepare()
 
 
 def compare(
     scene: Scene,
     frames: int | None = None,
-    cases: tuple[Case, ...] = CASES,
+    cases: Sequence[Case] | None = None,
     on_step: OnStep | None = None,
 ) -> Comparison:
     """Run a scene with several solvers and measure error and time.
@@ -250,8 +144,8 @@ def compare(
     scene : Scene
     frames : int, optional
         The scene's by default.
-    cases : tuple of Case
-        The first is the reference.
+    cases : sequence of Case, optional
+        The first is the reference; those of `cases_for` by default.
     on_step : callable, optional
         For progress.
 
@@ -262,6 +156,7 @@ def compare(
     ConvergenceError
         If the reference fails.  Other cases that fail are among ``failures``.
     """
+    cases = cases_for(scene) if cases is None else tuple(cases)
     if not cases:
         raise InputError("cases is empty: expected at least the reference.")
     labels = [case.label for case in cases]
@@ -285,7 +180,7 @@ def compare(
     complete = tuple(case for case in cases if case.label in runs)
     base = next((on_coarse[c.label] for c in complete[::-1] if c.plain and c.solver == "pd"), None)
     rows = []
-    for case in sorted(complete, key=lambda c: (c.refine, BASES.index(c.base), c.solver != "pd")):
+    for case in sorted(complete, key=_coarse_to_fine):
         run, here = runs[case.label], on_coarse[case.label]
         has_base = base is not None and metrics.mean_squared_error(base, truth) > 0
         rows.append(
@@ -309,6 +204,12 @@ def compare(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
         {case.label: _about(case.model) for case in cases if case.model}, failures,
     )  # fmt: skip
+
+
+def _coarse_to_fine(case: Case) -> tuple[int, bool, int, bool]:
+    """Order of the rows; elements with more nodes after all that share the coarse nodes."""
+    more_nodes = case.element is not None
+    return case.refine, more_nodes, BASES.index(case.base), case.solver != "pd"
 
 
 def _about(name: str) -> dict[str, str]:

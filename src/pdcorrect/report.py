@@ -6,19 +6,28 @@ import csv
 import dataclasses
 import io
 import json
-from collections.abc import Mapping
+import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import pdcorrect.figures as figures
 from pdcorrect.environment import environment
 from pdcorrect.evaluate import Comparison, Row
-from pdcorrect.metrics import energy_balance, largest_displacement
+from pdcorrect.io.vtk import write_vtu_series
 from pdcorrect.replacement import make_folder, write_text
-from pdcorrect.scene import Scene
-from pdcorrect.state import Status, Trajectory
+from pdcorrect.report_notes import inverted_frames, notes, refused_share, shown_labels
+
+__all__ = [
+    "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",
+    "to_json", "to_markdown", "write_report", "write_series",
+]  # fmt: skip
+
+VTU = "vtu"
+"""Folder, inside a report's, of what `write_series` writes."""
+
+_PANEL, _PANELS = 266, 6
+"""Width of a body's panel, pixels, where there are more than so many."""
 
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
@@ -31,11 +40,12 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
         r for r in comparison.rows if r.label == comparison.reference
     ).seconds_a_frame
     lines: list[tuple[str, ...]] = []
+    shown = shown_labels(comparison)
     for row in comparison.rows:
         is_reference = row.label == comparison.reference
         lines.append(
             (
-                row.label,
+                shown[row.label],
                 str(row.nodes),
                 "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
@@ -52,122 +62,6 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
 
 def _percent(share: float) -> str:
     return "" if np.isnan(share) else f"{round(share, 1) + 0.0:.1f} %"  # no minus zero
-
-
-def _elsewhere(scene: Scene) -> str:
-    """What a scene's regions change of its material."""
-    count = len(scene.materials)
-    return f"; {count} region{'s' if count > 1 else ''} with other values" if count else ""
-
-
-def notes(comparison: Comparison) -> list[str]:
-    """What the table's numbers mean on this scene, one sentence each."""
-    scene = comparison.scene
-    effective = scene.material.effective
-    moved = largest_displacement(comparison.on_coarse[comparison.reference])
-    frames = len(comparison.runs[comparison.reference])
-    out = [
-        f"{frames} frames of {scene.time.step:g} s; the reference moves by up to "
-        f"{1e3 * moved:.3g} mm. Errors (RMS, worst) are distances of the coarse nodes from the "
-        f"reference, {comparison.reference}, with the same time step, over all frames. Times and "
-        "iterations are for one frame.",
-        f"Material: E = {scene.material.young:.6g} Pa and Poisson's ratio "
-        f"{scene.material.poisson:g} asked for; the energy's small-strain moduli are "
-        f"E = {effective.young:.6g} Pa and {effective.poisson:.4g} "
-        f"(volume weight '{scene.material.volume_weight}'){_elsewhere(scene)}.",
-        f"Of the scene itself: element {scene.solver.element}, mass {scene.solver.mass}, time "
-        f"integrator {scene.time.integrator}. They are those of all rows whose names do not tell "
-        "another.",
-        f"Solver tolerance: {scene.solver.tolerance:g} of the coarse cell size for PD, 1e-10 for "
-        "Newton.",
-    ]
-    if any(np.isfinite(row.omega) for row in comparison.rows):
-        out[-1] += (
-            " 'Corrected' is the share of the coarse PD run's squared error that is gone (eq. 7-2)."
-        )
-    out += [
-        f"{label} failed and has no errors or times: {why}"
-        for label, why in comparison.failures.items()
-    ]
-    lost = _lost_share(comparison.runs[comparison.reference])
-    if lost is not None:
-        out.append(
-            f"The time integrator ({scene.time.integrator}, {scene.time.step:g} s) dissipates "
-            f"{100 * lost:.0f} % of the work that the loads do on the reference (time error, which "
-            "all rows share)."
-        )
-    if comparison.solver_error is not None:
-        best = {c.label for c in comparison.cases if c.base == "best"}
-        of_element = " and the element's" if comparison.reference in best else ""
-        out.append(
-            f"PD and Newton on the coarse mesh differ by at most "
-            f"{1e3 * comparison.solver_error:.2g} mm (solver error); the rest of their error is "
-            f"the mesh's{of_element}."
-        )
-    out += [
-        f"{row.label}: {row.unusual_frames} of {frames} frames converged only by a fallback "
-        "(Newton-CG or smaller steps), which changes their time error."
-        for row in comparison.rows
-        if row.unusual_frames
-    ]
-    gated = {case.label: case.gate for case in comparison.cases}
-    out += [
-        f"{label}: trained on scenes of the data set {about['dataset']!r} and with references of "
-        "its setting; on others it may be of no use, and "
-        + ("its gate need not notice." if gated[label] else "it has no gate.")
-        for label, about in comparison.models.items()
-    ]
-    out += [
-        f"{row.label}: {row.refused_frames} of {frames} corrections were refused by the gate "
-        f"({_reasons(comparison.runs[row.label].stats)})."
-        for row in comparison.rows
-        if row.refused_frames
-    ]
-    for row in comparison.rows:
-        inverted = inverted_frames(comparison.runs[row.label].stats, scene.time.step)
-        if inverted:
-            out.append(f"{row.label}: {inverted}.")
-    return out
-
-
-def _reasons(stats: Mapping[str, Any]) -> str:
-    """Why a gate refused corrections, as "2 by features, 1 by energy"."""
-    from pdcorrect.corrector.gate import refusals
-
-    found = refusals(stats["gate"])
-    return ", ".join(f"{count} by {reason}" for reason, count in found.items() if count)
-
-
-def inverted_frames(stats: Mapping[str, Any], step: float) -> str | None:
-    """How many frames of a run ended with inverted cells, and which was the first; None if none.
-
-    Parameters
-    ----------
-    stats : mapping of str to (T,) arrays
-        Those of a run from its first step on.
-    step : float
-        s.
-    """
-    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
-    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
-        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
-    if not inverted.any():
-        return None
-    first = 1 + int(inverted.argmax())
-    return (
-        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
-        f"first of them frame {first} (t = {first * step:g} s)"
-    )
-
-
-def _lost_share(run: Trajectory) -> float | None:
-    """Share of the work of loads and clamps that the integrator lost; None if unclear."""
-    if run.problem is None or run.problem.scene.time.integrator == "quasi-static":
-        return None
-    balance = energy_balance(run)
-    work = float(balance.external_work[-1] + balance.clamp_work[-1])
-    lost = float(balance.dissipation[-1])
-    return lost / work if work > lost > 0 else None
 
 
 def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
@@ -236,13 +130,41 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
     return folder / "report.md"
 
 
+def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
+    """Write every run for ParaView, with stress, into ``vtu`` inside a report's folder.
+
+    Returns
+    -------
+    list of Path
+        PVD files, in the order of the rows, with the rows' labels in small letters and dashes.
+
+    Raises
+    ------
+    OutputError
+        If they cannot be written.
+    """
+    target = make_folder(Path(folder) / VTU)
+    found: dict[str, Path] = {}
+    for row in comparison.rows:
+        run, name = comparison.runs[row.label], _file_name(row.label)
+        while name in found:  # labels that differ in other signs only
+            name += "-again"
+        found[name] = write_vtu_series(run, target, name=name, stress_of=run.problem)
+    return [*found.values()]
+
+
+def _file_name(label: str) -> str:
+    return re.sub(r"[^a-z0-9.]+", "-", label.lower()).strip("-.") or "run"
+
+
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
     """Bodies side by side and over each other, and plots; returns their file names.
 
     No plot of errors where there is none but the reference's.
     """
     runs = [comparison.runs[row.label] for row in comparison.rows]
-    labels = [row.label for row in comparison.rows]
+    shown = shown_labels(comparison)
+    labels = [*shown.values()]
     truth = comparison.on_coarse[comparison.reference]
     distance = np.linalg.norm(truth.positions - truth.points, axis=2)
     frame, node = np.unravel_index(int(distance.argmax()), distance.shape)
@@ -252,6 +174,7 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
         frame=int(frame),
+        window=None if len(runs) <= _PANELS else _PANEL * len(runs),
     )
     overlaid = overlaid_labels(comparison)
     if len(overlaid) > 1:
@@ -259,7 +182,7 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         figures.render_overlay(
             [comparison.on_coarse[label] for label in overlaid],
             folder / "overlay.png",
-            labels=overlaid,
+            labels=[shown[label] for label in overlaid],
             frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
         )
     figures.plot_node_trajectories(
@@ -270,10 +193,16 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
     if any(row.rms_error > 0 for row in comparison.rows):
         names += ["error_against_time.png", "error_over_time.png"]
         figures.plot_error_over_time(
-            comparison.errors_over_time(), truth.times, folder / "error_over_time.png"
+            {shown[label]: errors for label, errors in comparison.errors_over_time().items()},
+            truth.times,
+            folder / "error_over_time.png",
         )
         figures.plot_error_against_time(
-            {r.label: (r.seconds_a_frame, r.rms_error) for r in comparison.rows if r.rms_error > 0},
+            {
+                shown[row.label]: (row.seconds_a_frame, row.rms_error)
+                for row in comparison.rows
+                if row.rms_error > 0
+            },
             folder / "error_against_time.png",
         )
     return [*names, "node.png", "energy.png"]
@@ -282,19 +211,21 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
 def overlaid_labels(comparison: Comparison) -> list[str]:
     """Which runs are drawn over each other: the reference, what is near it, and the coarse mesh.
 
-    What is near it is the nearest corrector or better coarse model; without any, the nearest finer
-    mesh.  Runs that the comparison does not have are left out.
+    What is near it is the nearest corrector or better coarse model; without any, the nearest with
+    more nodes.  Runs that the comparison does not have are left out.
     """
     errors = {row.label: row.rms_error for row in comparison.rows}
     cases = [case for case in comparison.cases if case.label in errors]
     plain = [c.label for c in cases if c.plain and c.solver == "pd"]
-    finer = [c.label for c in cases if c.refine > 1 and c.label != comparison.reference]
+    others = [c for c in cases if c.label != comparison.reference]
+    finer = [c.label for c in others if c.refine > 1 or c.element is not None]
     better = [c.label for c in cases if c.refine == 1 and (c.model or c.base != "plain")] or finer
     nearest = sorted(better, key=lambda label: errors[label])[:1]
     return list(dict.fromkeys([comparison.reference, *nearest, *plain[:1]]))
 
 
 def _panel_label(comparison: Comparison, row: Row) -> str:
+    """Lines above a body; a line more is narrower than a longer name."""
     error = (
         "reference"
         if row.label == comparison.reference
@@ -302,4 +233,7 @@ def _panel_label(comparison: Comparison, row: Row) -> str:
     )
     ms = 1e3 * row.seconds_a_frame
     time = f"{ms:.3g}" if ms < 999.5 else f"{ms:.0f}"  # no powers of ten
-    return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame"
+    refused = refused_share(comparison, row)
+    return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame" + (
+        f"\n{refused}" if refused else ""
+    )

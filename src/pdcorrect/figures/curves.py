@@ -58,15 +58,19 @@ def _labelled(
 
 
 def _legend(figure: Any, axes: Sequence[Any]) -> None:
-    """Above the axes, so that it hides nothing."""
+    """Above the axes, so that it hides nothing, in as many columns as fit."""
     lines: dict[str, Any] = {}
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
         lines |= dict(zip(labels, handles, strict=True))
-    figure.legend(
-        lines.values(), lines, loc="outside upper center", ncols=min(4, len(lines)),
-        frameon=False, fontsize=9,
-    )  # fmt: skip
+    for columns in range(min(4, len(lines)), 0, -1):
+        legend = figure.legend(
+            lines.values(), lines, loc="outside upper center", ncols=columns, frameon=False,
+            fontsize=9,
+        )  # fmt: skip
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            return
+        legend.remove()
 
 
 def _style(index: int) -> dict[str, Any]:

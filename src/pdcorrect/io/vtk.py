@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,11 @@ def write_vtu_series(
     point_data, cell_data : callable, optional
         Frame -> fields (N, ...) or (C, ...).
     stress_of : Problem, optional
-        What was stepped (``trajectory.problem``): adds the Cauchy stress averaged to the
-        points, ``stress`` (N, 6), Pa, as xx yy zz xy yz xz, and its ``von_mises`` (N,).
+        What was stepped (``trajectory.problem``, or `problem_of` a run from a file): adds the
+        Cauchy stress averaged to the points, ``stress`` (N, 6), Pa, as xx yy zz xy yz xz, and its
+        ``von_mises`` (N,); and of the cells ``cell_von_mises`` (C,), Pa, of the Cauchy stress
+        averaged over the cell, and ``smallest_volume_ratio`` (C,), the smallest det F at its
+        quadrature points, see `ElasticBody.volume_ratios`.
 
     Returns
     -------
@@ -67,23 +71,25 @@ def write_vtu_series(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from error
-    for stale in folder.glob(f"{name}_[0-9][0-9][0-9][0-9]*.vtu"):
+    for stale in folder.glob(f"{escape(name)}_[0-9][0-9][0-9][0-9]*.vtu"):
         stale.unlink()
     root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
     collection = ET.SubElement(root, "Collection")
     for frame in range(0, len(trajectory.times), every):
         file = f"{name}_{frame:04d}.vtu"
+        positions = trajectory.positions[frame]
+        of_points, of_cells = _stresses(stress_of, positions) if stress_of else ({}, {})
         write_vtu(
             folder / file,
-            trajectory.positions[frame],
+            positions,
             trajectory.cells,
             {
-                "displacement": trajectory.positions[frame] - trajectory.points,
+                "displacement": positions - trajectory.points,
                 "velocity": trajectory.velocities[frame],
-                **(_stresses(stress_of, trajectory.positions[frame]) if stress_of else {}),
+                **of_points,
                 **(point_data(frame) if point_data else {}),
             },
-            cell_data(frame) if cell_data else None,
+            {**of_cells, **(cell_data(frame) if cell_data else {})},
         )
         time = repr(float(trajectory.times[frame]))
         ET.SubElement(collection, "DataSet", timestep=time, part="0", file=file)
@@ -97,10 +103,18 @@ def write_vtu_series(
     return path
 
 
-def _stresses(problem: Problem, positions: Array) -> dict[str, Array]:
-    """Fields of the stress at the points; a symmetric tensor in ParaView's order."""
-    cauchy = stress(problem, positions).nodal_cauchy
-    return {
-        "stress": cauchy[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
-        "von_mises": von_mises(cauchy),
+def _stresses(problem: Problem, positions: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Fields of the points and of the cells; a symmetric tensor in ParaView's order."""
+    found = stress(problem, positions)
+    nodal = found.nodal_cauchy
+    weights = found.weights / found.weights.sum(axis=1, keepdims=True)
+    by_cell = np.einsum("cq,cqij->cij", weights, found.cauchy)
+    of_points = {
+        "stress": nodal[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
+        "von_mises": von_mises(nodal),
     }
+    of_cells = {
+        "cell_von_mises": von_mises(by_cell),
+        "smallest_volume_ratio": problem.volume_ratios(positions),
+    }
+    return of_points, of_cells

@@ -1,0 +1,44 @@
+"""What several commands of the program share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from pdcorrect.errors import InputError, require_extra
+
+FAILED, BAD_INPUT = 1, 2
+"""Exit statuses."""
+
+SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=False)]
+Frames = Annotated[
+    Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)
+]
+
+
+def say(text: str) -> None:
+    """Print a paragraph, unless it is empty."""
+    if text:
+        typer.echo(text)
+
+
+def check_models(models: Sequence[str], gate: bool) -> None:
+    """Refuse options of correctors that cannot be meant, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        If there is no corrector that could go without a gate.
+    MissingExtraError
+        If correctors cannot be run here.
+    """
+    if models:
+        require_extra("torch", "learn")
+    elif not gate:
+        raise InputError(
+            "--no-gate without --model: there is no corrector whose gate could be left out: "
+            "expected --model NAME beside it; leave --no-gate out."
+        )

@@ -1,0 +1,116 @@
+"""The command ``pdcorrect compare``.  It imports what it needs when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Optional
+
+import typer
+
+from pdcorrect.cli_parts import FAILED, Frames, SceneFile, check_models, say
+from pdcorrect.errors import require_extra
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pdcorrect.evaluate import Case, Comparison
+    from pdcorrect.scene import Scene
+    from pdcorrect.state import StepResult
+
+
+def compare(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the report.")] = Path(
+        "comparison"
+    ),
+    frames: Frames = None,
+    model: Annotated[
+        Optional[list[str]],
+        typer.Option(
+            help="Also a corrector, by name or folder; repeatable (extra 'learn'). Those of base "
+            "'best' not together with others."
+        ),
+    ] = None,
+    gate: Annotated[
+        bool, typer.Option(help="Of correctors: let the default gate refuse doubtful corrections.")
+    ] = True,
+    hex27: Annotated[
+        bool, typer.Option("--hex27", help="Also 27-node elements on the coarse mesh.")
+    ] = False,
+    vtu: Annotated[
+        bool,
+        typer.Option(
+            "--vtu", help="Also write all runs as VTU, with stress, and PVD for ParaView."
+        ),
+    ] = False,
+    figures: Annotated[bool, typer.Option(help="Draw figures (extra 'view').")] = True,
+) -> None:
+    """Run coarse, best coarse, intermediate and fine PD and coarse Newton; report error and time.
+
+    The fine run has the element of the best coarse model; with correctors the one that they
+    have learned from, and the coarse models that they correct are compared too.  Exit status 1 if
+    a solver failed; the report then has the others, unless it was the fine run.
+    """
+    from pdcorrect import report
+    from pdcorrect.evaluate import cases_for
+    from pdcorrect.replacement import make_folder
+    from pdcorrect.scene import Scene
+
+    if figures:
+        require_extra("pyvista", "view")
+        require_extra("matplotlib", "view")
+    check_models(model or [], gate)
+    loaded = Scene.load(scene)
+    cases = cases_for(loaded, model or [], gate=gate, hex27=hex27)
+    make_folder(output / report.VTU if vtu else output)
+    comparison = _run(loaded, frames or loaded.time.frames, cases)
+    _print_table(comparison)
+    for note in report.notes(comparison):
+        say("- " + note)
+    say("drawing the figures ..." if figures else "")
+    say(f"report: {report.write_report(comparison, output, draw=figures)}")
+    if vtu:
+        say("writing the runs for ParaView ...")
+        for path in report.write_series(comparison, output):
+            say(f"wrote {path}")
+    if comparison.failures:
+        raise typer.Exit(FAILED)
+
+
+def _run(scene: Scene, count: int, cases: Sequence[Case]) -> Comparison:
+    """The comparison, with a bar for each case."""
+    from pdcorrect import evaluate
+    from pdcorrect.progress import progress_bar
+
+    with progress_bar() as progress:
+        tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases[::-1]}
+        begun: list[str] = []
+
+        def on_step(label: str, frame: int, result: StepResult) -> None:
+            if frame == 1:
+                for earlier in begun[-1:]:  # which may have failed
+                    progress.stop_task(tasks[earlier])
+                begun.append(label)
+                progress.start_task(tasks[label])
+            progress.update(tasks[label], completed=frame)
+
+        return evaluate.compare(scene, count, cases, on_step)
+
+
+def _print_table(comparison: Comparison) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    from pdcorrect import report
+
+    table = Table(
+        title=comparison.scene.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
+    )
+    for heading in report.HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    names = table.columns[0]
+    names.justify, names.no_wrap, names.overflow = "left", False, "fold"
+    for row in report.table(comparison):
+        table.add_row(*row)
+    Console().print(table)

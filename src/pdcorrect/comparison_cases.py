@@ -1,0 +1,200 @@
+"""What `compare` runs: solvers on meshes with models of the body, each under its label."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from pdcorrect.errors import InputError
+from pdcorrect.fem.coarse_models import BASES, coarse_model
+from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.scene import Scene, best_coarse
+
+
+@dataclass(frozen=True)
+class Case:
+    """One solver on one mesh.
+
+    Attributes
+    ----------
+    label : str
+    solver : str
+        "pd" or "newton".
+    refine : int
+    base : {"plain", "best", "total-mass"}
+        As of `coarse_model`; "best" on any mesh, "total-mass" on the coarse one only.
+    model : str or None
+        Name or folder of a corrector of the steps.
+    gate : bool
+        Whether a default `Gate` lets the corrector pass.
+    element : str or None
+        In place of the scene's, on the scene's cells; of base "plain" only.
+    """
+
+    label: str
+    solver: str
+    refine: int
+    base: str = "plain"
+    model: str | None = None
+    gate: bool = True
+    element: str | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is the scene itself on the coarse mesh."""
+        unchanged = self.base == "plain" and self.model is None and self.element is None
+        return self.refine == 1 and unchanged
+
+    def problem(self, scene: Scene) -> Problem:
+        """What is stepped.
+
+        Raises
+        ------
+        InputError
+            If there is no such base on its mesh, or an element is given with another base.
+        """
+        if self.element is not None:
+            return self._with_element(scene)
+        if self.refine == 1:
+            return coarse_model(scene, self.base)
+        if self.base not in ("plain", "best"):
+            raise InputError(
+                f"{self.label}: base {self.base!r} refined {self.refine} times: expected 'plain' "
+                "or 'best'."
+            )
+        return discretise(best_coarse(scene) if self.base == "best" else scene, self.refine)
+
+    def _with_element(self, scene: Scene) -> Problem:
+        """Mass by the scene's rule, but "per-node" is for nodes at corners only."""
+        if self.base != "plain":
+            raise InputError(
+                f"{self.label}: element {self.element!r} with base {self.base!r}: expected base "
+                "'plain', or no element."
+            )
+        mass = "averaged" if scene.solver.mass == "per-node" else scene.solver.mass
+        return discretise(scene, self.refine, mass, self.element)
+
+
+CASES = (
+    Case("fine PD", "pd", 4),
+    Case("intermediate PD", "pd", 2),
+    Case("coarse PD", "pd", 1),
+    Case("coarse Newton", "newton", 1),
+)
+"""Of a scene as it is; the first case is the reference of all errors."""
+
+HEX27 = Case("coarse PD, hex27", "pd", 1, element="hex27")
+"""The scene's cells with 27 nodes each."""
+
+_FINE_BEST = replace(CASES[0], label="fine best PD", base="best")
+"""The reference with the better element."""
+
+_COARSE = {"best": "best coarse PD", "total-mass": "coarse PD, total mass"}
+"""Labels of coarse models by their base."""
+
+
+def cases_for(
+    scene: Scene, models: Sequence[str] = (), *, gate: bool = True, hex27: bool = False
+) -> tuple[Case, ...]:
+    """What `compare` runs by default: `cases_with`, and always the best coarse model.
+
+    The reference is the fine mesh with the better element, that of the best coarse model; with
+    correctors it is what they learned from.  A scene that has no such model, see `without_best`,
+    has its own element on the fine mesh.
+
+    Parameters
+    ----------
+    scene : Scene
+    models : sequence of str
+        Names or folders of correctors.
+    gate : bool
+        Of the correctors.
+    hex27 : bool
+        Also 27-node elements on the coarse mesh.
+
+    Raises
+    ------
+    InputError
+        As `cases_with`; or if the scene's own element has 27 nodes.
+    """
+    reference, *others = cases_with(models, gate=gate)
+    best = Case(_COARSE["best"], "pd", 1, "best")
+    if without_best(scene) is None:
+        if not models:
+            reference = _FINE_BEST
+        if best not in others:
+            others.insert(len(CASES) - 1, best)
+    if hex27:
+        if scene.solver.element == HEX27.element:
+            raise InputError(
+                "hex27: the scene's own element is hex27, and coarse PD has it: expected a scene "
+                "of another element; leave the option out."
+            )
+        others.append(HEX27)
+    return (reference, *others)
+
+
+def without_best(scene: Scene) -> str | None:
+    """Why a scene has no best coarse model beside its own; None if it has one.
+
+    Where the scene itself cannot be discretised the reason is that of the scene.
+    """
+    best, own = best_coarse(scene), scene.solver
+    if (own.element, own.mass) == (best.solver.element, best.solver.mass):
+        return "the scene's own element and mass are those of the best coarse model"
+    if own.element == HEX27.element:
+        return "it has no nodes where the scene's 27-node elements have some"
+    try:
+        discretise(best)
+    except InputError as error:
+        return str(error).rstrip(".")
+    return None
+
+
+def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
+    """The cases of a scene as it is, and correctors.
+
+    Those of the best coarse model have learned references with its element: all errors
+    are then distances from such a one.  The coarse models that they correct are among the cases.
+    `cases_for` adds what a scene affords besides.
+
+    Parameters
+    ----------
+    models : sequence of str
+        Names or folders.
+    gate : bool
+        Of the correctors.
+
+    Raises
+    ------
+    InputError
+        If there is no such model, or they learned from references of unlike elements.
+    """
+    if not models:
+        return CASES
+    from pdcorrect.corrector.model_io import load_model, model_folder, unlike_ends
+
+    names = unlike_ends([model_folder(model).resolve() for model in models])
+    bases = [load_model(model).base for model in models]
+    for name, base in zip(names, bases, strict=True):
+        if base not in BASES:
+            raise InputError(f"{name}: corrects {base!r}: expected one of {', '.join(BASES)}.")
+    reference, *others = CASES
+    if "best" in bases:
+        if set(bases) != {"best"}:
+            raise InputError(
+                f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: "
+                "expected of 'best' or of the others, as their references have unlike elements; "
+                "compare the others apart."
+            )
+        reference = _FINE_BEST
+    without = "" if gate else ", no gate"
+    return (
+        reference,
+        *others,
+        *(Case(_COARSE[b], "pd", 1, b) for b in dict.fromkeys(bases) if b != "plain"),
+        *(
+            Case(f"hybrid {name}{without}", "pd", 1, base, model, gate)
+            for name, base, model in zip(names, bases, models, strict=True)
+        ),
+    )

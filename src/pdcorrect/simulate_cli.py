@@ -1,0 +1,214 @@
+"""The command ``pdcorrect simulate``.  It imports what it needs when it runs."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Optional
+
+import typer
+
+from pdcorrect.cli_parts import Frames, SceneFile, check_models, say
+from pdcorrect.errors import InputError
+from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated
+
+if TYPE_CHECKING:
+    from pdcorrect.scene import Scene
+    from pdcorrect.solvers.rollout import StepLog
+    from pdcorrect.state import Stepper, Trajectory
+
+
+class SolverName(StrEnum):
+    """Choices of --solver."""
+
+    pd = "pd"
+    newton = "newton"
+
+
+def simulate(
+    scene: SceneFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
+    refine: Annotated[int, typer.Option(help="Cut each coarse cell into REFINE^3.", min=1)] = 1,
+    solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
+    model: Annotated[
+        Optional[str],
+        typer.Option(
+            help="Correct the steps by this model, a name or a folder, on the coarse model that it "
+            "is for (extra 'learn')."
+        ),
+    ] = None,
+    gate: Annotated[
+        bool, typer.Option(help="Of the corrector: let the default gate refuse its corrections.")
+    ] = True,
+    frames: Frames = None,
+    vtu: Annotated[
+        Optional[Path],
+        typer.Option(help="Also write VTU files, with stress, and a PVD into this folder."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
+    resume: Annotated[
+        bool, typer.Option(help="Continue an existing output file after its last complete frame.")
+    ] = False,
+) -> None:
+    """Run one scene and write its trajectory, frame by frame."""
+    from pdcorrect.io.trajectory import load_trajectory
+    from pdcorrect.replacement import make_folder
+    from pdcorrect.scene import Scene
+
+    if resume and overwrite:
+        raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
+    check_models([] if model is None else [model], gate)
+    if model is not None:
+        _check_corrected(model, solver, refine)
+    loaded = Scene.load(scene)
+    if vtu:
+        make_folder(vtu)
+    stepper = _make_stepper(loaded, solver, refine, model, gate)
+    count = frames or loaded.time.frames
+    earlier = _frames_so_far(output, stepper, count) if resume else None
+    log = _run(stepper, count, output, earlier, overwrite)
+    before = 0 if earlier is None else len(earlier)
+    if before < count:
+        _summary(log.arrays(), stepper, before)
+        say(f"wrote {output}")
+    if vtu:
+        from pdcorrect.io.vtk import write_vtu_series
+
+        series = write_vtu_series(load_trajectory(output), vtu, stress_of=stepper.problem)
+        say(f"wrote {series}")
+
+
+def _check_corrected(model: str, solver: SolverName, refine: int) -> None:
+    """Refuse what a corrector is not for."""
+    if refine != 1:
+        raise InputError(
+            f"--refine {refine} with --model {model}: a corrector is for the scene's coarse mesh: "
+            "expected --refine 1; leave it out, or run the finer mesh without a model."
+        )
+    if solver is not SolverName.pd:
+        raise InputError(
+            f"--solver {solver} with --model {model}: a corrector is run on projective dynamics: "
+            "expected --solver pd; leave it out, or run Newton without a model."
+        )
+
+
+def _make_stepper(
+    scene: Scene, solver: SolverName, refine: int, model: str | None, gate: bool
+) -> Stepper:
+    if model is not None:
+        from pdcorrect.corrector.released import hybrid_of
+
+        return hybrid_of(scene, model, gate=gate).prepare()
+    from pdcorrect.evaluate import make_stepper
+
+    return make_stepper(scene, solver.value, refine)
+
+
+def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | None:
+    """What a file holds of the run to ``count`` frames, under the scene that is now run."""
+    from dataclasses import replace
+
+    from pdcorrect.io.trajectory import load_trajectory
+    from pdcorrect.solvers.resume import check_same_run
+
+    if not output.exists():
+        say(f"{output} does not exist yet: starting from the beginning")
+        return None
+    run = load_trajectory(output, salvage=True)
+    check_same_run(stepper, run, str(output))
+    if len(run) < count:
+        say(f"{output} holds {len(run)} of {count} frames: continuing")
+        return replace(run, scene_toml=stepper.problem.scene.to_toml())
+    say(f"{output} holds {len(run)} frames already, {count} wanted: nothing to do")
+    return run
+
+
+def _run(
+    stepper: Stepper, count: int, output: Path, earlier: Trajectory | None, overwrite: bool
+) -> StepLog:
+    """Step to frame ``count`` and write each frame; an interruption ends the program."""
+    from pdcorrect.io.trajectory import TrajectoryWriter
+    from pdcorrect.progress import progress_bar
+    from pdcorrect.solvers.resume import continue_from
+    from pdcorrect.solvers.rollout import StepLog, march, run_attributes
+
+    problem = stepper.problem
+    if earlier is None:
+        state, done, log = problem.rest_state(), 0, StepLog()
+        writer = TrajectoryWriter(
+            output, problem.positions, problem.cells, state, overwrite=overwrite,
+            scene_toml=problem.scene.to_toml(), attributes=run_attributes(stepper),
+        )  # fmt: skip
+    else:
+        state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
+        writer = TrajectoryWriter.resume(output, earlier)
+    with writer, progress_bar(hidden=done >= count) as progress:
+        task = progress.add_task(problem.scene.name, total=count, completed=done)
+        try:
+            for result, elapsed in march(stepper, max(0, count - done), state=state):
+                writer.append(result, elapsed)
+                log.add(result, elapsed)
+                progress.advance(task)
+        except (KeyboardInterrupt, Terminated) as stop:
+            typer.echo(
+                f"stopped: {writer.steps} of {count} frames are in {output}; --resume continues",
+                err=True,
+            )
+            ended = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
+            raise typer.Exit(ended) from None
+    return log
+
+
+def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
+    """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
+    from pdcorrect.report_notes import inverted_frames
+
+    count, seconds = len(stats["seconds"]), stats["seconds"].sum()
+    problem, status = stepper.problem, stats["status"].tolist()
+    ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
+    ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
+    say(
+        f"{ran} of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
+        f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
+        f"{seconds:.2f} s: {1e3 * seconds / count:.3g} ms a frame"
+    )
+    say(", ".join(f"{k}: {v}" for k, v in stepper.describe().items()))
+    say(
+        f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
+        f"{stats['iterations'].max()}; frames: {ends}"
+    )
+    say(
+        f"worst residual {stats['residual'].max():.2g} N, worst estimated distance from the step's "
+        f"solution {stats['error_estimate'].max():.2g} m"
+    )
+    say(
+        f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
+        f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
+        f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
+    )
+    say(inverted_frames(stats, problem.time_step) or "")
+    if "refused" in stats:
+        _corrections(stats, stepper)
+
+
+def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
+    """How large the corrections of a hybrid were, and which were refused and why."""
+    from pdcorrect.corrector.gate import Reason
+    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.report_notes import refused_corrections
+
+    say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
+    for sentence in refused_corrections(stats):
+        say(sentence)
+    if isinstance(stepper, HybridStepper) and (stats["gate"] == Reason.BODY).any():
+        measures = [f"{name} by {excess:.2g}" for name, excess in stepper.body_excess().items()]
+        say(f"Measures of the body beyond their range in training: {', '.join(measures)}.")
+    if stats["refused"].all():
+        say("This is no corrected run: its steps are those of the coarse model alone.")
+
+
+def _other_work(stats: dict[str, Any]) -> str:
+    """Work of moving clamps and loss to damping over a run, where there is any."""
+    named = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
+    sums = {text: stats[name].sum() for name, text in named.items() if stats[name].any()}
+    return "".join(f", {text} {total:.4g} J" for text, total in sums.items())

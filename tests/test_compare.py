@@ -1,0 +1,242 @@
+"""What `compare` shows: the best coarse model, its reference, refused correctors, VTU files."""
+
+import csv
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from conftest import beam
+from pdcorrect import cli, report, report_notes
+from pdcorrect.comparison_cases import HEX27, cases_for, without_best
+from pdcorrect.errors import InputError
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+MODEL = "torsion-exact-compact"
+
+
+@pytest.fixture
+def thick():
+    """A small beam that is nowhere one cell thick."""
+    return beam((3, 2, 2), time={"frames": 2})
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    """A scene that a corrector's gate knows the body of, and no step."""
+    scene = pc.Scene.load(EXAMPLES / "unseen_cross.toml")
+    return scene.with_changes(material={"young": 1e7}, time={"frames": 2})
+
+
+def labels(cases):
+    return [case.label for case in cases]
+
+
+def test_the_best_coarse_model_is_always_there_and_the_reference_has_its_element(thick):
+    found = pc.compare(thick)
+    assert found.reference == "fine best PD"
+    assert labels(found.rows)[2] == "best coarse PD"
+    assert found.runs["fine best PD"].attributes["element"] == "hex8-bubble-mean"
+    by_hand = pc.restrict(
+        pc.rollout(pc.ProjectiveDynamics(pc.discretise(pc.best_coarse(thick), 4))),
+        to=pc.discretise(thick),
+    )
+    own = pc.rollout(pc.ProjectiveDynamics(pc.coarse_model(thick, "best")))
+    row = found.rows[2]
+    assert row.rms_error == pytest.approx(pc.metrics.rms_error(own, by_hand), rel=1e-9)
+    assert row.rms_error < 0.5 * found.rows[0].rms_error
+    assert found.rows[0].omega == 0.0  # the zero is the scene's own coarse run
+    told = " ".join(report.notes(found))
+    assert "is not the truth: it is the scene with each cell cut 4×4×4" in told
+    assert "best coarse PD: element hex8-bubble-mean, mass averaged, as the reference" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"solver": {"element": "hex8-bubble-mean", "mass": "averaged"}}, "are those of the best"),
+        ({"solver": {"element": "hex27"}}, "27-node elements"),
+        ({"material": {"energy": "volume-only"}}, "nothing resists"),
+    ],
+)
+def test_scenes_without_a_best_coarse_model_say_why(thick, changes, words):
+    scene = thick.with_changes(**changes)
+    assert words in without_best(scene)
+    assert cases_for(scene) == pc.evaluate.CASES
+    (found,) = [
+        note
+        for note in report.notes(pc.compare(scene, 1, pc.evaluate.CASES[2:3]))
+        if "no row of the best coarse model" in note
+    ]
+    assert words in found
+
+
+def test_the_same_element_with_another_mass_is_another_model(thick):
+    scene = thick.with_changes(solver={"element": "hex8-bubble-mean"})
+    assert without_best(scene) is None
+    assert "best coarse PD" in labels(cases_for(scene))
+
+
+def test_27_node_elements_are_measured_on_the_coarse_nodes(program, thick, tmp_path):
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    arguments = ("-o", tmp_path / "r", "--hex27", "--no-figures")
+    status, out, _ = program("compare", tmp_path / "scene.toml", *arguments)
+    assert status == 0
+    rows = {r["label"]: r for r in csv.DictReader((tmp_path / "r" / "report.csv").open())}
+    assert list(rows)[3] == HEX27.label == "coarse PD, hex27"
+    assert int(rows[HEX27.label]["nodes"]) == 7 * 5 * 5
+    coarse, steps = pc.discretise(thick), pc.ProjectiveDynamics
+    own, fine = (
+        pc.restrict(pc.rollout(steps(problem)), to=coarse)
+        for problem in (
+            pc.discretise(thick, element="hex27"), pc.discretise(pc.best_coarse(thick), 4)
+        )
+    )  # fmt: skip
+    error = float(rows[HEX27.label]["rms_error"])
+    assert error == pytest.approx(pc.metrics.rms_error(own, fine), rel=1e-9)
+    assert error < 0.3 * float(rows["coarse PD"]["rms_error"])
+    assert "it has 175 nodes" in out
+    record = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert [case["element"] for case in record["cases"]] == [None] * 5 + ["hex27"]
+
+
+def test_27_nodes_have_no_mass_per_node(thick):
+    heavy = thick.with_changes(solver={"mass": "per-node"})
+    assert HEX27.problem(heavy).mass_rule == "averaged"
+    assert HEX27.problem(heavy).mass.sum() == pytest.approx(3 * 2 * 2 * 0.02**3 * 1e3)
+    assert HEX27.problem(thick).mass_rule == "lumped"
+    assert not HEX27.plain
+
+
+def test_hex27_is_refused_where_it_is_the_scenes_own(program, thick, tmp_path):
+    scene = thick.with_changes(solver={"element": "hex27"})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    status, _, err = program("compare", tmp_path / "scene.toml", "-o", tmp_path / "r", "--hex27")
+    assert status == cli.BAD_INPUT
+    assert "leave the option out" in err
+    assert not (tmp_path / "r").exists()
+    with pytest.raises(InputError, match="element 'hex27' with base 'best'"):
+        dataclasses.replace(HEX27, base="best").problem(thick)
+
+
+def test_models_keep_the_reference_that_they_learned_from(thick):
+    pytest.importorskip("torch_geometric")
+    plain = cases_for(thick, ["torsion-as-published"], hex27=True)
+    assert labels(plain) == [
+        "fine PD", "intermediate PD", "coarse PD", "coarse Newton", "best coarse PD",
+        "hybrid torsion-as-published", "coarse PD, hex27",
+    ]  # fmt: skip
+    best = cases_for(thick, [MODEL])
+    assert best == pc.evaluate.cases_with([MODEL])
+    assert labels(best).count("best coarse PD") == 1
+
+
+def test_errors_from_another_element_than_the_references_are_told(thick):
+    cases = (*pc.evaluate.CASES[:1], *pc.evaluate.CASES[2:3], cases_for(thick)[4])
+    told = " ".join(report.notes(pc.compare(thick, cases=cases)))
+    assert "best coarse PD: element hex8-bubble-mean, mass averaged, unlike the reference's" in told
+    assert "(element hex8, mass lumped)" in told
+
+
+def test_a_row_whose_corrections_are_all_refused_says_so(stiff, tmp_path):
+    pytest.importorskip("torch_geometric")
+    coarse, hybrid = cases_for(stiff, [MODEL])[4:]
+    found = pc.compare(stiff, cases=(coarse, hybrid))
+    name = f"hybrid {MODEL} (all refused)"
+    assert [line[0] for line in report.table(found)] == ["best coarse PD", name]
+    text = report.write_report(found, tmp_path, draw=False).read_text()
+    assert f"| {name} |" in text
+    assert f"- hybrid {MODEL} is no corrected run" in text
+    assert "'features': the network's inputs are unlike those of its training" in text
+    np.testing.assert_array_equal(
+        found.runs[hybrid.label].positions, found.runs["best coarse PD"].positions
+    )
+
+
+def test_some_refused_corrections_are_counted_beside_the_label(stiff):
+    pytest.importorskip("torch_geometric")
+    found = pc.compare(stiff, cases=cases_for(stiff, [MODEL])[5:])
+    (label,) = found.runs
+    run = found.runs[label]
+    stats = {**run.stats, "refused": np.array([1.0, 0.0]), "gate": np.array([6.0, 0.0])}
+    fewer = dataclasses.replace(
+        found,
+        rows=(dataclasses.replace(found.rows[0], refused_frames=1),),
+        runs={label: dataclasses.replace(run, stats=stats)},
+    )
+    assert report.table(fewer)[0][0] == f"{label} (1 of 2 refused)"
+    told = report.notes(fewer)
+    assert f"{label}: 1 of 2 corrections were refused by the gate (1 by body)." in told
+    assert not any("no corrected run" in note for note in told)
+    none = dataclasses.replace(fewer, rows=(dataclasses.replace(found.rows[0], refused_frames=0),))
+    assert report.table(none)[0][0] == label
+
+
+def test_every_reason_of_a_gate_has_a_meaning():
+    gate = pytest.importorskip("pdcorrect.corrector.gate")
+    assert list(report_notes._MEANINGS) == list(gate.refusals([]))
+
+
+def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    folder = tmp_path / "report"
+    status, out, _ = program(
+        "compare", tmp_path / "scene.toml", "-o", folder, "--vtu", "--hex27", "--no-figures"
+    )
+    assert status == 0
+    names = ["best-coarse-pd", "coarse-newton", "coarse-pd", "coarse-pd-hex27", "fine-best-pd",
+             "intermediate-pd"]  # fmt: skip
+    assert sorted(path.stem for path in (folder / "vtu").glob("*.pvd")) == names
+    for name in names:
+        assert f"{name}.pvd" in out
+        frames = sorted((folder / "vtu").glob(f"{name}_[0-9]*.vtu"))
+        assert len(frames) == 3
+        data = meshio.read(frames[-1])
+        assert {"displacement", "velocity", "stress", "von_mises"} == set(data.point_data)
+        assert {"cell_von_mises", "smallest_volume_ratio"} == set(data.cell_data)
+    assert meshio.read(folder / "vtu" / "coarse-pd-hex27_0002.vtu").cells[0].type == "hexahedron27"
+
+
+def test_labels_that_become_one_file_name_are_told_apart(thick, tmp_path):
+    case = pc.evaluate.CASES[2]
+    other = dataclasses.replace(case, label="coarse, PD")
+    written = report.write_series(pc.compare(thick, 1, (case, other)), tmp_path)
+    assert [path.name for path in written] == ["coarse-pd.pvd", "coarse-pd-again.pvd"]
+
+
+def test_no_gate_without_a_model_is_refused(program, thick, tmp_path):
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    status, _, err = program("compare", tmp_path / "scene.toml", "-o", tmp_path / "r", "--no-gate")
+    assert status == cli.BAD_INPUT
+    assert "--no-gate without --model" in err
+
+
+def test_compare_with_a_model_and_no_torch_names_the_extra(program, thick, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
+    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
+    assert status == cli.BAD_INPUT
+    assert "pip install 'pdcorrect[learn]'" in err
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_long_legend_stays_in_the_picture(tmp_path, monkeypatch):
+    pytest.importorskip("matplotlib")
+    from pdcorrect.figures import curves
+
+    seen = []
+    monkeypatch.setattr(curves, "_save", lambda figure, output: seen.append(figure))
+    times = np.linspace(0.0, 1.0, 3)
+    names = [f"hybrid of a model with a long name, number {k} (all refused)" for k in range(6)]
+    curves.plot_error_over_time(dict.fromkeys(names, times), times, tmp_path / "a.png")
+    curves.plot_error_over_time({name[:6] + name[-15:]: times for name in names}, times, "b.png")
+    for figure in seen:
+        (legend,) = figure.legends
+        assert legend.get_window_extent().width <= figure.bbox.width
+        assert len(figure.legends) == 1

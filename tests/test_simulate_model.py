@@ -1,0 +1,146 @@
+"""`pdcorrect simulate --model`: what it steps, continues, refuses and says."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+from conftest import beam
+from pdcorrect import cli
+
+ROOT = Path(__file__).parent.parent
+SCENE = ROOT / "examples" / "unseen_cross.toml"
+MODEL = "torsion-exact-compact"
+
+
+@pytest.fixture
+def learned():
+    """Without PyTorch there is nothing to step by."""
+    pytest.importorskip("torch_geometric")
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(beam((4, 2, 2), time={"frames": 2}).to_toml(), encoding="utf-8")
+    return path
+
+
+def by_hand(scene, name, frames, gate):
+    model = pc.load_model(name)
+    coarse = pc.ProjectiveDynamics(pc.coarse_model(scene, model.base))
+    hybrid = pc.HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=gate)
+    return pc.rollout(hybrid, frames)
+
+
+@pytest.mark.parametrize("gated", [True, False])
+def test_the_steps_are_those_of_the_hybrid_on_its_own_base(program, learned, tmp_path, gated):
+    path, scene = tmp_path / "run.h5", pc.Scene.load(SCENE)
+    more = () if gated else ("--no-gate",)
+    command = ("simulate", SCENE, "-o", path, "--frames", 3, "--model", MODEL, *more)
+    status, out, err = program(*command, "--vtu", tmp_path / "vtu")
+    assert (status, err) == (0, "")
+    expected = by_hand(scene, MODEL, 3, pc.Gate() if gated else None)
+    run = pc.load_trajectory(path)
+    np.testing.assert_array_equal(run.positions, expected.positions)
+    assert run.attributes["element"] == "hex8-bubble-mean"
+    assert (run.attributes["gate"] == "none") == (not gated)
+    assert "corrections: at most" in out
+    assert "refused" not in out
+    assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 4
+
+
+def test_a_model_of_the_right_mass_steps_a_body_of_that_mass(program, learned, tmp_path):
+    name, path = "torsion-as-published-total-mass", tmp_path / "run.h5"
+    scene = ROOT / "examples" / "published_cross.toml"
+    assert program("simulate", scene, "-o", path, "--frames", 1, "--model", name)[0] == 0
+    expected = by_hand(pc.Scene.load(scene), name, 1, pc.Gate())
+    np.testing.assert_array_equal(pc.load_trajectory(path).positions, expected.positions)
+
+
+def test_a_hybrid_is_continued_bit_for_bit(program, learned, tmp_path):
+    whole, parts = tmp_path / "whole.h5", tmp_path / "parts.h5"
+    command = ("simulate", SCENE, "--model", MODEL)
+    assert program(*command, "-o", whole, "--frames", 4)[0] == 0
+    for frames in (2, 4):
+        status, out, _ = program(*command, "-o", parts, "--frames", frames, "--resume")
+        assert status == 0
+    assert "4 frames (2 resumed)" in out
+    one, other = pc.load_trajectory(whole), pc.load_trajectory(parts)
+    np.testing.assert_array_equal(one.positions, other.positions)
+    np.testing.assert_array_equal(one.velocities, other.velocities)
+    for name in ("correction", "refused", "gate", "iterations"):
+        np.testing.assert_array_equal(one.stats[name], other.stats[name])
+
+
+@pytest.mark.parametrize("other", [(), ("--model", MODEL, "--no-gate"), ("--model", "tiny")])
+def test_a_hybrid_is_not_continued_as_something_else(program, learned, tmp_path, other):
+    path = tmp_path / "run.h5"
+    assert program("simulate", SCENE, "-o", path, "--frames", 1, "--model", MODEL)[0] == 0
+    before = path.read_bytes()
+    status, _, err = program("simulate", SCENE, "-o", path, "--frames", 2, "--resume", *other)
+    assert status == cli.BAD_INPUT
+    assert "its frames are of another run" in err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--model", MODEL, "--refine", 2), "expected --refine 1"),
+        (("--model", MODEL, "--solver", "newton"), "expected --solver pd"),
+        (("--no-gate",), "--no-gate without --model"),
+        (("--model", "nothing"), "model 'nothing': not in"),
+        (("--model", "./nothing"), "expected a folder with a model"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_before_the_work(
+    program, learned, scene_file, tmp_path, more, words
+):
+    path = tmp_path / "run.h5"
+    status, out, err = program("simulate", scene_file, "-o", path, *more)
+    assert status == cli.BAD_INPUT
+    assert err.startswith("error: ")
+    assert words in err
+    assert "Traceback" not in out + err
+    assert not path.exists()
+
+
+def test_a_model_of_an_unknown_base_is_named(learned, tmp_path, monkeypatch):
+    from pdcorrect.corrector import released
+
+    shutil.copytree(ROOT / "models" / MODEL, tmp_path / "odd")
+    kind = type(pc.load_model(tmp_path / "odd"))
+    monkeypatch.setattr(kind, "base", "coarsest")
+    with pytest.raises(pc.errors.InputError, match="odd: corrects 'coarsest': expected one of"):
+        released.hybrid_of(pc.Scene.load(SCENE), tmp_path / "odd")
+
+
+def test_without_torch_the_extra_is_named(program, scene_file, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    path = tmp_path / "run.h5"
+    status, _, err = program("simulate", scene_file, "-o", path, "--model", MODEL)
+    assert status == cli.BAD_INPUT
+    assert "pip install 'pdcorrect[learn]'" in err
+    assert not path.exists()
+    assert program("simulate", scene_file, "-o", path)[0] == 0  # which needs no torch
+
+
+def test_a_run_whose_corrections_are_refused_says_so_and_why(
+    program, learned, scene_file, tmp_path
+):
+    path = tmp_path / "run.h5"
+    status, out, _ = program("simulate", scene_file, "-o", path, "--model", MODEL)
+    assert status == 0
+    assert "2 of 2 corrections were refused by the gate (2 by body)" in out
+    assert "'body': the body at rest is unlike those of its training" in out
+    assert "Measures of the body beyond their range in training: " in out
+    assert "This is no corrected run" in out
+    run = pc.load_trajectory(path)
+    best = pc.discretise(pc.best_coarse(pc.Scene.load(scene_file)))
+    np.testing.assert_array_equal(run.positions, pc.rollout(pc.ProjectiveDynamics(best)).positions)
+    assert json.loads(run.attributes["gate"])["body"] == 0.3
