@@ -173,13 +173,18 @@ def test_the_error_estimate_is_within_ten_times_of_the_error(motion, poisson, me
 
 
 @pytest.mark.parametrize(
-    ("cells", "poisson", "time_step", "young", "tolerance"),
-    [((100, 2, 2), 0.45, 0.1, 1e8, 1e-3), ((100, 1, 1), 0.49, 0.1, 1e7, 1e-2)],
+    ("cells", "poisson", "young", "tolerance", "least"),
+    [
+        ((100, 2, 2), 0.45, 1e8, 1e-3, 0.1),
+        ((100, 1, 1), 0.49, 1e7, 1e-4, 0.5),
+        ((100, 1, 1), 0.49, 1e7, 1e-2, 0.03),
+    ],
 )
 def test_the_estimate_holds_for_slender_beams_and_long_steps(
-    cells, poisson, time_step, young, tolerance
+    cells, poisson, young, tolerance, least
 ):
-    scene = beam(cells, poisson=poisson, material={"young": young}, time={"step": time_step})
+    """One Newton step is short of the minimum where a loose tolerance stops the descent early."""
+    scene = beam(cells, poisson=poisson, material={"young": young}, time={"step": 0.1})
     problem = pc.discretise(scene)
     state = problem.rest_state()
     for _ in range(3):
@@ -187,7 +192,7 @@ def test_the_estimate_holds_for_slender_beams_and_long_steps(
         exact = pc.Newton(problem, tolerance=1e-11)(state)
         error = largest_displacement(result.state.positions - exact.state.positions)
         assert result.status.ok
-        assert 0.1 < result.error_estimate / error < 10
+        assert least < result.error_estimate / error < 10
         state = exact.state
 
 
