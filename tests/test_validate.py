@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 
 import pytest
@@ -205,7 +206,9 @@ def test_an_unknown_case_or_home_is_bad_input(program, home, monkeypatch, tmp_pa
     ("entry", "message"),
     [
         ({"value": 1.0, "source": "x"}, "a: expected value and tolerance together"),
-        ({"source": "x"}, "expected value and tolerance, or status"),
+        ({"source": "x"}, "expected value and tolerance, or at_least"),
+        ({"value": 1.0, "tolerance": 0.1, "at_most": 2.0, "source": "x"}, "or status"),
+        ({"at_most": 1.0, "at_least": 2.0, "source": "x"}, "expected at_least below at_most"),
         ({"value": 1.0, "tolerance": 0.1, "status": ["A"], "source": "x"}, "or status"),
         ({"value": 1.0, "tolerance": -0.1, "source": "x"}, "a.tolerance: "),
         ({"value": 1.0, "tolerance": 0.1}, "a.source: "),
@@ -219,6 +222,21 @@ def test_expectations_without_a_meaning_are_refused(program, home, entry, messag
     assert status == 2
     assert message in err
     assert "expected.json" in err
+
+
+@pytest.mark.parametrize(
+    ("bounds", "told", "fine"),
+    [
+        ({"at_least": 1.0}, "at least 1", [1.0, 1.01, 1e9]),
+        ({"at_most": 1.0}, "at most 1", [-1e9, 0.49, 0.5, 1.0]),
+        ({"at_least": 0.5, "at_most": 1.0}, "at least 0.5, at most 1", [0.5, 1.0]),
+    ],
+)
+def test_a_figure_may_be_bounded_on_either_side(bounds, told, fine):
+    aim = Expectation(source="x", **bounds)
+    assert aim.describe() == told
+    assert [v for v in (-1e9, 0.49, 0.5, 1.0, 1.01, 1e9) if aim.met_by(v)] == fine
+    assert not any(aim.met_by(v) for v in (math.nan, None, "CONVERGED"))
 
 
 def test_expectations_that_are_no_json_are_refused(home):

@@ -63,12 +63,14 @@ class Outcome:
 
 
 class Expectation(Strict):
-    """What a figure has to be: a value and its tolerance, or one of some statuses.
+    """What a figure has to be: a value and its tolerance, within bounds, or one of some statuses.
 
     Attributes
     ----------
     value, tolerance
         The figure may differ from the value by the tolerance at most.
+    at_least, at_most
+        Bounds, either or both.
     status
         Texts of which the figure has to be one.
     source
@@ -83,6 +85,8 @@ class Expectation(Strict):
 
     value: Number | None = None
     tolerance: NonNegative | None = None
+    at_least: Number | None = None
+    at_most: Number | None = None
     status: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
     source: Annotated[str, Field(min_length=1)]
     quick: bool = False
@@ -92,16 +96,33 @@ class Expectation(Strict):
     def _one_kind(self) -> Expectation:
         if (self.value is None) != (self.tolerance is None):
             raise ValueError("expected value and tolerance together")
-        if (self.value is None) == (self.status is None):
-            raise ValueError("expected value and tolerance, or status")
+        if [self.value is None, self._bounds is None, self.status is None].count(False) != 1:
+            raise ValueError(
+                "expected value and tolerance, or at_least, at_most or both, or status"
+            )
+        if self._bounds and self._bounds[0] > self._bounds[1]:
+            raise ValueError("expected at_least below at_most")
         return self
 
+    @property
+    def _bounds(self) -> tuple[float, float] | None:
+        if self.at_least is None and self.at_most is None:
+            return None
+        return (
+            -math.inf if self.at_least is None else self.at_least,
+            math.inf if self.at_most is None else self.at_most,
+        )
+
     def met_by(self, figure: Figure | None) -> bool:
-        """Whether a figure is within the tolerance, or one of the statuses."""
+        """Whether a figure is within the tolerance or the bounds, or one of the statuses."""
         if self.status is not None:
             return figure in self.status
-        if self.value is None or self.tolerance is None or not isinstance(figure, (int, float)):
+        if not isinstance(figure, (int, float)):
             return False
+        if self._bounds:
+            return self._bounds[0] <= figure <= self._bounds[1]
+        assert self.value is not None
+        assert self.tolerance is not None
         return abs(figure - self.value) <= self.tolerance
 
     def allows(self, figure: Figure | None) -> bool:
@@ -112,6 +133,11 @@ class Expectation(Strict):
         """What is expected, as text."""
         if self.status is not None:
             return " or ".join(self.status)
+        told = {"at least": self.at_least, "at most": self.at_most}
+        if self._bounds:
+            return ", ".join(
+                f"{how} {bound:.6g}" for how, bound in told.items() if bound is not None
+            )
         return f"{self.value:.6g} ± {self.tolerance:.3g}"
 
 

@@ -141,19 +141,21 @@ def to_csv(sections: Sequence[Section]) -> str:
     """All figures of all cases, one line each, with what was expected."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(
-        ["case", "figure", "found", "value", "tolerance", "status", "source", "as expected"]
-    )
+    writer.writerow(["case", "figure", "found", *_AIM, "status", "source", "as expected"])
     for one in sections:
         for name, found in one.record.figures.items():
             aim = one.case.expected.get(name)
-            told = ("", "", "", "", "")
+            told = [""] * (len(_AIM) + 3)
             if aim:
-                status = " or ".join(aim.status or ())
+                numbers = [_number(getattr(aim, key)) for key in _AIM]
                 good = "no" if name in one.record.outside else "yes"
-                told = (_number(aim.value), _number(aim.tolerance), status, aim.source, good)
+                told = [*numbers, " or ".join(aim.status or ()), aim.source, good]
             writer.writerow([one.case.name, name, found, *told])
     return buffer.getvalue()
+
+
+_AIM = ("value", "tolerance", "at_least", "at_most")
+"""Numbers of an expectation."""
 
 
 def _number(value: float | None) -> str:
