@@ -505,3 +505,16 @@ def test_compare_with_a_model_that_is_not_there_is_bad_input(program, scene_file
     assert status == cli.BAD_INPUT
     assert "nothing" in err
     assert not (tmp_path / "r").exists()
+
+
+def test_compiling_is_told_of_once(tmp_path):
+    """In a process of its own, whose kernels are not on disk."""
+    code = (
+        "from numba import njit; from pdcorrect.cli_parts import tell_of_compiling\n"
+        "tell_of_compiling(); tell_of_compiling()\n"
+        "for power in (2, 3):\n"
+        "    njit(lambda x, p=power: x**p)(2.0)\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stderr.count("compiling kernels") == 1
+    assert ran.stdout == ""

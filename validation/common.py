@@ -23,7 +23,15 @@ from pdcorrect.validation.running import run_case
 Array = NDArray[np.float64]
 Figures = dict[str, float]
 
-ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
+ELEMENT_STYLES = {
+    "hex8": ("#000000", "o"),
+    "hex8-mean": ("#e69f00", "s"),
+    "hex8-bubble": ("#0072b2", "D"),
+    "hex8-bubble-mean": ("#d55e00", "^"),
+    "hex27": ("#009e73", "v"),
+}
+"""Colour and mark of each element in pictures."""
+ELEMENTS = tuple(ELEMENT_STYLES)
 STATIC = {"step": 1.0, "frames": 1, "integrator": "quasi-static"}
 SMALL = 1e-4
 """Deflection over length at which the geometric nonlinearity is far below 0.1 %."""

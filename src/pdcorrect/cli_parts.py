@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Optional
 
@@ -23,6 +24,31 @@ def say(text: str) -> None:
     """Print a paragraph, unless it is empty."""
     if text:
         typer.echo(text)
+
+
+@cache
+def tell_of_compiling() -> None:
+    """Say on standard error, once in this process, that numba compiles, if it does."""
+    from numba.core import event
+
+    class Told(event.Listener):  # type: ignore[misc]
+        """Hears of each kernel that was not on disk, and speaks of the first."""
+
+        def on_start(self, event: object) -> None:
+            if not self.done:
+                typer.echo(
+                    "compiling kernels, which takes up to a minute or two; they are kept on disk "
+                    "for the next time",
+                    err=True,
+                )
+            self.done = True
+
+        def on_end(self, event: object) -> None:
+            """Nothing to say."""
+
+        done = False
+
+    event.register("numba:compile", Told())  # type: ignore[no-untyped-call]
 
 
 def check_models(models: Sequence[str], gate: bool) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from pdcorrect.cli_parts import FAILED, Frames, SceneFile, check_models, say
+from pdcorrect.cli_parts import FAILED, Frames, SceneFile, check_models, say, tell_of_compiling
 from pdcorrect.errors import require_extra
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def compare(
     loaded = Scene.load(scene)
     cases = cases_for(loaded, model or [], gate=gate, hex27=hex27)
     make_folder(output / report.VTU if vtu else output)
+    tell_of_compiling()
     comparison = _run(loaded, frames or loaded.time.frames, cases)
     _print_table(comparison)
     for note in report.notes(comparison):

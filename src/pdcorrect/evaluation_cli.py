@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from pdcorrect.cli_parts import tell_of_compiling
+
 if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
     from pdcorrect.evaluation.candidates import SavedCandidate
@@ -62,6 +64,7 @@ def evaluate(
         require_extra("matplotlib", "view")
     refuses = DEFAULT_GATE if gate else None
     saved = saved_candidates(models, device, gate=refuses)
+    tell_of_compiling()
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("evaluating", total=None)
         found = run(

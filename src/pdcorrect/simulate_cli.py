@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli_parts import Frames, SceneFile, check_models, say
+from pdcorrect.cli_parts import Frames, SceneFile, check_models, say, tell_of_compiling
 from pdcorrect.errors import InputError
 from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated
 
@@ -63,6 +63,7 @@ def simulate(
     loaded = Scene.load(scene)
     if vtu:
         make_folder(vtu)
+    tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, model, gate)
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None

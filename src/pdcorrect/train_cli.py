@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from pdcorrect.cli_parts import tell_of_compiling
+
 if TYPE_CHECKING:
     from pdcorrect.training.progress import Progress
 
@@ -64,6 +66,7 @@ def train(
             shard_paths(folder, evaluate)  # refused now, not when the training has ended
             if not incomplete:
                 check_whole(folder, [evaluate])
+    tell_of_compiling()
     with joined(device) as (world, own):
         training = Training(
             loaded, data, output, device=own, resume=resume, incomplete=incomplete, world=world,

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from pdcorrect.cli_parts import tell_of_compiling
+
 if TYPE_CHECKING:
     from pdcorrect.validation.cases import ValidationCase
     from pdcorrect.validation.page import Section
@@ -55,6 +57,7 @@ def validate(
         require_extra("pyvista", "view")
         require_extra("matplotlib", "view")
     chosen = [case for case in found if case.has_quick_part or not quick]
+    tell_of_compiling()
     sections = _run(chosen, output, quick, again, figures)
     for section in sections:
         _tell(section)

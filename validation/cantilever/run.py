@@ -155,7 +155,11 @@ def _twist_rate(problem: pc.Problem, positions: np.ndarray, length: float) -> fl
     return float(np.polyfit(places, angles, 1)[0])
 
 
-def compute(elements: tuple[str, ...] = common.ELEMENTS, meshes: tuple[int, ...] = (1, 2, 4)):
+MESHES = (1, 2, 4)
+"""Cells through the thickness."""
+
+
+def compute(elements: tuple[str, ...] = common.ELEMENTS, meshes: tuple[int, ...] = MESHES):
     """All figures: ratios to theory by load, element and cells through the thickness."""
     figures: common.Figures = {}
     theory = timoshenko_frequencies()
@@ -182,9 +186,48 @@ def quick_figures() -> common.Figures:
     return figures | {"torsion, free to warp, hex27 4x4": torsion("hex27", 4, True, SIDE)}
 
 
+PANELS = ("end shear", "gravity", "frequency 1", "frequency 3", "torsion, free to warp")
+
+
+def draw(figures: common.Figures, path: Path) -> None:
+    """Ratios to beam theory against cells through the thickness, a panel a load."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(PANELS))
+    for axis, what in zip(panels, PANELS, strict=True):
+        for k, (element, (colour, mark)) in enumerate(common.ELEMENT_STYLES.items()):
+            ratios = [figures[f"{what}, {element} {n}x{n}"] for n in MESHES]
+            places = [n * (1.0 + 0.03 * (k - 2)) for n in MESHES]  # beside each other
+            axis.plot(places, ratios, color=colour, marker=mark, markersize=5, label=element)
+        axis.axhline(1.0, color="0.4", linewidth=0.8)
+        axis.set(xscale="log", title=what, xlabel="cells through the thickness")
+        axis.set_xticks(MESHES, [str(n) for n in MESHES])
+        axis.minorticks_off()
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("ratio to beam theory")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False
+    )
+    figure.savefig(path, dpi=150)
+
+
+CAPTION = (
+    "Deflections, frequencies and torsional stiffness over beam theory's against the number of "
+    "cells through the thickness; marks of one number of cells stand side by side."
+)
+
+
 def case(quick: bool) -> common.Outcome:
-    """The case's outcome."""
-    return common.Outcome(quick_figures() if quick else compute())
+    """The case's outcome; the picture needs all figures."""
+    if quick:
+        return common.Outcome(quick_figures())
+    figures = compute()
+    picture = common.Picture("ratios", CAPTION, lambda path: draw(figures, path))
+    return common.Outcome(figures, pictures=(picture,))
 
 
 if __name__ == "__main__":

@@ -108,10 +108,54 @@ def compute(
     return figures
 
 
+PUBLISHED = {
+    "plane stress": (23.96, 23.96),
+    "plane strain": (32.20, 32.28),
+    "near incompressible": (27.35, 27.56),
+    "neo-Hookean": (6.9, 6.9),
+}
+"""Least and largest of the values that others give, by problem; sources in the README."""
+
+
+def draw(figures: common.Figures, path: Path) -> None:
+    """Lifts against cells along an edge, a panel a problem, with the published values."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(PROBLEMS))
+    for axis, problem in zip(panels, PROBLEMS, strict=True):
+        for element, (colour, mark) in common.ELEMENT_STYLES.items():
+            lifts = [figures[f"{problem}, {element}, {n}x{n}"] for n in SIZES]
+            axis.plot(SIZES, lifts, color=colour, marker=mark, markersize=5, label=element)
+        least, largest = PUBLISHED[problem]
+        axis.axhspan(least, largest, color="0.6", linewidth=1.2, label="published")
+        axis.set(xscale="log", title=problem, xlabel="cells along an edge")
+        axis.set_xticks(SIZES, [str(n) for n in SIZES])
+        axis.minorticks_off()
+        axis.set_ylim(bottom=0.0)
+        axis.grid(alpha=0.3)
+        axis.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("lift, units of length")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False
+    )
+    figure.savefig(path, dpi=150)
+
+
+CAPTION = (
+    "Lift of the loaded edge against the number of cells along it, and published values (gray); "
+    "gaps are meshes without a stable equilibrium."
+)
+
+
 def case(quick: bool) -> common.Outcome:
-    """The case's outcome."""
+    """The case's outcome; the picture needs all figures."""
     if not quick:
-        return common.Outcome(compute())
+        figures = compute()
+        picture = common.Picture("convergence", CAPTION, lambda path: draw(figures, path))
+        return common.Outcome(figures, pictures=(picture,))
     figures = compute(("plane strain", "near incompressible"), ("hex8",), (4, 8))
     return common.Outcome(figures | compute(("plane stress",), ("hex8-bubble",), (32,)))
 

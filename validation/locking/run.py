@@ -110,9 +110,7 @@ def draw(figures: common.Figures, path: Path) -> None:
     figure = Figure(figsize=(12, 4.4), layout="constrained")
     FigureCanvasAgg(figure)
     left, middle, right = figure.subplots(1, 3, sharey=True)
-    for k, (element, colour, mark) in enumerate(
-        zip(common.ELEMENTS, _COLOURS, "osD^v", strict=True)
-    ):
+    for k, (element, (colour, mark)) in enumerate(common.ELEMENT_STYLES.items()):
         style = {"color": colour, "marker": mark, "markersize": 6, "label": element}
         compressible = [1 - 2 * nu for nu in POISSONS]
         values = [figures[f"volumetric, nu {nu:g}, {element}"] for nu in POISSONS]
@@ -144,7 +142,6 @@ def draw(figures: common.Figures, path: Path) -> None:
     figure.savefig(path, dpi=150)
 
 
-_COLOURS = ("#000000", "#e69f00", "#0072b2", "#d55e00", "#009e73")
 _SHAPES = ("bricks", "trapezoids", "parallelograms")
 
 
