@@ -25,12 +25,21 @@ def peer() -> dict[str, Array]:
         return {name: data[name] for name in data}
 
 
-def scene(mass: str = "per-node", weight: str = "published", tolerance: float = 1e-7) -> pc.Scene:
-    """Its beam: 24 x 2 x 2 cells of 2 cm, E = 1 MPa, Poisson's ratio 0.45, under gravity."""
+def scene(
+    mass: str = "per-node", weight: str = "published", tolerance: float = 1e-7, cut: int = 1
+) -> pc.Scene:
+    """Its beam: 24 x 2 x 2 cells of 2 cm, E = 1 MPa, Poisson's ratio 0.45, under gravity.
+
+    Cells ``cut`` times as small are as many times as many along each edge.
+    """
     data = peer()
     return pc.Scene(
         name="beam of another code",
-        body={"shape": "beam", "cells": [24, 2, 2], "cell_size": float(data["cell_size"])},
+        body={
+            "shape": "beam",
+            "cells": [24 * cut, 2 * cut, 2 * cut],
+            "cell_size": float(data["cell_size"]) / cut,
+        },
         material={
             "young": float(data["young"]),
             "poisson": float(data["poisson"]),
@@ -48,6 +57,32 @@ def tip(positions: Array) -> Array:
     """Displacement across, (T+1,), mm, of the node that the other code's authors watch."""
     node = int(peer()["tip_node"])
     return 1e3 * (positions[:, node, 2] - positions[0, node, 2])
+
+
+TIMES = {1: (225, 31.0), 2: (1225, 350.0), 4: (7857, 4320.0)}
+"""DiffPD's nodes and ms a step by how often the cells are cut.
+
+Medians with 2 threads on an AMD EPYC (Milan), compiled with -O3 -march=native: its L-BFGS
+("pd_eigen", history 10) to its own relative tolerance of 1e-4.  Measured apart, see
+``benchmarks/README.md``.
+"""
+
+
+def times() -> tuple[common.Figures, common.Table]:
+    """A step here beside one of DiffPD, and the iterations of both kinds."""
+    figures: common.Figures = {}
+    rows = []
+    for cut, (nodes, theirs) in TIMES.items():
+        problem = pc.discretise(scene(tolerance=1e-5, cut=cut))
+        assert len(problem.positions) == nodes
+        run = pc.rollout(pc.ProjectiveDynamics(problem).prepare())
+        ours = 1e3 * float(np.median(run.stats["seconds"]))
+        figures[f"{nodes} nodes, DiffPD's time over ours"] = theirs / ours
+        rows.append((float(nodes), theirs, ours, theirs / ours))
+    headings = ("nodes", "DiffPD, ms a step", "here, ms a step", "ratio")
+    return figures, common.Table(
+        "Times beside DiffPD's, on another processor", headings, tuple(rows)
+    )
 
 
 def case(quick: bool) -> common.Outcome:
@@ -92,8 +127,12 @@ def case(quick: bool) -> common.Outcome:
         lambda path: common.plot(path, curves, labels),
     )  # fmt: skip
     headings = ("tolerance, cells", "worst error of the tip, µm", "iterations a step")
-    tables = (common.Table("PD against DiffPD's trajectory", headings, tuple(rows)),)
-    return common.Outcome(figures, tables, (picture,))
+    tables = [common.Table("PD against DiffPD's trajectory", headings, tuple(rows))]
+    if not quick:  # times of a busy machine say nothing
+        ratios, beside = times()
+        figures |= ratios
+        tables.append(beside)
+    return common.Outcome(figures, tuple(tables), (picture,))
 
 
 def honest_scene() -> pc.Scene:
