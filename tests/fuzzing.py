@@ -18,6 +18,18 @@ MEMORY = 3 * 2**30
 """Bytes that one input may take on top of what the process holds."""
 
 
+TRIED: list[int] = []
+"""An entry for each input of the test that runs."""
+
+
+@pytest.fixture(autouse=True)
+def inputs_recorded(record_property):
+    """Tell the test report how many inputs a test took (`benchmarks/robustness.py` reads it)."""
+    TRIED.clear()
+    yield
+    record_property("inputs", len(TRIED))
+
+
 class HangError(BaseException):
     """An input took too long; not an `Exception`, which readers of files may catch."""
 
@@ -40,6 +52,7 @@ def for_all(strategy, check, count):
     )
 
     def bounded(value):
+        TRIED.append(count)
         with within_seconds(SECONDS):
             check(value)
 
@@ -169,4 +182,4 @@ def _alter(draw, parent, key, values):
     elif kind == "wrap":
         parent[key] = [parent[key]]
     else:
-        parent[key] = draw(values)
+        parent[key] = copy.deepcopy(draw(values))  # the next change may be within it

@@ -24,6 +24,7 @@ from fuzzing import (
     counts,
     damaged,
     for_all,
+    inputs_recorded,  # noqa: F401
     places,
     renumbered,
     within_memory,

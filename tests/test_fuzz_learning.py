@@ -21,7 +21,14 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 pytest.importorskip("safetensors")
 
-from fuzzing import altered, counts, damaged, for_all, renumbered  # noqa: E402
+from fuzzing import (  # noqa: E402
+    altered,
+    counts,
+    damaged,
+    for_all,
+    inputs_recorded,  # noqa: F401
+    renumbered,
+)
 from pdcorrect import cli  # noqa: E402
 from pdcorrect.corrector import model_io  # noqa: E402
 from pdcorrect.corrector.model_io import DESCRIPTION, WEIGHTS, load_model  # noqa: E402

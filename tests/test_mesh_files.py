@@ -158,6 +158,14 @@ def test_gmsh_cells_with_missing_nodes_are_refused(tmp_path, text):
         read_hex_mesh(path)
 
 
+def test_cells_without_nodes_are_refused(tmp_path, monkeypatch):
+    """As meshio makes of a damaged binary file of Gmsh."""
+    empty = meshio.Mesh(np.array(CORNERS, float), [("hexahedron", np.empty((6, 0), np.int64))])
+    monkeypatch.setattr(meshio, "read", lambda path: empty)
+    with pytest.raises(MeshError, match="hexahedron cells have no nodes"):
+        read_hex_mesh(tmp_path / "cell.msh")
+
+
 ABAQUS = """*Heading
 ** Job name: block Model name: Model-1
 *Preprint, echo=NO, model=NO, history=NO, contact=NO

@@ -63,6 +63,8 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     for block in solids:
         ragged = block.type.startswith("polyhedron")  # each cell a list of faces
         nodes = np.hstack([np.hstack(cell) for cell in block.data]) if ragged else block.data
+        if not nodes.size:
+            raise MeshError(f"{path}: its {block.type} cells have no nodes: expected eight each.")
         if nodes.min() < 0 or nodes.max() >= len(points):
             raise MeshError(
                 f"{path}: its {block.type} cells refer to nodes that the file does not hold: "
