@@ -125,7 +125,7 @@ def verdict(solver: str, found: Run, figures: common.Figures) -> str:
     expected = ValidationCase(Path(__file__).parent).expected
     judged = [expected[name].met_by(x) for name, x in figures.items() if name in expected]
     if not judged:
-        return found.status.value
+        return found.status.name.lower()
     if not all(judged):
         return "fail"
     unusual = any(status in FALLBACKS for status in found.statuses)
