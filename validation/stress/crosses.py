@@ -90,7 +90,12 @@ CROSSES = (
         cross(40, 10.0),
         forces=turning,
     ),
-    _moved("cross weight", "gravity besides, across and along it", cross(40, more_loads=[WEIGHT])),
+    _moved(
+        "cross weight",
+        "gravity besides, across and along it",
+        cross(40, more_loads=[WEIGHT]),
+        quick=True,
+    ),
     _moved(
         "cross kick",
         "struck: a bending motion at 20 m/s, faster than waves in it",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 from crosses import CROSSES
+from diagnosis import ENDS, PARTING, minimum, parting
 from scenarios import SCENARIOS, Scenario
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -173,13 +174,9 @@ def part(scenario: Scenario) -> common.Outcome:
     if scenario.finer:
         tables.append(common.Table(ERRORS, *errors(truth, chosen)))
     tables.append(common.Table(DETAILS, _HEADINGS, tuple(details)))
-    elsewhere = [
-        (scenario.name, solver, _first(found[solver]), *minimum(truth.run(solver)))
-        for solver in chosen
-        if scenario.goal == "rest" and 1e-3 < _first(found[solver]) < UNDEFINED
-    ]
-    if elsewhere:
-        tables.append(common.Table(ELSEWHERE, _ENDS, tuple(elsewhere)))
+    astray = {s: x for s in chosen if 1e-3 < (x := _first(found[s])) < UNDEFINED}
+    if astray:
+        tables += why(truth, astray)
     drawn = "hybrid torsion" if scenario.known else "PD"
     picture = common.Picture(
         f"stress-{scenario.name.replace(' ', '-')}",
@@ -188,6 +185,23 @@ def part(scenario: Scenario) -> common.Outcome:
     )
     figures = {name: x for each in found.values() for name, x in each.items()}
     return common.Outcome(figures, tuple(tables), (picture,))
+
+
+def why(truth: Truth, astray: Mapping[str, float]) -> list[common.Table]:
+    """Of runs that are not where they have to be: other equilibria, other answers to a step."""
+    scenario = truth.scenario
+    if scenario.goal == "rest":
+        ends = [(scenario.name, s, far, *minimum(truth.run(s))) for s, far in astray.items()]
+        return [common.Table(ELSEWHERE, ("scene", "solver", "distance, cells", *ENDS), tuple(ends))]
+    rows: list[Row] = []
+    for solver in astray:
+        other = truth.of(solver)
+        if other is None or solver in MODELS:
+            continue
+        found = parting(scenario, truth.run(solver), other)
+        if found:
+            rows.append((scenario.name, solver, *found))
+    return [common.Table(PARTINGS, ("scene", "solver", *PARTING), tuple(rows))] if rows else []
 
 
 def errors(truth: Truth, solvers: Sequence[str]) -> tuple[tuple[str, ...], tuple[Row, ...]]:
@@ -200,33 +214,8 @@ def errors(truth: Truth, solvers: Sequence[str]) -> tuple[tuple[str, ...], tuple
     return headings, ((scenario.name, size, far, fine.status.name, *found),)
 
 
-def minimum(found: Run) -> tuple[float, float, float, float]:
-    """Whether a run ended at a minimum of the elastic energy.
-
-    Largest force out of balance over Young's modulus times a cell's face; smallest eigenvalue
-    of the stiffness over that at rest; smallest det F at the quadrature points and, for
-    the trilinear map of the nodes, at the corners.
-    """
-    problem, end = found.problem, found.positions[-1]
-    face = problem.scene.material.young * problem.cell_size**2
-    force = np.abs(problem.forces(end) * problem.free).max() / face
-    free = problem.free.ravel()
-
-    def softest(positions: Array) -> float:
-        matrix = problem.stiffness(positions).toarray()[np.ix_(free, free)]
-        return float(np.linalg.eigvalsh(matrix)[0])
-
-    return (
-        float(force), softest(end) / softest(problem.positions),
-        float(problem.volume_ratios(end).min()), found.least_corner,
-    )  # fmt: skip
-
-
 ELSEWHERE = "Runs that ended elsewhere than at rest: is it a minimum of the energy?"
-_ENDS = (
-    "scene", "solver", "distance, cells", "force out of balance / (E face)",
-    "least stiffness / at rest", "least det F at Gauss points", "at corners",
-)  # fmt: skip
+PARTINGS = "Runs that part from the same steps by the other method: has the step two answers?"
 _HEADINGS = (
     "scene", "solver", "distance", "status", "frames by a fallback", "inverted frames",
     "iterations, mean", "iterations, most", "corrections refused", "least det F at corners",
