@@ -194,7 +194,7 @@ def test_the_models_know_the_cross_at_rest_and_not_with_its_far_end_held(model):
 
 
 def test_the_crosses_load_turns_round_at_every_step():
-    scenario = SCENES["cross reversal"]
+    scenario = SCENES["cross reversal 10"]
     problem = pc.discretise(scenario.scene)
     load = problem.external_forces(0.0, problem.time_step)
     for step, sign in ((0, 1.0), (1, -1.0), (2, 1.0)):

@@ -84,11 +84,14 @@ CROSSES = (
     _moved("cross long", "the same, five times as long", cross(200), shown=(0, 60, 120, 200)),
     _moved("cross load 10", "ten times the load", cross(30, 10.0)),
     _moved("cross load 100", "a hundred times the load", cross(15, 100.0)),
-    _moved(
-        "cross reversal",
-        "ten times the load, which turns round at every step",
-        cross(40, 10.0),
-        forces=turning,
+    *(
+        _moved(
+            f"cross reversal {load:g}",
+            f"{words}, which turns round at every step",
+            cross(40, load),
+            forces=turning,
+        )
+        for load, words in ((1.0, "the load as in training"), (10.0, "ten times the load"))
     ),
     _moved(
         "cross weight",
