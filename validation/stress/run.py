@@ -153,11 +153,8 @@ GOALS = {
     "motion": "all frames as by the other method",
 }
 MATRIX = "Pass, slow or fail, with the distance from what has to be reached"
-KNOWN = (
-    "A cross that the torsion models know: the same; of hybrids in motions how much their error "
-    "is above PD best's, and the share of steps corrected"
-)
-ERRORS = "A cross that the torsion models know: error beside a finer mesh"
+KNOWN = "The cross that the torsion models know: the same"
+ERRORS = "The cross: error beside a finer mesh"
 DETAILS = "Figures"
 
 
@@ -215,7 +212,7 @@ def errors(truth: Truth, solvers: Sequence[str]) -> tuple[tuple[str, ...], tuple
 
 
 ELSEWHERE = "Runs that ended elsewhere than at rest: is it a minimum of the energy?"
-PARTINGS = "Runs that part from the same steps by the other method: has the step two answers?"
+PARTINGS = "Runs that part from the other method: has a step two answers?"
 _HEADINGS = (
     "scene", "solver", "distance", "status", "frames by a fallback", "inverted frames",
     "iterations, mean", "iterations, most", "corrections refused", "least det F at corners",
