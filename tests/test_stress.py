@@ -207,3 +207,25 @@ def test_weights_may_differ_by_matrix(rng):
         assert found[2, 3] == pytest.approx(function(F[2, 3], mu[2, 0], omega[3]), rel=1e-12)
     with pytest.raises(InputError, match=r"mu has shape \(3,\)"):
         energies.first_piola(F, np.ones(3), 1.0)
+
+
+@every_element
+def test_corners_have_the_volume_ratio_of_an_affine_deformation(element):
+    problem = body(element)
+    F = np.array([[1.2, 0.3, 0.0], [0.0, 0.9, -0.2], [0.1, 0.0, 1.1]])
+    found = problem.corner_volume_ratios(problem.positions @ F.T + 0.3)
+    np.testing.assert_allclose(found, np.linalg.det(F), rtol=1e-10)
+    assert found.shape == (len(problem.cells), 8)
+
+
+def test_a_corner_pushed_through_its_cell_is_seen_there_and_not_at_the_quadrature_points():
+    problem = pc.discretise(beam(clamps=[], loads=[]))
+    corner = int(problem.positions.sum(axis=1).argmin())
+    moved = problem.positions.copy()
+    moved[corner] += 0.4 * problem.cell_size  # past the plane of its three neighbours
+    assert problem.volume_ratios(moved).min() > 0.0
+    ratios = problem.corner_volume_ratios(moved)
+    cell, number = np.argwhere(problem.cells == corner)[0]
+    # edges e_i - 0.4 (1, 1, 1) at the corner: 1 - 3 * 0.4
+    assert ratios[cell, number] == pytest.approx(1.0 - 3 * 0.4)
+    assert (np.delete(ratios.ravel(), 8 * cell + number) > 0.0).all()

@@ -1,5 +1,6 @@
 """How the stress battery judges a run: distances from what has to be reached, and verdicts."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -7,12 +8,14 @@ import pytest
 
 import pdcorrect as pc
 from conftest import rotation
+from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.plan import make_plan
 from pdcorrect.validation.cases import find_cases
 
 (CASE,) = find_cases(["stress"])
 BATTERY = CASE._module()
-SCENES = {scenario.name: scenario for scenario in BATTERY.SCENARIOS}
-SOLVERS = BATTERY.SOLVERS
+SCENES = {scenario.name: scenario for scenario in BATTERY.BATTERY}
+SOLVERS, MODELS, NO_GATE = BATTERY.SOLVERS, BATTERY.MODELS, "no gate"
 
 
 def run_of(scenario, *frames, statuses=("CONVERGED",), iterations=(3,)):
@@ -36,12 +39,23 @@ def pushed(by, nodes=slice(None)):
     return place
 
 
+def judged(scenario, solver):
+    """Names of the figures that are expected of a run; nothing is of one without a gate."""
+    if solver == NO_GATE:
+        return set()
+    finer = scenario.finer and solver in MODELS
+    found = {"error above PD best's" if finer else "distance", "status"}
+    if scenario.name == "cross ordinary" and solver in MODELS:
+        found.add("accepted")
+    return {f"{scenario.name}, {solver}, {what}" for what in found}
+
+
 def test_every_scene_and_solver_has_an_expectation_and_there_are_no_others():
     names = {
-        f"{scenario.name}, {solver}, {what}"
+        name
         for scenario in SCENES.values()
         for solver in (scenario.solvers or SOLVERS)
-        for what in ("distance", "status")
+        for name in judged(scenario, solver)
     }
     assert set(CASE.expected) == names
     quick = {name for name, aim in CASE.expected.items() if aim.quick}
@@ -151,3 +165,95 @@ def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
     assert row["PD"].startswith("fail")
     assert row["Newton"].startswith("pass")
     assert outcome.figures["1 cell, PD, status"] == "ITERATION_LIMIT"
+
+
+# --- crosses that the torsion models know ------------------------------------------------------
+
+
+def test_the_cross_is_drawn_as_those_of_training_and_none_of_them():
+    module = sys.modules["crosses"]
+    config = DatasetConfig.load(module.DATASET / "config.toml")
+    assert config.seed != module.SEED
+    mesh = make_plan(config.model_copy(update={"seed": module.SEED}))[module.MESH]
+    assert mesh.design.key() not in {plan.design.key() for plan in make_plan(config)}
+    material, ranges = module.CROSS.material, config.material
+    for name in ("young", "poisson", "density"):
+        low, high = getattr(ranges, name)
+        assert low <= getattr(material, name) <= high
+    low, high = config.motion.strength
+    assert low <= abs(module.CROSS.loads[0].strength) / material.density <= high
+
+
+@pytest.mark.parametrize("model", ["torsion-exact", "torsion-exact-compact"])
+def test_the_models_know_the_cross_at_rest_and_not_with_its_far_end_held(model):
+    found = pc.load_model(model)
+    for name, known in (("cross ordinary", True), ("cross plane", True), ("cross turned", False)):
+        problem = pc.discretise(pc.best_coarse(SCENES[name].scene))
+        stepper = pc.HybridStepper(pc.ProjectiveDynamics(problem), found.corrector)
+        assert (max(stepper.body_excess().values(), default=0.0) <= pc.Gate().body) == known
+
+
+def test_the_crosses_load_turns_round_at_every_step():
+    scenario = SCENES["cross reversal 10"]
+    problem = pc.discretise(scenario.scene)
+    load = problem.external_forces(0.0, problem.time_step)
+    for step, sign in ((0, 1.0), (1, -1.0), (2, 1.0)):
+        np.testing.assert_allclose(load + scenario.forces(problem, step), sign * load)
+
+
+def test_the_twisted_cross_has_its_ends_where_they_were_and_its_middle_upside_down():
+    problem = pc.discretise(SCENES["cross twisted"].scene)
+    rest, start = problem.positions, SCENES["cross twisted"].state(problem).positions
+    along = rest[:, 0] / rest[:, 0].max()
+    ends = (along == 0.0) | (along == 1.0)
+    np.testing.assert_allclose(start[ends], rest[ends], atol=1e-12)
+    edges = np.linalg.norm(rest[:, 1:] - 0.05, axis=1)
+    np.testing.assert_allclose(np.linalg.norm(start[:, 1:] - 0.05, axis=1), edges, atol=1e-12)
+    assert np.abs(start - rest).max() > 0.1
+
+
+def test_hybrids_in_motion_are_held_against_the_finer_mesh_and_pd_best():
+    scenario = SCENES["cross ordinary"]
+    truth = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.5]))
+    best = run_of(scenario, at_rest, pushed([0.0, 0.0, 0.45]))
+    name = "cross ordinary, hybrid torsion"
+    for end, above in ((0.48, 0.0), (0.55, 0.0), (0.4, 0.1)):
+        hybrid = run_of(scenario, at_rest, pushed([0.0, 0.0, end]))
+        figures = BATTERY.figures_of(scenario, "hybrid torsion", hybrid, truth, best)
+        assert figures[f"{name}, error above PD best's"] == pytest.approx(above)
+        assert figures[f"{name}, accepted"] == 1.0
+    lost = run_of(scenario, at_rest, pushed([0.0, 0.0, np.nan]))
+    figures = BATTERY.figures_of(scenario, "hybrid torsion", lost, truth, best)
+    assert BATTERY.verdict("hybrid torsion", lost, figures) == "fail"
+
+
+def test_the_matrix_tells_folded_corners_and_the_share_corrected():
+    scenario = SCENES["cross plane"]
+
+    def folded(problem):
+        out, corner = problem.positions.copy(), int(problem.positions.sum(axis=1).argmax())
+        out[corner] -= 0.4 * problem.cell_size  # past the plane of its three neighbours
+        return out
+
+    found = run_of(scenario, at_rest, folded)
+    found = replace(found, refused=[1, 0, 0, 0])
+    figures = BATTERY.figures_of(scenario, "hybrid torsion", found, None)
+    cell = BATTERY.cell(scenario, "hybrid torsion", found, figures)
+    assert cell.endswith("folded corner, 75% corrected")
+    figures = BATTERY.figures_of(scenario, NO_GATE, found, None)
+    assert BATTERY.cell(scenario, NO_GATE, found, figures).startswith("converged ")
+
+
+def test_where_runs_part_the_better_answer_has_less_of_the_objective():
+    scenario = SCENES["1 cell"]
+    found = BATTERY.run(scenario, "Newton")
+    other = found.positions.copy()
+    other[3:, -1] += 0.1 * found.problem.cell_size
+    frame, apart, mine, its, curvature, _ = BATTERY.parting(
+        scenario, found, replace(found, positions=other)
+    )
+    assert frame == 3
+    assert apart == pytest.approx(0.1 * np.sqrt(3.0))
+    assert mine < its
+    assert curvature > 0.0
+    assert BATTERY.parting(scenario, found, found) is None

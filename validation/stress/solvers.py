@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -13,11 +13,18 @@ from scenarios import Scenario
 import pdcorrect as pc
 
 Array = np.ndarray
-MODELS = {"hybrid": "tiny", "hybrid torsion": "torsion-exact"}
+NO_GATE = "no gate"
+"""A corrector without a gate, which shows what the gate is for: nothing is expected of it."""
+MODELS = {
+    "hybrid": "tiny", "hybrid torsion": "torsion-exact", "hybrid compact": "torsion-exact-compact",
+    NO_GATE: "torsion-exact",
+}  # fmt: skip
 """Correctors by solver."""
-SOLVERS = ("PD", "PD best", "Newton", "batch", *MODELS)
+SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid", "hybrid torsion")
 """Projective dynamics on the plain and on the best coarse mesh, Newton and the batch stepper on
 the plain one, and correctors with their gate on the best."""
+KNOWN_SOLVERS = ("PD", "PD best", "Newton", "hybrid torsion", "hybrid compact", NO_GATE)
+"""Those of bodies that the torsion models know."""
 
 TIGHT = 1e-8
 """Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""
@@ -34,7 +41,7 @@ class Run:
     statuses : list of Status
     iterations : list of int
     refused : list of int
-        1 where a gate refused a correction.
+        1 where a correction was refused.
     """
 
     problem: pc.Problem
@@ -43,11 +50,28 @@ class Run:
     iterations: list[int]
     refused: list[int]
 
+    @property
+    def accepted(self) -> float:
+        """Share of the steps whose correction was not refused."""
+        return 1.0 - float(np.mean(self.refused))
 
-def problem_of(scenario: Scenario, solver: str) -> pc.Problem:
+    @property
+    def status(self) -> pc.Status:
+        """The last failure, or the status of the last frame."""
+        failed = [status for status in self.statuses if not status.ok]
+        return failed[-1] if failed else self.statuses[-1]
+
+    @property
+    def least_corner(self) -> float:
+        """Least det F at the cells' corners at the end; below zero where a cell is folded."""
+        return float(self.problem.corner_volume_ratios(self.positions[-1]).min())
+
+
+def problem_of(scenario: Scenario, solver: str, refine: int = 1) -> pc.Problem:
     """The mesh that a solver works on."""
     best = solver == "PD best" or solver in MODELS
-    return pc.discretise(pc.best_coarse(scenario.scene) if best else scenario.scene)
+    scene = pc.best_coarse(scenario.scene) if best else scenario.scene
+    return pc.discretise(scene, refine=refine)
 
 
 def run(scenario: Scenario, solver: str) -> Run:
@@ -65,22 +89,29 @@ def tight(scenario: Scenario, solver: str) -> Run:
     return _steps(scenario, other)
 
 
+def finer(scenario: Scenario) -> Run:
+    """The same steps by PD on a finer mesh of the best coarse model's element, at its nodes."""
+    fine = _steps(scenario, pc.ProjectiveDynamics(problem_of(scenario, "PD best", scenario.finer)))
+    coarse, shared = problem_of(scenario, "PD best"), fine.problem.mesh.coarse_nodes
+    return replace(fine, problem=coarse, positions=fine.positions[:, shared])
+
+
 @cache
 def _model(model: str) -> Any:
     return pc.load_model(model)
 
 
-def _hybrid(model: str, problem: pc.Problem) -> pc.HybridStepper:
-    found = _model(model)
+def _hybrid(solver: str, problem: pc.Problem) -> pc.HybridStepper:
+    found, gate = _model(MODELS[solver]), None if solver == NO_GATE else pc.Gate()
     coarse = pc.ProjectiveDynamics(problem)
-    return pc.HybridStepper(coarse, found.corrector, velocity=found.velocity, gate=pc.Gate())
+    return pc.HybridStepper(coarse, found.corrector, velocity=found.velocity, gate=gate)
 
 
 MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
     "PD": pc.ProjectiveDynamics,
     "PD best": pc.ProjectiveDynamics,
     "Newton": pc.Newton,
-    **{solver: partial(_hybrid, model) for solver, model in MODELS.items()},
+    **{solver: partial(_hybrid, solver) for solver in MODELS},
 }
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, Linearisation
+from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.operators import Space
@@ -162,6 +163,18 @@ class ElasticBody:
             positions - self.positions, self.cells, self.quadrature.lanes, out
         )
         return out
+
+    def corner_volume_ratios(self, positions: Array) -> Array:
+        """det F at the corners of each cell, (C, 8), of the trilinear map of its corners.
+
+        Folded layers of cells show here first: they may be at a minimum of the energy with
+        det F positive at all quadrature points (`volume_ratios`) and negative at corners,
+        which the energy does not see.  Steppers do not look at corners; of a run,
+        ``problem.corner_volume_ratios(run.positions[-1]).min()`` tells.
+        """
+        self._check(positions, len(self.positions))
+        corners = self.cells[:, :8]  # VTK order: also of cells with 27 nodes
+        return corner_jacobians(positions, corners) / corner_jacobians(self.positions, corners)
 
     def linearise(
         self, configuration: Array, project: bool = False, cells: slice = slice(None)
