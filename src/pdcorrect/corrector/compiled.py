@@ -68,8 +68,7 @@ class CompiledCorrector:
 
     def of_view(self, view: View) -> Tensor:
         """The correction (n, 3), m."""
-        if self._contents.changed:
-            self.refresh()
+        self._follow()
         features = self._seen(view)
         answer = np.empty_like(features.frames[:, 0])
         size = float(self._bodies.cell_size) * features.deformation
@@ -79,22 +78,27 @@ class CompiledCorrector:
 
     def outside(self, view: View, margin: float) -> Tensor:
         """See `Corrector.outside`."""
-        if view is not self._view and self._contents.changed:
-            self.refresh()
-        beyond = ~(self._seen(view).excess <= margin)
-        return torch.tensor([np.count_nonzero(beyond) / len(beyond)], dtype=torch.float64)
+        excess = self._known(view).excess
+        beyond = len(excess) - np.count_nonzero(excess <= margin)
+        return torch.tensor([beyond / len(excess)], dtype=torch.float64)
 
     def unlike(self, view: View) -> Tensor:
         """See `Corrector.unlike`."""
-        if view is not self._view and self._contents.changed:
-            self.refresh()
-        averages = self._seen(view).of_nodes.mean(axis=0, dtype=np.float64)
-        normaliser = self._corrector.normaliser
-        return normaliser.strangeness(torch.from_numpy(averages)[None]).amax(dim=1)
+        return torch.tensor([self._known(view).strangeness()], dtype=torch.float64)
 
     def shape_excess(self, bodies: BodyGraph) -> Tensor:
         """See `Corrector.shape_excess`."""
         return self._corrector.shape_excess(bodies)
+
+    def _follow(self) -> None:
+        if self._contents.changed:
+            self.refresh()
+
+    def _known(self, view: View) -> CompiledFeatures:
+        """The features of a view; if it is not the last one by the corrector as it is now."""
+        if view is not self._view:
+            self._follow()
+        return self._seen(view)
 
     def _seen(self, view: View) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""

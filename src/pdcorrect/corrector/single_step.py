@@ -71,8 +71,8 @@ class SingleCoarseStep:
             else answer.state.positions
         )
         arrays = state.positions, state.velocities, proposed, self._loads
-        positions, velocities, after, loads = map(torch.tensor, arrays)
-        old = None if self._previous is None else torch.tensor(self._previous)
+        positions, velocities, after, loads = map(_tensor, arrays)
+        old = None if self._previous is None else _tensor(self._previous)
         return View(self._bodies, Snapshot(positions, velocities, after, loads, old))
 
     def solved(self, added: Tensor | None = None, guess: Tensor | None = None) -> StepResult:
@@ -143,6 +143,11 @@ class SingleCoarseStep:
 
     def _kinetic(self, state: State) -> float:
         return 0.5 * float(np.vdot(state.velocities, self._problem.mass_times(state.velocities)))
+
+
+def _tensor(array: Array) -> Tensor:
+    """Of the same memory, which nobody writes to, or of a copy where torch would warn of that."""
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
 def _status(coarse: Status, ratio: float) -> Status:
