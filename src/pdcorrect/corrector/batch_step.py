@@ -101,6 +101,15 @@ class BatchCoarseStep:
         self._state, self._previous = state, previous
         self._loads: Tensor | None = None
 
+    @property
+    def bodies(self) -> BodyGraph:
+        """See `CoarseStep`."""
+        return self._parts.nodes.graph
+
+    def own(self, values: Tensor) -> Tensor:
+        """See `CoarseStep`."""
+        return values
+
     def view(self, answer: BatchResult | None) -> View:
         """See `CoarseStep`."""
         proposed = None if answer is None else answer.state.positions
