@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -82,7 +81,6 @@ class SingleCoarseStep:
         self._coarse, self._graph, self._velocity = coarse, bodies, velocity
         self._problem, self._state, self._forces = coarse.problem, state, forces
         self._previous, self.seconds = previous, 0.0
-        self._last: tuple[State, Array] | None = None
         stage = coarse.integrate(self._problem, state, coarse.time_step, forces)
         loads = self._problem.external_forces(*stage.loads_over, stage.loads_at)
         self._loads: Array = loads if forces is None else loads + forces
@@ -133,7 +131,8 @@ class SingleCoarseStep:
         scheme = self._coarse.integrate.scheme(self._state, self._coarse.time_step)
         positions, velocities, memory = moved(scheme, answer.state, correction, self._velocity)
         state = State(positions, velocities, answer.state.time, memory)
-        ratio = float(self._ratios(state).min())
+        ratios = self._problem.volume_ratios(positions)
+        ratio = float(ratios.min())
         work = answer.stats["external_work"] + float(np.vdot(self._loads, correction))
         stats = {
             **answer.stats,
@@ -143,30 +142,27 @@ class SingleCoarseStep:
             "smallest_volume_ratio": ratio,
         }
         status = _status(answer.status, ratio)
-        return replace(answer, state=state, status=status, stats=stats, modes=None)
+        return replace(
+            answer, state=state, status=status, stats=stats, modes=None, volume_ratios=ratios
+        )
 
     def measured(self, answer: StepResult) -> Measured:
         """See `CoarseStep`."""
         stored = answer.stats["elastic_energy"] + answer.stats["kinetic_energy"]
-        return self._measured(answer.state, stored, np.vdot(self._loads, self._way(answer)))
+        ratios = answer.volume_ratios
+        if ratios is None:
+            ratios = self._problem.volume_ratios(answer.state.positions)
+        return _measured(ratios, stored, float(np.vdot(self._loads, self._way(answer))))
 
     def before(self) -> Measured:
         """See `CoarseStep`."""
-        energy = self._problem.energy(self._state.positions)
-        return self._measured(self._state, energy + self._kinetic(self._state), 0.0)
+        positions = self._state.positions
+        stored = self._problem.energy(positions) + self._kinetic(self._state)
+        return _measured(self._problem.volume_ratios(positions), stored, 0.0)
 
     def chosen(self, which: NDArray[np.bool_], one: StepResult, other: StepResult) -> StepResult:
         """See `CoarseStep`."""
         return one if which.item() else other
-
-    def _measured(self, state: State, stored: float, work: float | np.floating[Any]) -> Measured:
-        return Measured(self._ratios(state)[None], np.array([stored]), np.array([float(work)]))
-
-    def _ratios(self, state: State) -> Array:
-        """Smallest det F of each cell, (C,); those of the state asked for last are kept."""
-        if self._last is None or self._last[0] is not state:
-            self._last = state, self._problem.volume_ratios(state.positions)
-        return self._last[1]
 
     def _way(self, answer: StepResult) -> Array:
         way: Array = answer.state.positions - self._state.positions
@@ -174,6 +170,10 @@ class SingleCoarseStep:
 
     def _kinetic(self, state: State) -> float:
         return 0.5 * float(np.vdot(state.velocities, self._problem.mass_times(state.velocities)))
+
+
+def _measured(ratios: Array, stored: float, work: float) -> Measured:
+    return Measured(ratios[None], np.array([stored]), np.array([work]))
 
 
 def _tensor(array: Array) -> Tensor:
