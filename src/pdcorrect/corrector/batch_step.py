@@ -17,6 +17,7 @@ from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Measured
 from pdcorrect.corrector.placements import Velocity, check_velocity, moved
 from pdcorrect.corrector.recorded import RecordedMeasures, stored_and_ratios
+from pdcorrect.corrector.values import Values
 from pdcorrect.errors import InputError
 
 
@@ -106,7 +107,7 @@ class BatchCoarseStep:
         """See `CoarseStep`."""
         return self._parts.nodes.graph
 
-    def own(self, values: Tensor) -> Tensor:
+    def own(self, values: Values) -> Values:
         """See `CoarseStep`."""
         return values
 

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled_features import KNOWN_OF_EDGES, KNOWN_OF_NODES, CompiledFeatures
+from pdcorrect.corrector.compiled_features import (
+    KNOWN_OF_EDGES,
+    KNOWN_OF_NODES,
+    CompiledFeatures,
+    largest_excess,
+)
 from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.contents import Contents
@@ -76,19 +81,21 @@ class CompiledCorrector:
         found = torch.from_numpy(answer)
         return without_momentum(view, found) if self.config.momentum_neutral else found
 
-    def outside(self, view: View, margin: float) -> Tensor:
+    def outside(self, view: View, margin: float) -> Array:
         """See `Corrector.outside`."""
         excess = self._known(view).excess
         beyond = len(excess) - np.count_nonzero(excess <= margin)
-        return torch.tensor([beyond / len(excess)], dtype=torch.float64)
+        return np.array([beyond / len(excess)])
 
-    def unlike(self, view: View) -> Tensor:
+    def unlike(self, view: View) -> Array:
         """See `Corrector.unlike`."""
-        return torch.tensor([self._known(view).strangeness()], dtype=torch.float64)
+        return np.array([self._known(view).strangeness()])
 
-    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+    def shape_excess(self, bodies: BodyGraph) -> Array:
         """See `Corrector.shape_excess`."""
-        return self._corrector.shape_excess(bodies)
+        normaliser = self._corrector.normaliser
+        low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
+        return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
 
     def _follow(self) -> None:
         if self._contents.changed:

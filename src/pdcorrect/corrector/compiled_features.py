@@ -289,6 +289,17 @@ def _strangeness(x, count, mean, deviation, low, high):  # type: ignore[no-untyp
     return worst
 
 
+@njit(**OPTIONS)
+def largest_excess(values, low, high):  # type: ignore[no-untyped-def]
+    """How far numbers (k,) lie outside a range at most; infinite where one is not a number."""
+    worst = 0.0
+    for k in range(len(values)):
+        outside = max(low[k] - values[k], values[k] - high[k])
+        if not outside <= worst:
+            worst = outside if outside == outside else np.inf
+    return worst
+
+
 @njit(inline="always", **OPTIONS)
 def _write(values, places, scales, clip, out):  # type: ignore[no-untyped-def]
     """Normalised components in their columns; returns their largest excess."""

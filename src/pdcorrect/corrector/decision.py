@@ -11,8 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
 
-from torch import Tensor
-
 from pdcorrect.corrector.corrector import Answers
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, Measured, Reason
@@ -49,8 +47,8 @@ class CoarseStep(Protocol[Answer]):
     def bodies(self) -> Bodies:
         """Those of the scenes."""
 
-    def own(self, values: Tensor) -> Values:
-        """A tensor as what the step computes with."""
+    def own(self, values: Values) -> Values:
+        """Values of a network or gate as what the step computes with."""
 
     def view(self, answer: Answer | None) -> View:
         """What the network sees, with the coarse answer if it is asked after that."""

@@ -13,7 +13,6 @@ from typing import Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
@@ -123,20 +122,19 @@ class Gate(Strict):
     energy: NonNegative | None = 8.0
     limit: bool = False
 
-    def foreign(self, corrector: Answers, bodies: BodyGraph) -> Tensor:
+    def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Whether bodies at rest are too unlike those of its training, (B,) bool."""
         if self.body is None:
             return torch.zeros_like(bodies.cell_size, dtype=torch.bool)
         return corrector.shape_excess(bodies) > self.body
 
-    def unknown(self, corrector: Answers, view: View) -> Tensor:
-        """Whether the network's inputs are too far from its training data, (B,) bool."""
-        bodies = view.bodies
-        found = torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
+    def unknown(self, corrector: Answers, view: View) -> Values:
+        """Whether the network's inputs are too far from its training data, (B,) bool, or False."""
+        found: Values = False
         if self.margin is not None:
-            found |= corrector.outside(view, self.margin) > self.share
+            found = found | (corrector.outside(view, self.margin) > self.share)
         if self.average is not None:
-            found |= corrector.unlike(view) > self.average
+            found = found | (corrector.unlike(view) > self.average)
         return found
 
     def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Values:

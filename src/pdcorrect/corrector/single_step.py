@@ -90,9 +90,9 @@ class SingleCoarseStep:
         """See `CoarseStep`."""
         return OneBody(self._graph.cell_size.numpy())
 
-    def own(self, values: Tensor) -> Values:
+    def own(self, values: Values) -> Values:
         """See `CoarseStep`."""
-        return values.numpy()
+        return np.asarray(values)
 
     def view(self, answer: StepResult | None) -> View:
         """See `CoarseStep`."""
