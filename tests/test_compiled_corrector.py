@@ -69,7 +69,7 @@ def both(made, view):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("sizes", [(8, 1, 16), (16, 37, 16), (24, 48, 96)])
+@pytest.mark.parametrize("sizes", [(8, 1, 16), (16, 37, 16), (24, 48, 96), (16, 5, 64)])
 def test_products_are_those_of_matrices(sizes, dtype):
     m, a, b = sizes
     rng = np.random.default_rng(0)
@@ -149,6 +149,17 @@ def test_how_unlike_training_a_body_is_agrees_with_torch():
         found = compiled.unlike(view)
         assert found[0] > 0.0
         assert found[0] == pytest.approx(float(made.unlike(view)), rel=1e-12)
+
+
+def test_how_unlike_training_a_body_is_at_rest_is_told_as_by_torch_and_follows_the_normaliser():
+    view = next(views())
+    made = corrector(view=view)
+    compiled = CompiledCorrector(made, view.bodies)
+    for shift in (0.0, 0.25, -1.0, np.nan):
+        made.normaliser.shape_high -= shift
+        expected = made.shape_excess(view.bodies).numpy()
+        assert np.array_equal(compiled.shape_excess(view.bodies), expected)
+    assert np.isinf(expected).all()
 
 
 def test_a_body_with_inputs_that_are_not_numbers_is_unlike_any():

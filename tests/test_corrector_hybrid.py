@@ -1018,6 +1018,29 @@ def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element)
                 assert stored > least
 
 
+def test_a_gate_judges_arrays_as_it_judges_tensors():
+    rng, gates = np.random.default_rng(0), (Gate(), Gate(volume=None), Gate(crushing=None))
+    numbers = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    others = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    numbers[0][0, 0] = others[0][1, 1] = numbers[1][2] = others[2][3] = np.nan
+    arrays = Measured(*numbers), Measured(*others)
+    tensors = [Measured(*map(torch.tensor, each)) for each in (numbers, others)]
+    for gate in gates:
+        for rise in (None, 0.0, 0.5):
+            found, expected = gate.reasons(*arrays, rise), gate.reasons(*tensors, rise)
+            assert found.dtype == np.int64
+            assert np.array_equal(found, expected.numpy())
+            assert len(set(found.tolist())) == (2 if rise is None else 3)
+
+
+def test_a_corrected_step_carries_the_volume_ratios_of_its_own_state():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]))
+    result = hybrid(problem.rest_state())
+    assert result.stats["correction"] > 0.0
+    assert np.array_equal(result.volume_ratios, problem.volume_ratios(result.state.positions))
+
+
 def test_refusals_are_counted_by_reason():
     assert refusals(np.array([0.0, 1.0, 3.0, 3.0, 0.0])) == {
         "not finite": 1, "features": 0, "inversion": 2, "energy": 0, "solver": 0, "body": 0,
