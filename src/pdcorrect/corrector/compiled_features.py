@@ -294,9 +294,9 @@ def largest_excess(values, low, high):  # type: ignore[no-untyped-def]
     """How far numbers (k,) lie outside a range at most; infinite where one is not a number."""
     worst = 0.0
     for k in range(len(values)):
-        outside = max(low[k] - values[k], values[k] - high[k])
-        if not outside <= worst:
-            worst = outside if outside == outside else np.inf
+        for outside in (low[k] - values[k], values[k] - high[k]):
+            if not outside <= worst:
+                worst = outside if outside == outside else np.inf
     return worst
 
 
