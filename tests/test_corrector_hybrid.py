@@ -154,7 +154,7 @@ def test_corrected_answers_are_measured_once(monkeypatch):
     )
     assert hybrid(problem.rest_state()).stats["correction"] > 0.0
     assert len(energies) == 1
-    assert len(ratios) == 3  # coarse step, coarse answer by cells, corrected one
+    assert len(ratios) == 2  # coarse step, corrected one
 
 
 # --- one scene and many ----------------------------------------------------------------------

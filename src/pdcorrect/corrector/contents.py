@@ -27,8 +27,9 @@ class Contents:
 
     def __init__(self, corrector: Corrector) -> None:
         self._corrector, self.config = corrector, corrector.config
-        # what is added to empty ones nothing here asks for
-        self._tables = [table for table in _tables(corrector) if table]
+        tables = [*_tables(corrector)]
+        self._tables = [table for table in tables if table]
+        self._empty = [table for table in tables if not table]
         self._names, self._parts = [*chain.from_iterable(self._tables)], [*self._there()]
         self._tensors = [part for part in self._parts if isinstance(part, Tensor)]
         # of inference tensors torch does not count how often they are written
@@ -40,7 +41,7 @@ class Contents:
         """Whether there are other modules, tensors or storage than there were."""
         if self._corrector.config is not self.config or self._where() != self._places:
             return True
-        if [*chain.from_iterable(self._tables)] != self._names:
+        if any(self._empty) or [*chain.from_iterable(self._tables)] != self._names:
             return True
         return not all(map(is_, self._there(), self._parts))
 
