@@ -154,7 +154,7 @@ def test_corrected_answers_are_measured_once(monkeypatch):
     )
     assert hybrid(problem.rest_state()).stats["correction"] > 0.0
     assert len(energies) == 1
-    assert len(ratios) == 3  # coarse step, coarse answer by cells, corrected one
+    assert len(ratios) == 2  # coarse step, corrected one
 
 
 # --- one scene and many ----------------------------------------------------------------------
@@ -999,7 +999,7 @@ def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element)
         alone = one.solved()
         pairs = (
             (many.measured(answer), one.measured(alone), True),
-            (many.measured(moved), one.measured(one.moved(alone, torch.tensor(shift))), False),
+            (many.measured(moved), one.measured(one.moved(alone, shift)), False),
             (many.before(), one.before(), True),
         )
         for found, expected, same_modes in pairs:
@@ -1008,14 +1008,37 @@ def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element)
                 continue
             count = len(problem.cells)
             ratios = found.ratios[i, :count].numpy()
-            assert ratios == pytest.approx(expected.ratios[0].numpy(), rel=1e-8)
+            assert ratios == pytest.approx(expected.ratios[0], rel=1e-8)
             assert torch.isinf(found.ratios[i, count:]).all()
-            assert float(found.work[i]) == pytest.approx(float(expected.work), rel=1e-8)
+            assert float(found.work[i]) == pytest.approx(expected.work[0], rel=1e-8)
             stored, least = float(found.stored[i]), float(expected.stored[0])
             if same_modes or element == "hex8" or integrator == "midpoint":
                 assert stored == pytest.approx(least, rel=1e-8)
             else:
                 assert stored > least
+
+
+def test_a_gate_judges_arrays_as_it_judges_tensors():
+    rng, gates = np.random.default_rng(0), (Gate(), Gate(volume=None), Gate(crushing=None))
+    numbers = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    others = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    numbers[0][0, 0] = others[0][1, 1] = numbers[1][2] = others[2][3] = np.nan
+    arrays = Measured(*numbers), Measured(*others)
+    tensors = [Measured(*map(torch.tensor, each)) for each in (numbers, others)]
+    for gate in gates:
+        for rise in (None, 0.0, 0.5):
+            found, expected = gate.reasons(*arrays, rise), gate.reasons(*tensors, rise)
+            assert found.dtype == np.int64
+            assert np.array_equal(found, expected.numpy())
+            assert len(set(found.tolist())) == (2 if rise is None else 3)
+
+
+def test_a_corrected_step_carries_the_volume_ratios_of_its_own_state():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]))
+    result = hybrid(problem.rest_state())
+    assert result.stats["correction"] > 0.0
+    assert np.array_equal(result.volume_ratios, problem.volume_ratios(result.state.positions))
 
 
 def test_refusals_are_counted_by_reason():

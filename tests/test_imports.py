@@ -169,6 +169,7 @@ ORDER = [
     "data.workers",
     "data.generate",
     "corrector",
+    "corrector.values",
     "corrector.rotations",
     "corrector.frames",
     "corrector.shapes",

@@ -105,6 +105,22 @@ def test_a_free_body_falls_freely_with_every_mass(rule):
         np.testing.assert_allclose(run.positions[n], problem.positions + fall, atol=1e-9)
 
 
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean", "hex27"])
+@pytest.mark.parametrize("energy", ["corotated", "neo-hookean"])
+def test_a_result_carries_the_energy_and_the_volume_ratios_of_its_state(element, energy):
+    material = {"poisson": 0.3, "energy": energy}
+    scene = beam((4, 1, 1), material=material, solver={"element": element})
+    problem = pc.discretise(scene)
+    state = pc.State(disturbed(problem, 0.05), np.zeros_like(problem.positions))
+    result = pc.ProjectiveDynamics(problem)(state)
+    ratios = problem.volume_ratios(result.state.positions)
+    assert np.array_equal(result.volume_ratios, ratios)
+    assert result.stats["smallest_volume_ratio"] == ratios.min()
+    y = problem.relaxed(result.state.positions)
+    assert problem.energy_of(y) == pytest.approx(problem.energy_and_forces(y)[0], rel=1e-14)
+    assert result.stats["elastic_energy"] == pytest.approx(problem.energy_of(y), rel=1e-6)
+
+
 def test_free_flight_keeps_linear_momentum(rng):
     problem = pc.discretise(cross(clamps=[], loads=[]))
     start = pc.State(problem.positions, rng.normal(size=problem.positions.shape))

@@ -112,6 +112,9 @@ class StepResult:
     modes : (B, 3) or None
         Internal modes at the end of the step, m, of elements that have some; None too where a
         network has moved the nodes.
+    volume_ratios : (C,) or None
+        Smallest det F of each cell of ``state``, see `ElasticBody.volume_ratios`; None where they
+        were not measured.
     """
 
     state: State
@@ -121,6 +124,7 @@ class StepResult:
     error_estimate: float
     stats: Mapping[str, float] = field(default_factory=dict)
     modes: NDArray[np.float64] | None = None
+    volume_ratios: NDArray[np.float64] | None = None
 
     def __repr__(self) -> str:
         return (

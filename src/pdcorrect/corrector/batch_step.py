@@ -17,6 +17,7 @@ from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Measured
 from pdcorrect.corrector.placements import Velocity, check_velocity, moved
 from pdcorrect.corrector.recorded import RecordedMeasures, stored_and_ratios
+from pdcorrect.corrector.values import Values
 from pdcorrect.errors import InputError
 
 
@@ -100,6 +101,15 @@ class BatchCoarseStep:
         self._parts, self._stepper = parts, parts.stepper
         self._state, self._previous = state, previous
         self._loads: Tensor | None = None
+
+    @property
+    def bodies(self) -> BodyGraph:
+        """See `CoarseStep`."""
+        return self._parts.nodes.graph
+
+    def own(self, values: Values) -> Values:
+        """See `CoarseStep`."""
+        return values
 
     def view(self, answer: BatchResult | None) -> View:
         """See `CoarseStep`."""

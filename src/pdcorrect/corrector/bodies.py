@@ -173,10 +173,13 @@ class BodyGraph:
         counts = self.node_counts.to(values.dtype)
         return self.node_sums(values) / counts.reshape(-1, *[1] * (values.ndim - 1))
 
+    def some(self, flags: Tensor) -> Tensor:
+        """Whether any of the flags (n, ...) of each body is set, (B,)."""
+        return self.node_sums(flags.flatten(1).any(dim=1).to(self.rest.dtype)) > 0.0
+
     def sound(self, values: Tensor) -> Tensor:
         """Whether all values (n, ...) of each body are finite, (B,)."""
-        faults = (~torch.isfinite(values)).flatten(1).any(dim=1).to(self.rest.dtype)
-        return self.node_sums(faults) == 0.0
+        return ~self.some(~torch.isfinite(values))
 
     def with_material(
         self, mass: Tensor, young: Tensor, poisson: Tensor, density: Tensor

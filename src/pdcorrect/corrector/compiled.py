@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled_features import KNOWN_OF_EDGES, KNOWN_OF_NODES, CompiledFeatures
+from pdcorrect.corrector.compiled_features import (
+    KNOWN_OF_EDGES,
+    KNOWN_OF_NODES,
+    CompiledFeatures,
+    largest_excess,
+)
 from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.contents import Contents
@@ -68,8 +73,7 @@ class CompiledCorrector:
 
     def of_view(self, view: View) -> Tensor:
         """The correction (n, 3), m."""
-        if self._contents.changed:
-            self.refresh()
+        self._follow()
         features = self._seen(view)
         answer = np.empty_like(features.frames[:, 0])
         size = float(self._bodies.cell_size) * features.deformation
@@ -77,24 +81,31 @@ class CompiledCorrector:
         found = torch.from_numpy(answer)
         return without_momentum(view, found) if self.config.momentum_neutral else found
 
-    def outside(self, view: View, margin: float) -> Tensor:
+    def outside(self, view: View, margin: float) -> Array:
         """See `Corrector.outside`."""
-        if view is not self._view and self._contents.changed:
-            self.refresh()
-        beyond = ~(self._seen(view).excess <= margin)
-        return torch.tensor([np.count_nonzero(beyond) / len(beyond)], dtype=torch.float64)
+        excess = self._known(view).excess
+        beyond = len(excess) - np.count_nonzero(excess <= margin)
+        return np.array([beyond / len(excess)])
 
-    def unlike(self, view: View) -> Tensor:
+    def unlike(self, view: View) -> Array:
         """See `Corrector.unlike`."""
-        if view is not self._view and self._contents.changed:
-            self.refresh()
-        averages = self._seen(view).of_nodes.mean(axis=0, dtype=np.float64)
-        normaliser = self._corrector.normaliser
-        return normaliser.strangeness(torch.from_numpy(averages)[None]).amax(dim=1)
+        return np.array([self._known(view).strangeness()])
 
-    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+    def shape_excess(self, bodies: BodyGraph) -> Array:
         """See `Corrector.shape_excess`."""
-        return self._corrector.shape_excess(bodies)
+        normaliser = self._corrector.normaliser
+        low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
+        return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
+
+    def _follow(self) -> None:
+        if self._contents.changed:
+            self.refresh()
+
+    def _known(self, view: View) -> CompiledFeatures:
+        """The features of a view; if it is not the last one by the corrector as it is now."""
+        if view is not self._view:
+            self._follow()
+        return self._seen(view)
 
     def _seen(self, view: View) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""

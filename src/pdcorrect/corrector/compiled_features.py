@@ -27,6 +27,7 @@ from pdcorrect.corrector.features import (
     View,
 )
 from pdcorrect.corrector.frames import EDGE_MEANS
+from pdcorrect.corrector.normaliser import EXTREME
 from pdcorrect.corrector.rotations import rotations
 from pdcorrect.fem.blocks import PARALLEL
 from pdcorrect.fem.decomposition import OPTIONS
@@ -67,15 +68,12 @@ class CompiledFeatures:
         See `View.deformation`.
     frames : (n, 3, 3)
         See `View.frames`.
-    of_nodes : (n, a)
-        Normalised features of nodes, as the network sees them.
     """
 
     def __init__(
         self, corrector: Corrector, bodies: BodyGraph, groups: Groups, x: Array, e: Array
     ) -> None:
         self._groups, self._x, self._e = groups, x, e
-        self.of_nodes = x[: len(bodies.rest)]
         n, place = len(bodies.rest), groups.place
         self.deformation, self.excess = 0.0, np.zeros(n)
         self.frames = np.zeros((n, 3, 3))
@@ -92,6 +90,15 @@ class CompiledFeatures:
         self._gradients = np.zeros((len(self._cells), 3, 3))
         self._turns = np.zeros((n, 3, 3))
         self._strain, self._squares = np.zeros((n, 3, 3)), np.zeros(n)
+        self._still = np.zeros((n, 3))
+        normaliser = corrector.normaliser
+        self._averages = tuple(
+            part.numpy().copy()
+            for part in (
+                normaliser.average_mean, normaliser.average_deviation, normaliser.average_low,
+                normaliser.average_high,
+            )
+        )  # fmt: skip
         self._clip = math.inf if corrector.config.clip is None else corrector.config.clip
         still = View(bodies, Snapshot(*[torch.zeros_like(bodies.rest)] * 4))
         config = corrector.config
@@ -109,13 +116,13 @@ class CompiledFeatures:
     def __call__(self, snapshot: Snapshot) -> None:
         """Fill in the features of a snapshot."""
         old = snapshot.correction
-        before, velocities, after, loads, correction = (
+        before, velocities, after, loads = (
             part.contiguous().numpy()
             for part in (
                 snapshot.positions, snapshot.velocities, snapshot.proposed, snapshot.forces,
-                torch.zeros_like(snapshot.positions) if old is None else old,
             )
         )  # fmt: skip
+        correction = self._still if old is None else old.contiguous().numpy()
         _deform(
             after, self._cells, EDGE_MEANS, self._inverses, self._touched, self._touching,
             self._rest_frames, self._gradients, self._turns, self.frames, self._strain,
@@ -131,6 +138,10 @@ class CompiledFeatures:
             self._clip, *self._of_nodes, *self._of_edges, self._rest_excess, self._x, self._e,
             self.excess,
         )  # fmt: skip
+
+    def strangeness(self) -> float:
+        """See `Normaliser.strangeness`: the largest of the body's mean inputs."""
+        return float(_strangeness(self._x, len(self.excess), *self._averages))
 
 
 def _columns(
@@ -258,6 +269,35 @@ def _features(  # type: ignore[no-untyped-def]
                     of_edge[6 + j] = (0.5 * turn - rest_turns[edge, j]) / scale
                 worst = max(worst, _write(of_edge, edge_places, edge_scales, clip, e[edge]))
             excess[n] = worst
+
+
+@njit(**OPTIONS)
+def _strangeness(x, count, mean, deviation, low, high):  # type: ignore[no-untyped-def]
+    """`Normaliser.strangeness` of the means over ``count`` rows of x, the largest."""
+    means, worst = np.zeros(x.shape[1]), 0.0
+    for n in range(count):
+        for k in range(len(means)):
+            means[k] += x[n, k]
+    for k in range(len(means)):
+        average = means[k] / count
+        farthest = mean[k] - low[k] if average < mean[k] else high[k] - mean[k]
+        farthest /= EXTREME
+        unit = deviation[k] if deviation[k] > farthest else farthest
+        found = abs(average - mean[k]) / unit
+        if not found <= worst:
+            worst = found if found == found else np.inf
+    return worst
+
+
+@njit(**OPTIONS)
+def largest_excess(values, low, high):  # type: ignore[no-untyped-def]
+    """How far numbers (k,) lie outside a range at most; infinite where one is not a number."""
+    worst = 0.0
+    for k in range(len(values)):
+        for outside in (low[k] - values[k], values[k] - high[k]):
+            if not outside <= worst:
+                worst = outside if outside == outside else np.inf
+    return worst
 
 
 @njit(inline="always", **OPTIONS)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from operator import is_
+from itertools import chain
+from operator import attrgetter, is_
 from typing import Any
 
 from torch import Tensor
@@ -26,12 +27,11 @@ class Contents:
 
     def __init__(self, corrector: Corrector) -> None:
         self._corrector, self.config = corrector, corrector.config
-        self._tables = [(table, tuple(table)) for table in _tables(corrector)]
-        self._parts = [
-            (table, name, table[name]) for table, names in self._tables for name in names
-        ]
-        self._kept = [part for _, _, part in self._parts]
-        self._tensors = [part for _, _, part in self._parts if isinstance(part, Tensor)]
+        tables = [*_tables(corrector)]
+        self._tables = [table for table in tables if table]
+        self._empty = [table for table in tables if not table]
+        self._names, self._parts = [*chain.from_iterable(self._tables)], [*self._there()]
+        self._tensors = [part for part in self._parts if isinstance(part, Tensor)]
         # of inference tensors torch does not count how often they are written
         self._counted = [tensor for tensor in self._tensors if not tensor.is_inference()]
         self._places, self._writes = self._where(), self._written()
@@ -41,10 +41,9 @@ class Contents:
         """Whether there are other modules, tensors or storage than there were."""
         if self._corrector.config is not self.config or self._where() != self._places:
             return True
-        if any(tuple(table) != names for table, names in self._tables):
+        if any(self._empty) or [*chain.from_iterable(self._tables)] != self._names:
             return True
-        there = (table[name] for table, name, _ in self._parts)
-        return not all(map(is_, there, self._kept))
+        return not all(map(is_, self._there(), self._parts))
 
     @property
     def changed(self) -> bool:
@@ -52,10 +51,16 @@ class Contents:
         return self._written() != self._writes or self.replaced
 
     def _where(self) -> list[int]:
-        return [tensor.data_ptr() for tensor in self._tensors]
+        return [*map(Tensor.data_ptr, self._tensors)]
 
     def _written(self) -> list[int]:
-        return [tensor._version for tensor in self._counted]
+        return [*map(_VERSION, self._counted)]
+
+    def _there(self) -> Iterator[Any]:
+        return chain.from_iterable(map(dict.values, self._tables))
+
+
+_VERSION = attrgetter("_version")
 
 
 def _tables(corrector: Corrector) -> Iterator[dict[str, Any]]:

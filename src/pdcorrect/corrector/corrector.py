@@ -21,6 +21,7 @@ from pdcorrect.corrector.features import (
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.normaliser import Normaliser
+from pdcorrect.corrector.values import Values
 
 
 class Answers(Protocol):
@@ -33,13 +34,13 @@ class Answers(Protocol):
     def of_view(self, view: View) -> Tensor:
         """Corrections (n, 3), m."""
 
-    def outside(self, view: View, margin: float) -> Tensor:
+    def outside(self, view: View, margin: float) -> Values:
         """Share of each body's nodes with inputs beyond a margin, (B,)."""
 
-    def unlike(self, view: View) -> Tensor:
+    def unlike(self, view: View) -> Values:
         """How far each body's mean inputs are from those of training bodies, (B,)."""
 
-    def shape_excess(self, bodies: BodyGraph) -> Tensor:
+    def shape_excess(self, bodies: BodyGraph) -> Values:
         """How far measures of each body at rest lie outside their range in training, (B,)."""
 
 

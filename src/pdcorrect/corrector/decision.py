@@ -1,21 +1,20 @@
 """`corrected_step`: where a network's corrections go, and which of them count.
 
-The same for one scene and for many: what a step is made of is a `CoarseStep`.
+The same for one scene, in arrays, and for many, in tensors: what a step is made of is a
+`CoarseStep`.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, TypeVar
 
-import torch
-from torch import Tensor
-
-from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, Measured, Reason
+from pdcorrect.corrector.values import Values, filled, where
 
 _HALVINGS = 6
 """How often a limited correction is halved before it is refused."""
@@ -24,22 +23,46 @@ Answer = TypeVar("Answer")
 """A coarse solver's result of a step of B scenes."""
 
 
+class Bodies(Protocol):
+    """What a decision asks about B bodies with n nodes in all."""
+
+    @property
+    def cell_size(self) -> Values:
+        """(B,), m."""
+
+    def by_node(self, values: Values) -> Values:
+        """Values (B,) of bodies at their nodes: (n,), or (1,) of one body."""
+
+    def some(self, flags: Values) -> Values:
+        """Whether any of the flags (n, ...) of each body is set, (B,)."""
+
+    def sound(self, values: Values) -> Values:
+        """Whether all values (n, ...) of each body are finite, (B,)."""
+
+
 class CoarseStep(Protocol[Answer]):
     """One step of B scenes, with n nodes in all, from given states."""
+
+    @property
+    def bodies(self) -> Bodies:
+        """Those of the scenes."""
+
+    def own(self, values: Values) -> Values:
+        """Values of a network or gate as what the step computes with."""
 
     def view(self, answer: Answer | None) -> View:
         """What the network sees, with the coarse answer if it is asked after that."""
 
-    def solved(self, added: Tensor | None = None, guess: Tensor | None = None) -> Answer:
+    def solved(self, added: Values | None = None, guess: Values | None = None) -> Answer:
         """The coarse answer, also under the loads of a correction ``added`` (n, 3), m.
 
         The solver begins at positions ``guess`` (n, 3), m, in scenes where it is finite.
         """
 
-    def ok(self, answer: Answer) -> Tensor:
+    def ok(self, answer: Answer) -> Values:
         """Whether the step of each scene converged, (B,) bool."""
 
-    def moved(self, answer: Answer, correction: Tensor) -> Answer:
+    def moved(self, answer: Answer, correction: Values) -> Answer:
         """The answer with a correction (n, 3), m, in its state."""
 
     def measured(self, answer: Answer) -> Measured:
@@ -48,7 +71,7 @@ class CoarseStep(Protocol[Answer]):
     def before(self) -> Measured | None:
         """Those before it, without work; None where they are not known."""
 
-    def chosen(self, which: Tensor, one: Answer, other: Answer) -> Answer:
+    def chosen(self, which: Values, one: Answer, other: Answer) -> Answer:
         """Scenes of ``one`` where ``which`` (B,) holds, else of ``other``, bit for bit."""
 
 
@@ -58,7 +81,7 @@ class Decision:
 
     Attributes
     ----------
-    bodies : BodyGraph
+    bodies : Bodies
     asked : (n, 3)
         What the network gave, m; zero where that is not finite, or the body or its inputs are
         unknown.
@@ -68,45 +91,49 @@ class Decision:
         On what it gave, below 1 where a gate limited it.
     """
 
-    bodies: BodyGraph
-    asked: Tensor
-    reasons: Tensor
-    factors: Tensor
+    bodies: Bodies
+    asked: Values
+    reasons: Values
+    factors: Values
 
     @classmethod
-    def of(cls, corrector: Answers, view: View, gate: Gate | None) -> Decision:
+    def of(
+        cls, step: CoarseStep[Answer], view: View, corrector: Answers, gate: Gate | None
+    ) -> Decision:
         """Ask the network, if a gate lets it see one of the bodies."""
-        bodies, factors = view.bodies, torch.ones_like(view.bodies.cell_size)
-        reasons = torch.zeros_like(factors, dtype=torch.int64)
+        bodies, factors = step.bodies, filled(step.bodies.cell_size, 1.0)
+        foreign: Values = False
         if gate is not None:
-            reasons[gate.foreign(corrector, bodies)] = int(Reason.BODY)
-            if reasons.all():
-                return cls(bodies, torch.zeros_like(bodies.rest), reasons, factors)
-        asked = corrector.of_view(view)
-        reasons[(reasons == 0) & ~bodies.sound(asked)] = int(Reason.NOT_FINITE)
+            foreign = step.own(gate.foreign(corrector, view.bodies))
+            if foreign.all():
+                nothing = filled(step.own(view.snapshot.proposed), 0.0)
+                return cls(bodies, nothing, where(foreign, int(Reason.BODY), 0), factors)
+        asked = step.own(corrector.of_view(view))
+        reasons = where(bodies.sound(asked), int(Reason.NONE), int(Reason.NOT_FINITE))
         if gate is not None:
-            reasons[(reasons == 0) & gate.unknown(corrector, view)] = int(Reason.FEATURES)
-        asked = torch.where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
+            unknown = step.own(gate.unknown(corrector, view)) & (reasons == 0)
+            reasons = where(unknown, int(Reason.FEATURES), reasons)
+            reasons = where(foreign, int(Reason.BODY), reasons)
+        asked = where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
         return cls(bodies, asked, reasons, factors)
 
     @cached_property
-    def counts(self) -> Tensor:
+    def counts(self) -> Values:
         """Whether a body's correction is applied and not zero, (B,): else nothing changes."""
-        there = (self.asked != 0.0).any(dim=1).to(self.asked)
-        return (self.reasons == 0) & (self.bodies.node_sums(there) > 0.0)
+        return (self.reasons == 0) & self.bodies.some(self.asked != 0.0)
 
     @property
-    def correction(self) -> Tensor:
+    def correction(self) -> Values:
         """As applied, (n, 3), m; zero where it was refused."""
-        return self.scaled(torch.where(self.reasons == 0, self.factors, 0.0))
+        return self.scaled(where(self.reasons == 0, self.factors, 0.0))
 
-    def scaled(self, factors: Tensor) -> Tensor:
+    def scaled(self, factors: Values) -> Values:
         """What the network gave times (B,)."""
         return self.asked * self.bodies.by_node(factors)[:, None]
 
-    def refused(self, reasons: Tensor) -> Decision:
+    def refused(self, reasons: Values) -> Decision:
         """With reasons (B,) that were found for corrections that count."""
-        return replace(self, reasons=torch.where(self.counts, reasons, self.reasons))
+        return replace(self, reasons=where(self.counts, reasons, self.reasons))
 
     def judged(
         self, gate: Gate, step: CoarseStep[Answer], coarse: Answer
@@ -122,7 +149,7 @@ class Decision:
             failed = self.counts & (reasons > 0)
             if not failed.any():
                 break
-            factors = torch.where(failed, 0.5 * factors, factors)
+            factors = where(failed, 0.5 * factors, factors)
             moved = step.moved(coarse, self.scaled(factors))
             reasons = gate.reasons(step.measured(moved), beside, gate.energy)
         return replace(self.refused(reasons), factors=factors), moved
@@ -139,13 +166,13 @@ def corrected_step(
     if corrector.config.placement == "state":
         return _state(step, corrector, gate)
     view = step.view(None)
-    decision = Decision.of(corrector, view, gate)
+    decision = Decision.of(step, view, corrector, gate)
     if not decision.counts.any():
         answer = step.solved()
     elif corrector.config.placement == "force":
         answer, decision = _force(step, decision, gate)
     else:
-        answer, decision = _guess(step, decision, view)
+        answer, decision = _guess(step, decision, step.own(view.snapshot.proposed))
     return answer, answer, decision
 
 
@@ -153,8 +180,8 @@ def _state(
     step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     coarse = step.solved()
-    decision = Decision.of(corrector, step.view(coarse), gate)
-    reasons = torch.where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
+    decision = Decision.of(step, step.view(coarse), corrector, gate)
+    reasons = where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
     decision = replace(decision, reasons=reasons)
     if not decision.counts.any():
         return coarse, coarse, decision
@@ -170,30 +197,32 @@ def _force(
 ) -> tuple[Answer, Decision]:
     forced = step.solved(added=decision.correction)
     ok, measured = step.ok(forced), None
-    reasons = torch.where(ok, int(Reason.NONE), int(Reason.SOLVER))
+    reasons = where(ok, int(Reason.NONE), int(Reason.SOLVER))
     if gate is not None and gate.judges:
         measured, before = step.measured(forced), step.before()
         rise = None if gate.energy is None else 0.0
-        found = torch.full_like(reasons, int(Reason.ENERGY))
+        found = filled(reasons, int(Reason.ENERGY))
         found = found if before is None else gate.reasons(measured, before, rise)
-        reasons = torch.where(ok, found, reasons)
+        reasons = where(ok, found, reasons)
     if not (decision.counts & (reasons > 0)).any():
         return forced, decision
     plain = step.solved()
     if gate is not None and measured is not None:
         found = gate.reasons(measured, step.measured(plain), gate.energy)
-        found = torch.where(step.ok(plain), found, int(Reason.SOLVER))
-        reasons = torch.where(ok & (reasons > 0), found, reasons)
+        found = where(step.ok(plain), found, int(Reason.SOLVER))
+        reasons = where(ok & (reasons > 0), found, reasons)
     decision = decision.refused(reasons)
     return step.chosen(decision.counts, forced, plain), decision
 
 
-def _guess(step: CoarseStep[Answer], decision: Decision, view: View) -> tuple[Answer, Decision]:
+def _guess(
+    step: CoarseStep[Answer], decision: Decision, proposed: Values
+) -> tuple[Answer, Decision]:
     at_nodes = decision.bodies.by_node(decision.counts)[:, None]
-    guess = torch.where(at_nodes, view.snapshot.proposed + decision.correction, torch.nan)
+    guess = where(at_nodes, proposed + decision.correction, math.nan)
     guessed = step.solved(guess=guess)
     failed = decision.counts & ~step.ok(guessed)
     if not failed.any():
         return guessed, decision
-    decision = decision.refused(torch.where(failed, int(Reason.SOLVER), int(Reason.NONE)))
+    decision = decision.refused(where(failed, int(Reason.SOLVER), int(Reason.NONE)))
     return step.chosen(decision.counts, guessed, step.solved()), decision

@@ -64,9 +64,26 @@ class View:
     def __init__(self, bodies: BodyGraph, snapshot: Snapshot) -> None:
         self.bodies, self.snapshot = bodies, snapshot
         self.known: dict[str, Tensor] = {}
-        self.size = bodies.by_node(bodies.cell_size)[:, None]
-        self.step = bodies.by_node(bodies.time_step)[:, None]
-        self.receiver, self.sender = bodies.edge_index
+
+    @cached_property
+    def size(self) -> Tensor:
+        """Cell size at nodes, (n, 1), m."""
+        return self.bodies.by_node(self.bodies.cell_size)[:, None]
+
+    @cached_property
+    def step(self) -> Tensor:
+        """Time step at nodes, (n, 1), s."""
+        return self.bodies.by_node(self.bodies.time_step)[:, None]
+
+    @cached_property
+    def receiver(self) -> Tensor:
+        """Nodes that edges lead to, (E,) int64."""
+        return self.bodies.edge_index[0]
+
+    @cached_property
+    def sender(self) -> Tensor:
+        """Nodes that edges come from, (E,) int64."""
+        return self.bodies.edge_index[1]
 
     @property
     def rest_frames(self) -> Tensor:

@@ -13,11 +13,11 @@ from typing import Annotated
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.features import View
+from pdcorrect.corrector.values import Values, where
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import NonNegative, Number, Strict
 
@@ -44,6 +44,8 @@ class Reason(IntEnum):
 class Measured:
     """What a gate looks at in the states of B scenes after a step, or before it.
 
+    Arrays or tensors.
+
     Attributes
     ----------
     ratios : (B, C)
@@ -54,9 +56,9 @@ class Measured:
         Of the scene's loads since the step began, J, without the forces of corrections.
     """
 
-    ratios: Tensor
-    stored: Tensor
-    work: Tensor
+    ratios: Values
+    stored: Values
+    work: Values
 
 
 class Gate(Strict):
@@ -120,38 +122,38 @@ class Gate(Strict):
     energy: NonNegative | None = 8.0
     limit: bool = False
 
-    def foreign(self, corrector: Answers, bodies: BodyGraph) -> Tensor:
+    def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Whether bodies at rest are too unlike those of its training, (B,) bool."""
         if self.body is None:
             return torch.zeros_like(bodies.cell_size, dtype=torch.bool)
         return corrector.shape_excess(bodies) > self.body
 
-    def unknown(self, corrector: Answers, view: View) -> Tensor:
-        """Whether the network's inputs are too far from its training data, (B,) bool."""
-        bodies = view.bodies
-        found = torch.zeros(bodies.bodies, dtype=torch.bool, device=bodies.rest.device)
+    def unknown(self, corrector: Answers, view: View) -> Values:
+        """Whether the network's inputs are too far from its training data, (B,) bool, or False."""
+        found: Values = False
         if self.margin is not None:
-            found |= corrector.outside(view, self.margin) > self.share
+            found = found | (corrector.outside(view, self.margin) > self.share)
         if self.average is not None:
-            found |= corrector.unlike(view) > self.average
+            found = found | (corrector.unlike(view) > self.average)
         return found
 
-    def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Tensor:
+    def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Values:
         """Reasons (B,) to refuse an answer beside another one, which is the coarse one.
 
         ``rise`` takes the place of ``energy``.  What is not a number does not pass.
         """
-        reasons = torch.zeros(len(answer.stored), dtype=torch.int64, device=answer.stored.device)
+        reasons: Values = int(Reason.NONE)
         if rise is not None:
-            cap = coarse.stored - coarse.work + rise * (coarse.stored + coarse.work.abs())
-            reasons = torch.where(answer.stored - answer.work <= cap, reasons, int(Reason.ENERGY))
-        below = torch.zeros_like(answer.ratios, dtype=torch.bool)
+            cap = coarse.stored - coarse.work + rise * (coarse.stored + abs(coarse.work))
+            reasons = where(answer.stored - answer.work <= cap, reasons, int(Reason.ENERGY))
+        below: Values = False
         if self.volume is not None:
-            below |= ~(answer.ratios > self.volume)
+            below = ~(answer.ratios > self.volume)
         if self.crushing is not None:
-            below |= ~(answer.ratios >= self.crushing * coarse.ratios.clamp_min(0.0))
+            bound = self.crushing * where(coarse.ratios < 0.0, 0.0, coarse.ratios)
+            below = below | ~(answer.ratios >= bound)
         worse = below & ~(answer.ratios >= coarse.ratios)
-        return torch.where(worse.any(dim=1), int(Reason.INVERSION), reasons)
+        return where(worse.any(axis=1), int(Reason.INVERSION), reasons)
 
     @property
     def judges(self) -> bool:

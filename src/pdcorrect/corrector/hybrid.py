@@ -125,7 +125,8 @@ class HybridStepper:
         with torch.no_grad(), one_thread(torch.device("cpu")):
             if isinstance(self._answers, CompiledCorrector):
                 self._answers.refresh()
-            Decision.of(self._answers, self._step(self.problem.rest_state()).view(None), self.gate)
+            step = self._step(self.problem.rest_state())
+            Decision.of(step, step.view(None), self._answers, self.gate)
         return self
 
     def describe(self) -> dict[str, str]:
@@ -171,15 +172,15 @@ class HybridStepper:
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):
             result, _, decision = corrected_step(step, self._answers, self.gate)
-        correction: Array = decision.correction.numpy()
-        reason = float(decision.reasons)
+        correction: Array = decision.correction
+        reason = float(decision.reasons.item())
         after = result.state
         if self._remembers:
             after = replace(after, memory={**after.memory, MEMORY: correction})
         stats = {
             **result.stats,
             "correction": float(np.sqrt(np.square(correction).sum(axis=1).max())),
-            "correction_factor": float(decision.factors),
+            "correction_factor": float(decision.factors.item()),
             "refused": float(reason > 0.0),
             "gate": reason,
             "network_seconds": time.perf_counter() - started - step.seconds,

@@ -29,7 +29,7 @@ Means that symmetry makes vanish in all training bodies would make any other loo
 _PARTS = ("mean", "deviation", "low", "high")
 """What is known of each feature, by the names of the buffers."""
 
-_EXTREME = 3.5
+EXTREME = 3.5
 """Deviations that the extremes of inputs, and of bodies' means, count as where they are farther.
 
 Some inputs are large in few steps only, as in kicks: their deviation over all steps is little.
@@ -228,7 +228,7 @@ class Normaliser(nn.Module):
             getattr(self, f"average_{part}").to(averages) for part in _PARTS
         )
         farthest = torch.where(averages < mean, mean - low, high - mean)
-        found = (averages - mean).abs() / torch.maximum(deviation, farthest / _EXTREME)
+        found = (averages - mean).abs() / torch.maximum(deviation, farthest / EXTREME)
         return torch.where(found.isnan(), torch.inf, found)
 
     def shape_excess(self, shapes: Tensor) -> Tensor:
@@ -238,7 +238,7 @@ class Normaliser(nn.Module):
         """
         low, high = self.shape_low.to(shapes), self.shape_high.to(shapes)
         found = torch.maximum(low - shapes, shapes - high).clamp_min(0.0)
-        return torch.where(found.isnan(), torch.inf, found)
+        return found.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def scale(self, name: str) -> Scale:
         """What is known of one feature."""
@@ -261,7 +261,7 @@ def _units(mean: Tensor, deviation: Tensor, low: Tensor, high: Tensor) -> tuple[
     least = torch.where(constant, _CONSTANT_UNIT * torch.where(size > 0.0, size, 1.0), deviation)
 
     def unit(farthest: Tensor) -> Tensor:
-        return torch.where(constant, least, torch.maximum(least, farthest / _EXTREME))
+        return torch.where(constant, least, torch.maximum(least, farthest / EXTREME))
 
     return unit(mean - low), unit(high - mean)
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-import numpy as np
-import torch
-
+from pdcorrect.corrector.values import where
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.schemes import Scheme
 
@@ -41,7 +39,7 @@ def ballistic(state: Any, h: float, forces: Any, mass: Any, free: Any, held: Any
         Prescribed positions at the end of the step, m; not used where a component may move.
     """
     ahead = state.positions + h * state.velocities + h**2 * forces / mass[..., None]
-    return (np if isinstance(ahead, np.ndarray) else torch).where(free, ahead, held)
+    return where(free, ahead, held)
 
 
 def as_forces(correction: Any, h: float, mass: Any) -> Any:

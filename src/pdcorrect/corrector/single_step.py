@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,10 +14,36 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.features import Snapshot, View
 from pdcorrect.corrector.gate import Measured
 from pdcorrect.corrector.placements import Velocity, as_forces, ballistic, moved
+from pdcorrect.corrector.values import Values
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class OneBody:
+    """What a `Decision` asks about one body, in arrays.
+
+    Attributes
+    ----------
+    cell_size : (1,)
+        m.
+    """
+
+    cell_size: Array
+
+    def by_node(self, values: Values) -> Values:
+        """Values (1,), which are those of all nodes."""
+        return values
+
+    def some(self, flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Whether any flag is set, (1,)."""
+        return np.array([flags.any()])
+
+    def sound(self, values: Array) -> NDArray[np.bool_]:
+        """Whether all values are finite, (1,)."""
+        return np.array([np.isfinite(values).all()])
 
 
 class SingleCoarseStep:
@@ -53,13 +78,21 @@ class SingleCoarseStep:
         forces: Array | None = None,
         previous: Array | None = None,
     ) -> None:
-        self._coarse, self._bodies, self._velocity = coarse, bodies, velocity
+        self._coarse, self._graph, self._velocity = coarse, bodies, velocity
         self._problem, self._state, self._forces = coarse.problem, state, forces
         self._previous, self.seconds = previous, 0.0
-        self._last: tuple[State, Array] | None = None
         stage = coarse.integrate(self._problem, state, coarse.time_step, forces)
         loads = self._problem.external_forces(*stage.loads_over, stage.loads_at)
         self._loads: Array = loads if forces is None else loads + forces
+
+    @property
+    def bodies(self) -> OneBody:
+        """See `CoarseStep`."""
+        return OneBody(self._graph.cell_size.numpy())
+
+    def own(self, values: Values) -> Values:
+        """See `CoarseStep`."""
+        return np.asarray(values)
 
     def view(self, answer: StepResult | None) -> View:
         """See `CoarseStep`."""
@@ -71,37 +104,36 @@ class SingleCoarseStep:
             else answer.state.positions
         )
         arrays = state.positions, state.velocities, proposed, self._loads
-        positions, velocities, after, loads = map(torch.tensor, arrays)
-        old = None if self._previous is None else torch.tensor(self._previous)
-        return View(self._bodies, Snapshot(positions, velocities, after, loads, old))
+        positions, velocities, after, loads = map(_tensor, arrays)
+        old = None if self._previous is None else _tensor(self._previous)
+        return View(self._graph, Snapshot(positions, velocities, after, loads, old))
 
-    def solved(self, added: Tensor | None = None, guess: Tensor | None = None) -> StepResult:
+    def solved(self, added: Array | None = None, guess: Array | None = None) -> StepResult:
         """See `CoarseStep`; the work of a correction's forces is no ``external_work``."""
         started, forces = time.perf_counter(), self._forces
         push: Array | None = None
         if added is not None:
-            push = as_forces(added.numpy(), self._coarse.time_step, self._problem.mass)
+            push = as_forces(added, self._coarse.time_step, self._problem.mass)
             forces = push if forces is None else forces + push
-        start = None if guess is None else guess.numpy()
-        answer = self._coarse(self._state, forces, guess=start)
+        answer = self._coarse(self._state, forces, guess=guess)
         self.seconds += time.perf_counter() - started
         if push is None:
             return answer
         work = answer.stats["external_work"] - float(np.vdot(push, self._way(answer)))
         return replace(answer, stats={**answer.stats, "external_work": work})
 
-    def ok(self, answer: StepResult) -> Tensor:
+    def ok(self, answer: StepResult) -> NDArray[np.bool_]:
         """See `CoarseStep`."""
-        return torch.tensor([answer.status.ok])
+        return np.array([answer.status.ok])
 
-    def moved(self, answer: StepResult, correction: Tensor) -> StepResult:
+    def moved(self, answer: StepResult, correction: Array) -> StepResult:
         """See `CoarseStep`; statistics are those of the corrected state."""
-        shift = correction.numpy()
         scheme = self._coarse.integrate.scheme(self._state, self._coarse.time_step)
-        positions, velocities, memory = moved(scheme, answer.state, shift, self._velocity)
+        positions, velocities, memory = moved(scheme, answer.state, correction, self._velocity)
         state = State(positions, velocities, answer.state.time, memory)
-        ratio = float(self._ratios(state).min())
-        work = answer.stats["external_work"] + float(np.vdot(self._loads, shift))
+        ratios = self._problem.volume_ratios(positions)
+        ratio = float(ratios.min())
+        work = answer.stats["external_work"] + float(np.vdot(self._loads, correction))
         stats = {
             **answer.stats,
             "elastic_energy": self._problem.energy(positions, answer.modes),
@@ -110,32 +142,27 @@ class SingleCoarseStep:
             "smallest_volume_ratio": ratio,
         }
         status = _status(answer.status, ratio)
-        return replace(answer, state=state, status=status, stats=stats, modes=None)
+        return replace(
+            answer, state=state, status=status, stats=stats, modes=None, volume_ratios=ratios
+        )
 
     def measured(self, answer: StepResult) -> Measured:
         """See `CoarseStep`."""
         stored = answer.stats["elastic_energy"] + answer.stats["kinetic_energy"]
-        return self._measured(answer.state, stored, np.vdot(self._loads, self._way(answer)))
+        ratios = answer.volume_ratios
+        if ratios is None:
+            ratios = self._problem.volume_ratios(answer.state.positions)
+        return _measured(ratios, stored, float(np.vdot(self._loads, self._way(answer))))
 
     def before(self) -> Measured:
         """See `CoarseStep`."""
-        energy = self._problem.energy(self._state.positions)
-        return self._measured(self._state, energy + self._kinetic(self._state), 0.0)
+        positions = self._state.positions
+        stored = self._problem.energy(positions) + self._kinetic(self._state)
+        return _measured(self._problem.volume_ratios(positions), stored, 0.0)
 
-    def chosen(self, which: Tensor, one: StepResult, other: StepResult) -> StepResult:
+    def chosen(self, which: NDArray[np.bool_], one: StepResult, other: StepResult) -> StepResult:
         """See `CoarseStep`."""
-        return one if bool(which) else other
-
-    def _measured(self, state: State, stored: float, work: float | np.floating[Any]) -> Measured:
-        ratios = torch.from_numpy(self._ratios(state))[None]
-        numbers = torch.tensor([[stored], [float(work)]], dtype=torch.float64)
-        return Measured(ratios, numbers[0], numbers[1])
-
-    def _ratios(self, state: State) -> Array:
-        """Smallest det F of each cell, (C,); those of the state asked for last are kept."""
-        if self._last is None or self._last[0] is not state:
-            self._last = state, self._problem.volume_ratios(state.positions)
-        return self._last[1]
+        return one if which.item() else other
 
     def _way(self, answer: StepResult) -> Array:
         way: Array = answer.state.positions - self._state.positions
@@ -143,6 +170,15 @@ class SingleCoarseStep:
 
     def _kinetic(self, state: State) -> float:
         return 0.5 * float(np.vdot(state.velocities, self._problem.mass_times(state.velocities)))
+
+
+def _measured(ratios: Array, stored: float, work: float) -> Measured:
+    return Measured(ratios[None], np.array([stored]), np.array([work]))
+
+
+def _tensor(array: Array) -> Tensor:
+    """Of the same memory, which nobody writes to, or of a copy where torch would warn of that."""
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
 def _status(coarse: Status, ratio: float) -> Status:

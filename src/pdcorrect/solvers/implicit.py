@@ -316,6 +316,7 @@ class ImplicitStepper:
     def _report(self, outcome: _Outcome, effort: _Effort) -> StepResult:
         state, minimum = outcome.state, outcome.minimum
         kinetic = 0.5 * np.vdot(state.velocities, self.problem.mass_times(state.velocities))
+        ratios = self.problem.volume_ratios(state.positions)
         stats = {
             "evaluations": float(effort.evaluations),
             "elastic_energy": outcome.elastic_energy,
@@ -323,15 +324,16 @@ class ImplicitStepper:
             "external_work": outcome.external_work,
             "clamp_work": outcome.clamp_work,
             "damping_loss": outcome.damping_loss,
-            "smallest_volume_ratio": float(self.problem.volume_ratios(state.positions).min()),
+            "smallest_volume_ratio": float(ratios.min()),
         }
         status = minimum.status
         if status is Status.CONVERGED and stats["smallest_volume_ratio"] <= 0.0:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
         return StepResult(
-            state, status, effort.iterations, residual, minimum.estimate, stats, outcome.modes
-        )
+            state, status, effort.iterations, residual, minimum.estimate, stats, outcome.modes,
+            ratios,
+        )  # fmt: skip
 
 
 def _outcome(
@@ -348,7 +350,7 @@ def _outcome(
     return _Outcome(
         after,
         minimum,
-        elastic_energy=problem.energy_and_forces(end)[0],
+        elastic_energy=problem.energy_of(end),
         external_work=float(np.vdot(objective.forces[:nodes], moved)),
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, h),

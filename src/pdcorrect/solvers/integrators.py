@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -73,7 +74,7 @@ class Integrator:
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        return self.scheme_of(h, _started(state, h))
+        return _scheme(self.scheme_of, h, _started(state, h))
 
     def held(self, state: State, h: float) -> Integrator:
         """The same integrator with the scheme of that step, whatever the length of its own step.
@@ -135,6 +136,11 @@ class Integrator:
             finish,
             scheme.gain,
         )
+
+
+@lru_cache(maxsize=64)
+def _scheme(scheme_of: SchemeOf, h: float, started: bool) -> Scheme:
+    return scheme_of(h, started)
 
 
 def solution(scheme: Scheme, before: State, after: State, problem: Problem) -> Array:
