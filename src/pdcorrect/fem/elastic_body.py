@@ -174,7 +174,7 @@ class ElasticBody:
         return out
 
     def corner_volume_ratios(self, positions: Array) -> Array:
-        """Det F at the corners of each cell, (C, 8), of the trilinear map of its corners.
+        """Volume ratios, det F, at the corners of each cell, (C, 8), of the trilinear map of them.
 
         Folded layers of cells show here first: they may be at a minimum of the energy with
         det F positive at all quadrature points (`volume_ratios`) and negative at corners,
