@@ -12,7 +12,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli, report, report_notes
+from pdcorrect import cli, report, run_text
 from pdcorrect.comparison_cases import HEX27, cases_for, without_best
 from pdcorrect.errors import InputError
 
@@ -143,6 +143,77 @@ def test_errors_from_another_element_than_the_references_are_told(thick):
     assert "(element hex8, mass lumped)" in told
 
 
+def test_rows_unlike_the_reference_are_named_by_element_mass_and_total_mass(thick):
+    told = report.notes(pc.compare(thick))
+    (found,) = [note for note in told if "unlike the reference's" in note]
+    assert found.startswith(
+        "coarse PD, coarse Newton, intermediate PD: element hex8, mass lumped, unlike the "
+        "reference's (element hex8-bubble-mean, mass averaged, total mass 0.096 kg)"
+    )
+    assert any("is the mesh's, the element's and the mass's." in note for note in told)
+
+
+def test_rows_of_another_total_mass_and_the_row_of_the_right_one_are_told(thick):
+    heavy = thick.with_changes(solver={"mass": "per-node"})
+    right = dataclasses.replace(
+        pc.evaluate.CASES[2], label="coarse PD, total mass", base="total-mass"
+    )
+    cases = (*pc.evaluate.CASES[:1], *pc.evaluate.CASES[2:], right)
+    told = report.notes(pc.compare(heavy, cases=cases))
+    (unlike,) = [note for note in told if "unlike the reference's" in note]
+    assert unlike.startswith("coarse PD, coarse Newton: element hex8, mass per-node, total mass 0.")
+    assert any("is the mesh's and the total mass's." in note for note in told)
+    (what,) = [note for note in told if note.startswith("coarse PD, total mass: ")]
+    assert what.endswith("By the mass rule per-node a mesh is the heavier the coarser it is.")
+    told = " ".join(report.notes(pc.compare(thick, cases=cases)))
+    assert "By the mass rule lumped meshes have one mass, so it changes nothing" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"solver": "newton"}, "solver = 'newton', expected 'pd'"),
+        ({"refine": 2}, "refine = 2, expected 1"),
+        ({"base": "plain"}, "base = 'plain', expected 'best'"),
+        ({"element": "hex27"}, "element = 'hex27', expected None"),
+    ],
+)
+def test_a_case_does_not_ignore_what_its_corrector_is_not_for(thick, changes, words):
+    pytest.importorskip("torch_geometric")
+    case = pc.evaluate.Case("odd", "pd", 1, "best", MODEL)
+    with pytest.raises(InputError, match=f"odd: {words}"):
+        pc.evaluate.case_stepper(thick, dataclasses.replace(case, **changes))
+
+
+def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once(
+    program, thick, tmp_path
+):
+    pytest.importorskip("torch_geometric")
+    (tmp_path / "scene.toml").write_text(thick.with_changes(solver={"element": "hex27"}).to_toml())
+    arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
+    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
+    assert status == cli.BAD_INPUT
+    assert f"model {MODEL}: corrects the best coarse model, and this scene has none: it has" in err
+    assert not (tmp_path / "r").exists()
+    own = pc.best_coarse(thick)  # has none beside its own, which is as good
+    assert labels(cases_for(own, [MODEL]))[-1] == f"hybrid {MODEL}"
+
+
+def test_a_foreign_integrator_is_told_of_in_the_notes(stiff):
+    pytest.importorskip("torch_geometric")
+    scene = stiff.with_changes(time={"integrator": "midpoint"})
+    cases = cases_for(scene, [MODEL])[4:]
+    (found,) = [n for n in report.notes(pc.compare(scene, 1, cases)) if "has never seen" in n]
+    assert "trained on steps by backward-euler, and the scene's integrator is midpoint" in found
+    assert not any("has never seen" in n for n in report.notes(pc.compare(stiff, 1, cases)))
+
+
+def test_large_numbers_have_no_powers_of_ten():
+    assert [run_text.three_digits(x) for x in (0.01234, 999.4, 999.6, 12345.6)] == [
+        "0.0123", "999", "1000", "12346"
+    ]  # fmt: skip
+
+
 def test_a_row_whose_corrections_are_all_refused_says_so(stiff, tmp_path):
     pytest.importorskip("torch_geometric")
     coarse, hybrid = cases_for(stiff, [MODEL])[4:]
@@ -179,7 +250,7 @@ def test_some_refused_corrections_are_counted_beside_the_label(stiff):
 
 def test_every_reason_of_a_gate_has_a_meaning():
     gate = pytest.importorskip("pdcorrect.corrector.gate")
-    assert list(report_notes._MEANINGS) == list(gate.refusals([]))
+    assert list(run_text._MEANINGS) == list(gate.refusals([]))
 
 
 def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):

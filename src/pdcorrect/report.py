@@ -16,7 +16,8 @@ from pdcorrect.environment import environment
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.io.vtk import write_vtu_series
 from pdcorrect.replacement import make_folder, write_text
-from pdcorrect.report_notes import inverted_frames, notes, refused_share, shown_labels
+from pdcorrect.report_notes import notes, refused_share, shown_labels
+from pdcorrect.run_text import inverted_frames, three_digits
 
 __all__ = [
     "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",
@@ -50,8 +51,8 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
                 "ref." if is_reference else _percent(row.omega),
-                f"{1e3 * row.seconds_a_frame:.3g}",
-                f"{reference_seconds / row.seconds_a_frame:.3g}x",
+                three_digits(1e3 * row.seconds_a_frame),
+                f"{three_digits(reference_seconds / row.seconds_a_frame)}x",
                 f"{row.iterations_a_frame:.1f}",
             )
         )
@@ -231,8 +232,7 @@ def _panel_label(comparison: Comparison, row: Row) -> str:
         if row.label == comparison.reference
         else f"RMS error {1e3 * row.rms_error:.2g} mm"
     )
-    ms = 1e3 * row.seconds_a_frame
-    time = f"{ms:.3g}" if ms < 999.5 else f"{ms:.0f}"  # no powers of ten
+    time = three_digits(1e3 * row.seconds_a_frame)
     refused = refused_share(comparison, row)
     return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame" + (
         f"\n{refused}" if refused else ""
