@@ -62,7 +62,7 @@ def test_the_steps_are_those_of_the_hybrid_on_its_own_base(program, learned, tmp
     assert run.attributes["dataset"] == pc.load_model(MODEL).record.dataset
     assert "corrections: at most" in out
     assert "refused" not in out
-    assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 4
+    assert len(list((tmp_path / "vtu").glob("run_*.vtu"))) == 4
 
 
 def test_a_model_of_the_right_mass_steps_a_body_of_that_mass(program, learned, tmp_path):
@@ -105,6 +105,7 @@ def test_a_hybrid_is_not_continued_as_something_else(program, learned, tmp_path,
         (("--model", MODEL, "--refine", 2), "expected --refine 1"),
         (("--model", MODEL, "--solver", "newton"), "expected --solver pd"),
         (("--no-gate",), "--no-gate without --model"),
+        (("--model", ""), "--model '': an empty name"),
         (("--model", "nothing"), "model 'nothing': not in"),
         (("--model", "./nothing"), "expected a folder with a model"),
     ],

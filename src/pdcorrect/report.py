@@ -14,10 +14,11 @@ import numpy as np
 import pdcorrect.figures as figures
 from pdcorrect.environment import environment
 from pdcorrect.evaluate import Comparison, Row
-from pdcorrect.io.vtk import write_vtu_series
+from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.report_notes import notes, refused_share, shown_labels
 from pdcorrect.run_text import inverted_frames, three_digits
+from pdcorrect.state import Trajectory
 
 __all__ = [
     "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",
@@ -134,6 +135,8 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
     """Write every run for ParaView, with stress, into ``vtu`` inside a report's folder.
 
+    Series of an earlier report there, of rows that this one does not have, are deleted.
+
     Returns
     -------
     list of Path
@@ -145,13 +148,24 @@ def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
         If they cannot be written.
     """
     target = make_folder(Path(folder) / VTU)
-    found: dict[str, Path] = {}
+    runs = _named_runs(comparison)
+    for stale in {path.stem for path in target.glob("*.pvd")} - set(runs):
+        delete_vtu_series(target, stale)
+    return [
+        write_vtu_series(run, target, name=name, stress_of=run.problem)
+        for name, run in runs.items()
+    ]
+
+
+def _named_runs(comparison: Comparison) -> dict[str, Trajectory]:
+    """Runs of the rows by the names of their files."""
+    found: dict[str, Trajectory] = {}
     for row in comparison.rows:
-        run, name = comparison.runs[row.label], _file_name(row.label)
+        name = _file_name(row.label)
         while name in found:  # labels that differ in other signs only
             name += "-again"
-        found[name] = write_vtu_series(run, target, name=name, stress_of=run.problem)
-    return [*found.values()]
+        found[name] = comparison.runs[row.label]
+    return found
 
 
 def _file_name(label: str) -> str:

@@ -34,8 +34,8 @@ def simulate(
     model: Annotated[
         Optional[str],
         typer.Option(
-            help="Correct the steps by this model, a name or a folder, on the coarse model that it "
-            "is for (extra 'learn')."
+            help="Correct the steps by this model, a name (docs/results.md and models/README.md "
+            "list them) or a folder, on the coarse model that it is for (extra 'learn')."
         ),
     ] = None,
     gate: Annotated[
@@ -77,7 +77,9 @@ def simulate(
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
-        series = write_vtu_series(load_trajectory(output), vtu, stress_of=stepper.problem)
+        series = write_vtu_series(
+            load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
+        )
         say(f"wrote {series}")
 
 
