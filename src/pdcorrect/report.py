@@ -28,9 +28,6 @@ __all__ = [
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 
-_PANEL, _PANELS = 266, 6
-"""Width of a body's panel, pixels, where there are more than so many."""
-
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
 )  # fmt: skip
@@ -189,7 +186,6 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
         frame=int(frame),
-        window=None if len(runs) <= _PANELS else _PANEL * len(runs),
     )
     overlaid = overlaid_labels(comparison)
     if len(overlaid) > 1:
