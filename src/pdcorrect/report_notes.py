@@ -169,7 +169,7 @@ def _of_the_total_mass(label: str, run: Trajectory) -> str:
 
 
 def _unlike_the_reference(comparison: Comparison) -> list[str]:
-    """A sentence for all rows that differ from the reference in the same way."""
+    """The rows that differ from the reference, those that do in the same way together."""
     truth = comparison.runs[comparison.reference]
     alike: dict[str, list[str]] = {}
     for row in comparison.rows:
@@ -178,11 +178,13 @@ def _unlike_the_reference(comparison: Comparison) -> list[str]:
         if unlike:
             mass = f", total mass {_total_mass(run):.4g} kg" if "total mass" in unlike else ""
             alike.setdefault(_discretisation(run) + mass, []).append(row.label)
+    if not alike:
+        return []
+    groups = "; ".join(f"{', '.join(labels)}: {what}" for what, labels in alike.items())
     return [
-        f"{', '.join(labels)}: {what}, unlike the reference's ({_discretisation(truth)}, total "
-        f"mass {_total_mass(truth):.4g} kg). Such errors are distances from a run whose own errors "
-        "are in them: from a fine mesh of the row's own kind it may be nearer."
-        for what, labels in alike.items()
+        f"{groups}, unlike the reference's ({_discretisation(truth)}, total mass "
+        f"{_total_mass(truth):.4g} kg). Their errors are distances from a run whose own errors are "
+        "in them: from a fine mesh of their own element and mass they may be nearer."
     ]
 
 

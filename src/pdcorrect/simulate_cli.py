@@ -209,11 +209,11 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
 
 
 def _described(stepper: Stepper) -> dict[str, str]:
-    """What a stepper says of itself, without what only a file needs in full."""
-    told = stepper.describe()
+    """What a stepper says of itself, but for the model, which is told before the run."""
+    origin = getattr(stepper, "origin", {})
+    told = {name: text for name, text in stepper.describe().items() if name not in origin}
     if told.get("gate", "none") != "none":
         told["gate"] = "default"  # the program has no other
-    told.pop("weights_sha256", None)
     return told
 
 
