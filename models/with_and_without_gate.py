@@ -156,9 +156,8 @@ def repeated(
             "own_base": pc.metrics.error_corrected(base, zero, reference),
             "rms_mm_own_base": 1e3 * pc.metrics.rms_error(base, reference),
         }
-        for label, gate in (("with_gate", pc.Gate()), ("without", None)):
-            steps = pc.ProjectiveDynamics(coarse)
-            hybrid = pc.HybridStepper(steps, model.corrector, velocity=model.velocity, gate=gate)
+        for label, gate in (("with_gate", True), ("without", False)):
+            hybrid = pc.hybrid_of(scene, model, gate=gate, problem=coarse)
             row["body_beyond"] = hybrid.body_excess()
             run = pc.rollout(hybrid, frames)
             row[label] = pc.metrics.error_corrected(run, zero, reference)

@@ -12,7 +12,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli, report, report_notes
+from pdcorrect import cli, compare_cli, report, run_text
 from pdcorrect.comparison_cases import HEX27, cases_for, without_best
 from pdcorrect.errors import InputError
 
@@ -143,6 +143,77 @@ def test_errors_from_another_element_than_the_references_are_told(thick):
     assert "(element hex8, mass lumped)" in told
 
 
+def test_rows_unlike_the_reference_are_named_by_element_mass_and_total_mass(thick):
+    told = report.notes(pc.compare(thick))
+    (found,) = [note for note in told if "unlike the reference's" in note]
+    assert found.startswith(
+        "coarse PD, coarse Newton, intermediate PD: element hex8, mass lumped, unlike the "
+        "reference's (element hex8-bubble-mean, mass averaged, total mass 0.096 kg)"
+    )
+    assert any("is the mesh's, the element's and the mass's." in note for note in told)
+
+
+def test_rows_of_another_total_mass_and_the_row_of_the_right_one_are_told(thick):
+    heavy = thick.with_changes(solver={"mass": "per-node"})
+    right = dataclasses.replace(
+        pc.evaluate.CASES[2], label="coarse PD, total mass", base="total-mass"
+    )
+    cases = (*pc.evaluate.CASES[:1], *pc.evaluate.CASES[2:], right)
+    told = report.notes(pc.compare(heavy, cases=cases))
+    (unlike,) = [note for note in told if "unlike the reference's" in note]
+    assert unlike.startswith("coarse PD, coarse Newton: element hex8, mass per-node, total mass 0.")
+    assert any("is the mesh's and the total mass's." in note for note in told)
+    (what,) = [note for note in told if note.startswith("coarse PD, total mass: ")]
+    assert what.endswith("By the mass rule per-node a mesh is the heavier the coarser it is.")
+    told = " ".join(report.notes(pc.compare(thick, cases=cases)))
+    assert "By the mass rule lumped meshes have one mass, so it changes nothing" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"solver": "newton"}, "solver = 'newton', expected 'pd'"),
+        ({"refine": 2}, "refine = 2, expected 1"),
+        ({"base": "plain"}, "base = 'plain', expected 'best'"),
+        ({"element": "hex27"}, "element = 'hex27', expected None"),
+    ],
+)
+def test_a_case_does_not_ignore_what_its_corrector_is_not_for(thick, changes, words):
+    pytest.importorskip("torch_geometric")
+    case = pc.evaluate.Case("odd", "pd", 1, "best", MODEL)
+    with pytest.raises(InputError, match=f"odd: {words}"):
+        pc.evaluate.case_stepper(thick, dataclasses.replace(case, **changes))
+
+
+def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once(
+    program, thick, tmp_path
+):
+    pytest.importorskip("torch_geometric")
+    (tmp_path / "scene.toml").write_text(thick.with_changes(solver={"element": "hex27"}).to_toml())
+    arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
+    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
+    assert status == cli.BAD_INPUT
+    assert f"model {MODEL}: corrects the best coarse model, and this scene has none: it has" in err
+    assert not (tmp_path / "r").exists()
+    own = pc.best_coarse(thick)  # has none beside its own, which is as good
+    assert labels(cases_for(own, [MODEL]))[-1] == f"hybrid {MODEL}"
+
+
+def test_a_foreign_integrator_is_told_of_in_the_notes(stiff):
+    pytest.importorskip("torch_geometric")
+    scene = stiff.with_changes(time={"integrator": "midpoint"})
+    cases = cases_for(scene, [MODEL])[4:]
+    (found,) = [n for n in report.notes(pc.compare(scene, 1, cases)) if "has never seen" in n]
+    assert "trained on steps by backward-euler, and the scene's integrator is midpoint" in found
+    assert not any("has never seen" in n for n in report.notes(pc.compare(stiff, 1, cases)))
+
+
+def test_large_numbers_have_no_powers_of_ten():
+    assert [run_text.three_digits(x) for x in (0.01234, 999.4, 999.6, 12345.6)] == [
+        "0.0123", "999", "1000", "12346"
+    ]  # fmt: skip
+
+
 def test_a_row_whose_corrections_are_all_refused_says_so(stiff, tmp_path):
     pytest.importorskip("torch_geometric")
     coarse, hybrid = cases_for(stiff, [MODEL])[4:]
@@ -179,7 +250,7 @@ def test_some_refused_corrections_are_counted_beside_the_label(stiff):
 
 def test_every_reason_of_a_gate_has_a_meaning():
     gate = pytest.importorskip("pdcorrect.corrector.gate")
-    assert list(report_notes._MEANINGS) == list(gate.refusals([]))
+    assert list(run_text._MEANINGS) == list(gate.refusals([]))
 
 
 def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
@@ -240,3 +311,93 @@ def test_a_long_legend_stays_in_the_picture(tmp_path, monkeypatch):
         (legend,) = figure.legends
         assert legend.get_window_extent().width <= figure.bbox.width
         assert len(figure.legends) == 1
+
+
+@pytest.mark.parametrize("length", [20, 60, 160])
+def test_no_text_of_a_plot_leaves_it_and_axes_keep_their_height(tmp_path, monkeypatch, length):
+    pytest.importorskip("matplotlib")
+    agg = pytest.importorskip("matplotlib.backends.backend_agg")
+    from pdcorrect.figures import curves
+
+    seen = []
+    monkeypatch.setattr(curves, "_save", lambda figure, output: seen.append(figure))
+    times = np.linspace(0.0, 1.0, 3)
+    names = [f"{k:02d} {'hybrid ' * 40}"[:length] for k in range(12)]
+    curves.plot_error_over_time(dict.fromkeys(names, 1e-3 * times), times, "a.png")
+    curves.plot_error_against_time({n: (0.1 * k + 1, 2.0**-k) for k, n in enumerate(names)}, "b")
+    curves.plot_error_over_time({"one": 1e-3 * times}, times, "c.png")
+    for figure in seen:
+        agg.FigureCanvasAgg(figure)
+        figure.draw_without_rendering()
+    *long, short = (figure.axes[0].get_window_extent().height for figure in seen)
+    assert min(long) > 0.9 * short
+    for figure in seen:
+        drawn = figure.get_tightbbox().transformed(figure.dpi_scale_trans)
+        assert (drawn.min >= figure.bbox.min - 1).all()
+        assert (drawn.max <= figure.bbox.max + 1).all()
+
+
+def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkeypatch, capsys):
+    label = "hybrid torsion-as-published-total-mass"
+    case = dataclasses.replace(pc.evaluate.CASES[2], label=label)
+    found = pc.compare(thick, 1, (pc.evaluate.CASES[2], case))
+    slow = [dataclasses.replace(row, seconds_a_frame=1.2346) for row in found.rows]
+    found = dataclasses.replace(found, rows=tuple(slow))
+    monkeypatch.setenv("COLUMNS", "78")
+
+    def names():
+        compare_cli._print_table(found)
+        lines = capsys.readouterr().out.splitlines()[5:]
+        assert " 1235 " in lines[0]
+        return [line.strip().split("  ")[0] for line in lines if line.strip()]
+
+    assert names() == [label]
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
+    monkeypatch.setenv("TERM", "dumb")
+    assert names() == ["hybrid torsion-", "as-published-", "total-mass"]
+
+
+def test_refused_corrections_stand_above_a_body(stiff):
+    pytest.importorskip("torch_geometric")
+    found = pc.compare(stiff, cases=cases_for(stiff, [MODEL])[5:])
+    (row,) = found.rows
+    slow = dataclasses.replace(row, seconds_a_frame=12.3456)
+    first, second, third = report._panel_label(found, slow).splitlines()
+    assert first == f"hybrid {MODEL}, {row.nodes} nodes"
+    assert second == "reference, 12346 ms a frame"
+    assert third == "all refused"
+    without = dataclasses.replace(row, refused_frames=0)
+    assert len(report._panel_label(found, without).splitlines()) == 2
+
+
+def test_a_vtu_folder_that_cannot_be_made_ends_the_program_before_its_work(
+    program, thick, tmp_path, monkeypatch
+):
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r" / "vtu").write_text("")
+    monkeypatch.setattr(pc.evaluate, "case_stepper", None)  # what works raises TypeError
+    arguments = ("-o", tmp_path / "r", "--vtu", "--no-figures")
+    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
+    assert status == cli.FAILED
+    assert "vtu: is a file: expected a folder" in err
+    path, blocked = tmp_path / "run.h5", tmp_path / "r" / "vtu"
+    status, _, err = program("simulate", tmp_path / "scene.toml", "-o", path, "--vtu", blocked)
+    assert status == cli.FAILED
+    assert "vtu: is a file: expected a folder" in err
+    assert not path.exists()
+
+
+def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_path):
+    first = pc.compare(thick, 1, pc.evaluate.CASES[1:3])
+    report.write_series(first, tmp_path)
+    (tmp_path / "vtu" / "mine.vtu").write_text("")
+    second = pc.compare(thick, 1, pc.evaluate.CASES[2:3])
+    report.write_series(second, tmp_path)
+    assert {path.name for path in (tmp_path / "vtu").iterdir()} == {
+        "coarse-pd.pvd", "coarse-pd_0000.vtu", "coarse-pd_0001.vtu", "mine.vtu"
+    }  # fmt: skip
+    (tmp_path / "scene.toml").write_text(thick.to_toml())
+    command = ("compare", tmp_path / "scene.toml", "--frames", 1, "--no-figures", "-o")
+    assert "is of an earlier run" in program(*command, tmp_path)[1]
+    assert "is of an earlier run" not in program(*command, tmp_path / "new")[1]

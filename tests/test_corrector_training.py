@@ -1031,6 +1031,7 @@ def test_a_training_leaves_the_best_model_with_its_record(short, tmp_path):
     assert found.record.metrics["omega_mean"] == pytest.approx(best, rel=1e-4)
     assert found.record.dataset == "tiny"
     assert found.record.training["config"]["stages"][0]["iterations"] == 6
+    assert found.record.training["integrator"] == found.integrator == "backward-euler"
     assert len(found.record.dataset_hash) == 64
     assert torch.equal(weights(found.corrector), weights(training.corrector))
     scores = Validation(load_recordings(short, "validation", "plain"), "plain")(found.corrector)

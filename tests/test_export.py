@@ -13,6 +13,7 @@ from pdcorrect import cli
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.io.stored_problem import problem_of
+from pdcorrect.io.vtk import write_vtu_series
 
 
 def stored(tmp_path, scene, refine=1, name="run.h5"):
@@ -104,6 +105,22 @@ def test_a_folder_that_cannot_be_made_is_named(program, short, tmp_path):
     status, _, err = program("export", path, "-o", tmp_path / "file" / "out")
     assert status == cli.FAILED
     assert "file/out" in err
+    status, _, err = program("export", path, "-o", tmp_path / "file")
+    assert status == cli.FAILED
+    assert "file: is a file: expected a folder" in err
+
+
+def test_what_survives_of_a_file_is_written_if_asked(program, short, tmp_path):
+    path, _ = stored(tmp_path, short.with_changes(time={"frames": 60}))
+    path.write_bytes(path.read_bytes()[: int(0.7 * path.stat().st_size)])
+    status, _, err = program("export", path, "-o", tmp_path / "out")
+    assert status == cli.BAD_INPUT
+    left = len(pc.load_trajectory(path, salvage=True))
+    assert 0 < left < 60
+    assert f"export --salvage writes {left} steps of it" in err
+    arguments = ("-o", tmp_path / "out", "--salvage", "--no-stress")
+    assert program("export", path, *arguments)[0] == 0
+    assert len(list((tmp_path / "out").glob("run_*.vtu"))) == left + 1
 
 
 def test_a_run_of_another_material_is_written_without_stresses(program, short, tmp_path):
@@ -117,6 +134,22 @@ def test_a_run_of_another_material_is_written_without_stresses(program, short, t
     assert set(meshio.read(tmp_path / "out" / "run_0001.vtu").point_data) == {
         "displacement", "velocity"
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
+def test_a_run_of_another_total_mass_has_its_stresses(program, short, tmp_path, element):
+    scene = short.with_changes(solver={"element": element})
+    problem = pc.discretise(scene).with_total_mass(0.1)
+    path, run = tmp_path / "run.h5", pc.rollout(pc.ProjectiveDynamics(problem))
+    pc.save_trajectory(path, run)
+    status, out, _ = program("export", path, "-o", tmp_path / "out")
+    assert (status, "without" in out) == (0, False)
+    write_vtu_series(run, tmp_path / "own", stress_of=problem)
+    read, own = (meshio.read(tmp_path / f / "run_0004.vtu").point_data for f in ("out", "own"))
+    np.testing.assert_array_equal(read["stress"], own["stress"])
+    assert read["von_mises"].max() > 100.0
+    both = problem.with_material(young=2e6, poisson=0.3)
+    assert pc.rollout(pc.ProjectiveDynamics(both), 1).attributes["material"].startswith("changed")
 
 
 def test_what_a_file_does_not_say_is_told(short, tmp_path):

@@ -423,3 +423,24 @@ def test_short_times_are_told_in_a_unit_that_shows_them():
     assert time_text(1e-5, 1e-4) == "0.010 ms"
     assert time_text(0.0, 1e-4) == "0.000 ms"
     assert time_text(2e-6, 1e-5) == "2.000 µs"
+
+
+def test_many_runs_are_drawn_in_rows_whose_text_fits_their_panels(run, tmp_path):
+    names = [f"hybrid of a model, number {k}\nRMS error 0.123 mm" for k in range(7)]
+    many = drawn(figures.render([run] * 7, tmp_path / "a.png", labels=names))
+    four = drawn(figures.render([run] * 4, tmp_path / "b.png", labels=names[:4]))
+    assert many.shape[1] == four.shape[1] == 1600
+    blocks = np.diff(np.concatenate([[0], bodies(many).any(axis=1).astype(int), [0]]))
+    starts, stops = np.flatnonzero(blocks == 1), np.flatnonzero(blocks == -1)
+    tall = stops - starts > 60
+    assert tall.sum() == 2  # rows of bodies
+    first, second = (many[a:b] for a, b in zip(starts[tall], stops[tall], strict=True))
+    assert bodies(first)[:, 1200:].any()
+    assert not bodies(second)[:, 1200:].any()  # four above, three below
+
+
+@pytest.mark.parametrize(
+    ("panels", "shape"), [(1, (1, 1)), (5, (1, 5)), (6, (2, 3)), (9, (2, 5)), (11, (3, 4))]
+)
+def test_rows_have_at_most_five_panels(panels, shape):
+    assert figures._wrapped(panels) == shape

@@ -233,6 +233,7 @@ ORDER = [
     "validation.running",
     "validation.prose",
     "validation.page",
+    "run_text",
     "comparison_cases",
     "evaluate",
     "report_notes",

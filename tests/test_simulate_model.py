@@ -12,6 +12,8 @@ import pdcorrect as pc
 from conftest import beam
 from pdcorrect import cli
 
+weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
+
 ROOT = Path(__file__).parent.parent
 SCENE = ROOT / "examples" / "unseen_cross.toml"
 MODEL = "torsion-exact-compact"
@@ -49,9 +51,18 @@ def test_the_steps_are_those_of_the_hybrid_on_its_own_base(program, learned, tmp
     np.testing.assert_array_equal(run.positions, expected.positions)
     assert run.attributes["element"] == "hex8-bubble-mean"
     assert (run.attributes["gate"] == "none") == (not gated)
+    assert f"gate: {'default' if gated else 'none'}" in out
+    assert f"model {MODEL} on the base 'best', trained on 'torsion-exact'" in out
+    assert "{" not in out
+    digest = weights_digest(MODEL)
+    assert digest not in out
+    assert {"model": MODEL, "base": "best", "weights_sha256": digest}.items() <= (
+        run.attributes.items()
+    )
+    assert run.attributes["dataset"] == pc.load_model(MODEL).record.dataset
     assert "corrections: at most" in out
     assert "refused" not in out
-    assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 4
+    assert len(list((tmp_path / "vtu").glob("run_*.vtu"))) == 4
 
 
 def test_a_model_of_the_right_mass_steps_a_body_of_that_mass(program, learned, tmp_path):
@@ -94,6 +105,7 @@ def test_a_hybrid_is_not_continued_as_something_else(program, learned, tmp_path,
         (("--model", MODEL, "--refine", 2), "expected --refine 1"),
         (("--model", MODEL, "--solver", "newton"), "expected --solver pd"),
         (("--no-gate",), "--no-gate without --model"),
+        (("--model", ""), "--model '': an empty name"),
         (("--model", "nothing"), "model 'nothing': not in"),
         (("--model", "./nothing"), "expected a folder with a model"),
     ],
@@ -120,6 +132,52 @@ def test_a_model_of_an_unknown_base_is_named(learned, tmp_path, monkeypatch):
         released.hybrid_of(pc.Scene.load(SCENE), tmp_path / "odd")
 
 
+def with_integrator(name):
+    return pc.Scene.load(SCENE).with_changes(time={"integrator": name})
+
+
+def test_a_quasi_static_scene_is_refused(program, learned, tmp_path):
+    scene, path = tmp_path / "s.toml", tmp_path / "run.h5"
+    scene.write_text(with_integrator("quasi-static").to_toml(), encoding="utf-8")
+    status, _, err = program("simulate", scene, "-o", path, "--model", MODEL)
+    assert status == cli.BAD_INPUT
+    assert f"{MODEL}: trained on steps by backward-euler" in err
+    assert "'quasi-static', whose steps have no inertia: expected 'backward-euler'" in err
+    assert not path.exists()
+
+
+def test_an_integrator_that_the_model_never_saw_is_told(program, learned, tmp_path):
+    scene, path = tmp_path / "s.toml", tmp_path / "run.h5"
+    scene.write_text(with_integrator("midpoint").to_toml(), encoding="utf-8")
+    status, out, _ = program("simulate", scene, "-o", path, "--model", MODEL, "--frames", 1)
+    assert status == 0
+    assert "by backward-euler, and the scene's integrator is midpoint" in out
+
+
+def test_a_model_that_knows_another_integrator_is_asked_for_that(learned):
+    from pdcorrect.corrector.model_io import LoadedModel
+
+    known = pc.load_model(MODEL)
+    training = {**known.record.training, "integrator": "quasi-static"}
+    record = known.record.model_copy(update={"training": training})
+    own = LoadedModel(known.corrector, record)
+    assert (known.integrator, own.integrator) == ("backward-euler", "quasi-static")
+    hybrid = pc.hybrid_of(with_integrator("quasi-static"), own)
+    assert hybrid.coarse.integrator == "quasi-static"
+
+
+def test_a_problem_in_place_of_the_models_own_is_checked(learned):
+    scene = pc.Scene.load(SCENE)
+    model = pc.load_model(MODEL)
+    assert pc.hybrid_of(scene, model, problem=pc.coarse_model(scene, "best")).origin == {}
+    for problem, words in (
+        (pc.discretise(scene), "element hex8 and mass lumped: expected 1, hex8-bubble-mean"),
+        (pc.discretise(pc.best_coarse(scene), 2), "problem is refined 2 times"),
+    ):
+        with pytest.raises(pc.errors.InputError, match=words):
+            pc.hybrid_of(scene, model, problem=problem)
+
+
 def test_without_torch_the_extra_is_named(program, scene_file, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     path = tmp_path / "run.h5"
@@ -138,7 +196,12 @@ def test_a_run_whose_corrections_are_refused_says_so_and_why(
     assert status == 0
     assert "2 of 2 corrections were refused by the gate (2 by body)" in out
     assert "'body': the body at rest is unlike those of its training" in out
-    assert "Measures of the body beyond their range in training: " in out
+    assert "by more than the bound 0.3 (dimensionless): nodes " in out
+    named = out.split("(dimensionless): ")[1].split(".\n")[0].split(", ")
+    sizes = [float(one.split()[-1]) for one in named]
+    assert sizes == sorted(sizes, reverse=True)
+    assert min(sizes) >= 0.3
+    assert "at most" not in out
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)
     best = pc.discretise(pc.best_coarse(pc.Scene.load(scene_file)))

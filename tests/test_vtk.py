@@ -1,5 +1,6 @@
 """VTU and PVD files for ParaView, and meshes from files."""
 
+import dataclasses
 import xml.etree.ElementTree as ET
 
 import meshio
@@ -11,7 +12,7 @@ from conftest import beam
 from motion import cross_mesh, trajectory
 from pdcorrect.errors import InputError, MeshError, OutputError
 from pdcorrect.fem.mesh_files import read_hex_mesh, write_vtu
-from pdcorrect.io.vtk import write_vtu_series
+from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 
 
 @pytest.fixture(scope="module")
@@ -23,8 +24,8 @@ def test_paraview_reads_back_every_frame(run, tmp_path):
     pv = pytest.importorskip("pyvista")
     path = write_vtu_series(run, tmp_path / "new" / "folder")
     reader = pv.get_reader(path)
-    assert reader.time_values == run.times.tolist()
-    for frame, time in enumerate(run.times):
+    np.testing.assert_allclose(reader.time_values, run.times, rtol=1e-11)
+    for frame, time in enumerate(reader.time_values):
         reader.set_active_time_value(time)
         grid = reader.read()[0]
         np.testing.assert_array_equal(grid.points, run.positions[frame])
@@ -37,12 +38,64 @@ def test_paraview_reads_back_every_frame(run, tmp_path):
             np.testing.assert_allclose(volumes, 0.05**3, rtol=1e-12)
 
 
-def test_the_collection_names_existing_files_with_exact_times(run, tmp_path):
+def test_the_collection_names_existing_files_and_times(run, tmp_path):
     path = write_vtu_series(run, tmp_path, every=2, name="cross")
     entries = ET.parse(path).getroot().findall("Collection/DataSet")
-    assert [float(e.get("timestep")) for e in entries] == run.times[::2].tolist()
+    times = [float(e.get("timestep")) for e in entries]
+    np.testing.assert_allclose(times, run.times[::2], rtol=1e-11)
     assert [e.get("file") for e in entries] == [f"cross_{k:04d}.vtu" for k in (0, 2, 4)]
     assert {p.name for p in tmp_path.iterdir()} == {"cross.pvd", *(e.get("file") for e in entries)}
+
+
+def test_times_are_written_as_a_reader_would(run, tmp_path):
+    times = 0.1 * np.arange(len(run.times))  # 0.30000000000000004
+    path = write_vtu_series(dataclasses.replace(run, times=times), tmp_path)
+    entries = ET.parse(path).getroot().findall("Collection/DataSet")
+    assert [e.get("timestep") for e in entries] == ["0", "0.1", "0.2", "0.3", "0.4", "0.5"]
+
+
+def test_a_series_replaces_no_other_of_a_longer_name(run, tmp_path):
+    others = ("run_2026", "run_0001_b", "run_", "a.run")
+    for name in ("run", *others):
+        write_vtu_series(run, tmp_path, name=name)
+    before = {path.name for path in tmp_path.iterdir()}
+    write_vtu_series(run, tmp_path, every=5)
+    gone = {f"run_{k:04d}.vtu" for k in range(1, 5)}
+    assert before - {path.name for path in tmp_path.iterdir()} == gone
+    delete_vtu_series(tmp_path, "run")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {n for n in before if n.startswith(tuple(f"{o}_0" for o in others))} | {
+        f"{other}.pvd" for other in others
+    }
+
+
+@pytest.mark.parametrize("damage", ["nan", "mesh"])
+def test_what_is_refused_leaves_the_old_series(run, tmp_path, damage):
+    path = write_vtu_series(run, tmp_path)
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    if damage == "nan":
+        positions = run.positions.copy()
+        positions[3, 0, 0] = np.nan
+        bad, problem, words = dataclasses.replace(run, positions=positions), None, "frame 3"
+    else:
+        bad, problem, words = run, pc.discretise(beam((2, 1, 1))), "stress_of has 12 nodes"
+    with pytest.raises(InputError, match=f"run: {words}"):
+        write_vtu_series(bad, path.parent, every=2, stress_of=problem)
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_a_series_that_is_interrupted_has_no_collection(run, tmp_path):
+    write_vtu_series(run, tmp_path)
+
+    def stops(frame):
+        if frame == 2:
+            raise KeyboardInterrupt
+        return {}
+
+    with pytest.raises(KeyboardInterrupt):
+        write_vtu_series(run, tmp_path, point_data=stops)
+    assert not list(tmp_path.glob("*.pvd"))
+    assert len(list(tmp_path.glob("*.vtu"))) == len(run.times)
 
 
 def test_extra_fields_are_written(run, tmp_path):

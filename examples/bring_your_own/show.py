@@ -21,7 +21,7 @@ def main(
     scene = pc.Scene.load(scene_file)
     better = pc.best_coarse(scene)
     coarse = pc.ProjectiveDynamics(pc.discretise(better))
-    hybrid = pc.HybridStepper(coarse, pc.load_model(model).corrector, gate=pc.Gate())
+    hybrid = pc.hybrid_of(scene, model)
     steppers = {
         "fine": pc.ProjectiveDynamics(pc.discretise(better, refine=REFINE)),
         "plain": pc.ProjectiveDynamics(pc.discretise(scene)),
@@ -49,7 +49,7 @@ def main(
         reference=runs["fine"],
     )
     pc.save_trajectory(folder / "hook_hybrid.h5", runs["hybrid"], overwrite=True)
-    pc.write_vtu_series(runs["hybrid"], folder / "hook_vtu")
+    pc.write_vtu_series(runs["hybrid"], folder / "hook_vtu", name="hook_hybrid")
     return errors
 
 

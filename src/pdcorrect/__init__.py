@@ -40,6 +40,7 @@ _HOME = {
     "load_model": "pdcorrect.corrector.model_io",
     "save_model": "pdcorrect.corrector.model_io",
     "HybridStepper": "pdcorrect.corrector.hybrid",
+    "hybrid_of": "pdcorrect.corrector.released",
     "BatchHybrid": "pdcorrect.corrector.batch_hybrid",
     "HybridLayer": "pdcorrect.corrector.batch_hybrid",
     "Gate": "pdcorrect.corrector.gate",
@@ -56,8 +57,8 @@ _HOME = {
     "compare": "pdcorrect.evaluate",
 }
 _NEEDS_TORCH = (
-    "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "HybridStepper", "BatchHybrid",
-    "HybridLayer", "Gate", "load_model", "save_model",
+    "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "HybridStepper", "hybrid_of",
+    "BatchHybrid", "HybridLayer", "Gate", "load_model", "save_model",
 )  # fmt: skip
 _MODULES = ("metrics", "errors", "figures", "evaluate", "report")
 
@@ -84,6 +85,7 @@ __all__ = [  # noqa: RUF022
     "load_model",
     "save_model",
     "HybridStepper",
+    "hybrid_of",
     "BatchHybrid",
     "HybridLayer",
     "Gate",
@@ -115,6 +117,7 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
     from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model, save_model
+    from pdcorrect.corrector.released import hybrid_of
     from pdcorrect.evaluate import compare
     from pdcorrect.fem.coarse_models import coarse_model
     from pdcorrect.fem.modes import modes

@@ -57,10 +57,14 @@ def check_models(models: Sequence[str], gate: bool) -> None:
     Raises
     ------
     InputError
-        If there is no corrector that could go without a gate.
+        If a name is empty, or there is no corrector that could go without a gate.
     MissingExtraError
         If correctors cannot be run here.
     """
+    if any(not model.strip() for model in models):
+        raise InputError(
+            "--model '': an empty name: expected the name of a folder in models, or a path."
+        )
     if models:
         require_extra("torch", "learn")
     elif not gate:

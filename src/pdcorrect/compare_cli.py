@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from pdcorrect.scene import Scene
     from pdcorrect.state import StepResult
 
+_WIDE, _NARROW = 200, 12
+"""Letters in a line where there is no terminal; in a line of a name at least."""
+
 
 def compare(
     scene: SceneFile,
@@ -27,8 +31,8 @@ def compare(
     model: Annotated[
         Optional[list[str]],
         typer.Option(
-            help="Also a corrector, by name or folder; repeatable (extra 'learn'). Those of base "
-            "'best' not together with others."
+            help="Also a corrector, by name (docs/results.md and models/README.md list them) or "
+            "folder; repeatable (extra 'learn'). Those of base 'best' not together with others."
         ),
     ] = None,
     gate: Annotated[
@@ -74,6 +78,8 @@ def compare(
         say("writing the runs for ParaView ...")
         for path in report.write_series(comparison, output):
             say(f"wrote {path}")
+    elif any((output / report.VTU).glob("*.pvd")):
+        say(f"{output / report.VTU} is of an earlier run: --vtu writes it anew")
     if comparison.failures:
         raise typer.Exit(FAILED)
 
@@ -105,6 +111,9 @@ def _print_table(comparison: Comparison) -> None:
 
     from pdcorrect import report
 
+    console = Console()
+    if not console.is_terminal:  # a file or a pipe, which has no width
+        console = Console(width=_WIDE)
     table = Table(
         title=comparison.scene.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
@@ -112,6 +121,9 @@ def _print_table(comparison: Comparison) -> None:
         table.add_column(heading, justify="right", no_wrap=True)
     names = table.columns[0]
     names.justify, names.no_wrap, names.overflow = "left", False, "fold"
-    for row in report.table(comparison):
-        table.add_row(*row)
-    Console().print(table)
+    rows = report.table(comparison)
+    columns = [*zip(report.HEADINGS, *rows, strict=True)][1:]
+    room = console.width - sum(max(map(len, column)) + 2 for column in columns)
+    for name, *cells in rows:
+        table.add_row("\n".join(wrap(name, max(room, _NARROW))), *cells)
+    console.print(table)

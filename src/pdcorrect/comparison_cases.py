@@ -24,7 +24,7 @@ class Case:
     base : {"plain", "best", "total-mass"}
         As of `coarse_model`; "best" on any mesh, "total-mass" on the coarse one only.
     model : str or None
-        Name or folder of a corrector of the steps.
+        Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
     gate : bool
         Whether a default `Gate` lets the corrector pass.
     element : str or None
@@ -75,6 +75,32 @@ class Case:
         return discretise(scene, self.refine, mass, self.element)
 
 
+def check_corrected(case: Case, base: str) -> None:
+    """Refuse a case that asks of a corrector what it is not for.
+
+    Parameters
+    ----------
+    case : Case
+    base : str
+        That its model corrects.
+
+    Raises
+    ------
+    InputError
+    """
+    expected = {"solver": "pd", "refine": 1, "base": base, "element": None}
+    unlike = [
+        f"{name} = {getattr(case, name)!r}, expected {wanted!r}"
+        for name, wanted in expected.items()
+        if getattr(case, name) != wanted
+    ]
+    if unlike:
+        raise InputError(
+            f"{case.label}: {'; '.join(unlike)}: the corrector {case.model} is run by projective "
+            f"dynamics on the coarse model {base!r} that it was trained for."
+        )
+
+
 CASES = (
     Case("fine PD", "pd", 4),
     Case("intermediate PD", "pd", 2),
@@ -115,11 +141,14 @@ def cases_for(
     Raises
     ------
     InputError
-        As `cases_with`; or if the scene's own element has 27 nodes.
+        As `cases_with`; or if a corrector is for the best coarse model, the scene has no such
+        model and the corrector's reference cannot be made; or if the scene's own element has 27
+        nodes and others are asked for.
     """
     reference, *others = cases_with(models, gate=gate)
-    best = Case(_COARSE["best"], "pd", 1, "best")
-    if without_best(scene) is None:
+    best, why = Case(_COARSE["best"], "pd", 1, "best"), without_best(scene)
+    _check_best(scene, others, why)
+    if why is None:
         if not models:
             reference = _FINE_BEST
         if best not in others:
@@ -134,18 +163,35 @@ def cases_for(
     return (reference, *others)
 
 
+def _check_best(scene: Scene, cases: Sequence[Case], why: str | None) -> None:
+    """Refuse correctors of a best coarse model that a scene has not, ``why``."""
+    if why is None or _is_best(scene):
+        return
+    for case in cases:
+        if case.model is not None and case.base == "best":
+            raise InputError(
+                f"model {case.model}: corrects the best coarse model, and this scene has none: "
+                f"{why}. Expected a scene that has one, or a model of another base."
+            )
+
+
+def _is_best(scene: Scene) -> bool:
+    """Whether the scene's own element and mass are those of its best coarse model."""
+    best, own = best_coarse(scene).solver, scene.solver
+    return (own.element, own.mass) == (best.element, best.mass)
+
+
 def without_best(scene: Scene) -> str | None:
     """Why a scene has no best coarse model beside its own; None if it has one.
 
     Where the scene itself cannot be discretised the reason is that of the scene.
     """
-    best, own = best_coarse(scene), scene.solver
-    if (own.element, own.mass) == (best.solver.element, best.solver.mass):
+    if _is_best(scene):
         return "the scene's own element and mass are those of the best coarse model"
-    if own.element == HEX27.element:
+    if scene.solver.element == HEX27.element:
         return "it has no nodes where the scene's 27-node elements have some"
     try:
-        discretise(best)
+        discretise(best_coarse(scene))
     except InputError as error:
         return str(error).rstrip(".")
     return None

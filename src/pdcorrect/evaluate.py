@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pdcorrect import metrics
-from pdcorrect.comparison_cases import CASES, Case, cases_for, cases_with
+from pdcorrect.comparison_cases import (
+    CASES,
+    Case,
+    cases_for,
+    cases_with,
+    check_corrected,
+    without_best,
+)
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem, discretise
@@ -70,8 +77,8 @@ class Comparison:
         The same on the coarse nodes.
     cases : tuple of Case
     models : dict of str to dict
-        Of correctors, by label: model, base, the data set that it was trained on, digest of
-        its weights.
+        Of correctors, by label: model, base, the data set that it was trained on, that one's
+        time integrator, digest of its weights.
     reference : str
         Label of the case that errors are measured against.
     solver_error : float or None
@@ -81,6 +88,8 @@ class Comparison:
         frame needed a fallback.
     failures : dict of str to str
         Of cases that did not come to their end, by label: why.
+    without_best : str or None
+        Why none of the cases is the best coarse model; None if one is, or could be.
     """
 
     scene: Scene
@@ -89,9 +98,10 @@ class Comparison:
     on_coarse: dict[str, Trajectory]
     reference: str
     solver_error: float | None
-    cases: tuple[Case, ...] = ()
+    cases: tuple[Case, ...]
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
+    without_best: str | None = None
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance from the reference in each frame, by label, m."""
@@ -121,14 +131,16 @@ def case_stepper(scene: Scene, case: Case) -> Stepper:
     Raises
     ------
     InputError
-        If there is no such solver, base or model, or a model does not fit the scene.
+        If there is no such solver, base or model, a model does not fit the scene, or the case
+        has another solver, mesh or base than the model.
     """
-    problem = case.problem(scene)
     if case.model is None:
-        return _stepper(problem, case.solver)
+        return _stepper(case.problem(scene), case.solver)
+    from pdcorrect.corrector.model_io import load_model
     from pdcorrect.corrector.released import hybrid_of
 
-    return hybrid_of(scene, case.model, gate=case.gate, problem=problem).prepare()
+    check_corrected(case, load_model(case.model).base)
+    return hybrid_of(scene, case.model, gate=case.gate).prepare()
 
 
 def compare(
@@ -202,7 +214,8 @@ def compare(
         )
     return Comparison(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
-        {case.label: _about(case.model) for case in cases if case.model}, failures,
+        _models(cases), failures,
+        None if any(case.base == "best" for case in cases) else without_best(scene),
     )  # fmt: skip
 
 
@@ -212,15 +225,13 @@ def _coarse_to_fine(case: Case) -> tuple[int, bool, int, bool]:
     return case.refine, more_nodes, BASES.index(case.base), case.solver != "pd"
 
 
-def _about(name: str) -> dict[str, str]:
-    """Which model that is."""
-    from pdcorrect.corrector.model_io import load_model, model_folder, weights_digest
+def _models(cases: Sequence[Case]) -> dict[str, dict[str, str]]:
+    """Which models the correctors are, by label."""
+    if not any(case.model for case in cases):
+        return {}
+    from pdcorrect.corrector.released import about_model
 
-    model = load_model(name)
-    return {
-        "model": model_folder(name).name, "base": model.base, "dataset": model.record.dataset,
-        "weights_sha256": weights_digest(model_folder(name)),
-    }  # fmt: skip
+    return {case.label: about_model(case.model) for case in cases if case.model}
 
 
 def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float], None] | None:

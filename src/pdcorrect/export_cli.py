@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pdcorrect.cli_parts import say
-from pdcorrect.errors import InputError
+from pdcorrect.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
     from pdcorrect.fem.problem import Problem
@@ -24,20 +24,36 @@ def export(
     stress: Annotated[
         bool, typer.Option(help="With stresses and volume ratios, where the file allows them.")
     ] = True,
+    salvage: Annotated[
+        bool, typer.Option("--salvage", help="Of a file that was cut short: what survives of it.")
+    ] = False,
 ) -> None:
     """Write a run for ParaView: one VTU a frame, and a PVD with the times to open.
 
     Points have displacement, velocity, stress and von Mises stress, cells von Mises stress and the
     smallest det F.  An older series of the same run in the folder is replaced.
     """
-    from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.io.vtk import write_vtu_series
     from pdcorrect.replacement import make_folder
 
-    loaded = load_trajectory(run)
+    loaded = _loaded(run, salvage)
     make_folder(output)
     problem = _stepped(loaded, run) if stress else None
     say(f"wrote {write_vtu_series(loaded, output, every=every, name=run.stem, stress_of=problem)}")
+
+
+def _loaded(path: Path, salvage: bool) -> Trajectory:
+    """The run, or what survives of it; a refusal offers the option where something does."""
+    from pdcorrect.io.trajectory import load_trajectory
+
+    try:
+        return load_trajectory(path, salvage=salvage)
+    except FileFormatError as error:
+        try:
+            left = len(load_trajectory(path, salvage=True))
+        except FileFormatError:
+            raise error from None
+        raise FileFormatError(f"{error} export --salvage writes {left} steps of it.") from None
 
 
 def _stepped(run: Trajectory, path: Path) -> Problem | None:

@@ -75,6 +75,8 @@ def make_folder(folder: str | Path) -> Path:
         If it cannot be created.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise OutputError(f"{folder}: is a file: expected a folder, or a new name.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -14,9 +14,11 @@ import numpy as np
 import pdcorrect.figures as figures
 from pdcorrect.environment import environment
 from pdcorrect.evaluate import Comparison, Row
-from pdcorrect.io.vtk import write_vtu_series
+from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.replacement import make_folder, write_text
-from pdcorrect.report_notes import inverted_frames, notes, refused_share, shown_labels
+from pdcorrect.report_notes import notes, refused_share, shown_labels
+from pdcorrect.run_text import inverted_frames, three_digits
+from pdcorrect.state import Trajectory
 
 __all__ = [
     "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",
@@ -25,9 +27,6 @@ __all__ = [
 
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
-
-_PANEL, _PANELS = 266, 6
-"""Width of a body's panel, pixels, where there are more than so many."""
 
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
@@ -50,8 +49,8 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
                 "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
                 "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
                 "ref." if is_reference else _percent(row.omega),
-                f"{1e3 * row.seconds_a_frame:.3g}",
-                f"{reference_seconds / row.seconds_a_frame:.3g}x",
+                three_digits(1e3 * row.seconds_a_frame),
+                f"{three_digits(reference_seconds / row.seconds_a_frame)}x",
                 f"{row.iterations_a_frame:.1f}",
             )
         )
@@ -133,6 +132,8 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
     """Write every run for ParaView, with stress, into ``vtu`` inside a report's folder.
 
+    Series of an earlier report there, of rows that this one does not have, are deleted.
+
     Returns
     -------
     list of Path
@@ -144,13 +145,24 @@ def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
         If they cannot be written.
     """
     target = make_folder(Path(folder) / VTU)
-    found: dict[str, Path] = {}
+    runs = _named_runs(comparison)
+    for stale in {path.stem for path in target.glob("*.pvd")} - set(runs):
+        delete_vtu_series(target, stale)
+    return [
+        write_vtu_series(run, target, name=name, stress_of=run.problem)
+        for name, run in runs.items()
+    ]
+
+
+def _named_runs(comparison: Comparison) -> dict[str, Trajectory]:
+    """Runs of the rows by the names of their files."""
+    found: dict[str, Trajectory] = {}
     for row in comparison.rows:
-        run, name = comparison.runs[row.label], _file_name(row.label)
+        name = _file_name(row.label)
         while name in found:  # labels that differ in other signs only
             name += "-again"
-        found[name] = write_vtu_series(run, target, name=name, stress_of=run.problem)
-    return [*found.values()]
+        found[name] = comparison.runs[row.label]
+    return found
 
 
 def _file_name(label: str) -> str:
@@ -174,7 +186,6 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
         frame=int(frame),
-        window=None if len(runs) <= _PANELS else _PANEL * len(runs),
     )
     overlaid = overlaid_labels(comparison)
     if len(overlaid) > 1:
@@ -231,8 +242,7 @@ def _panel_label(comparison: Comparison, row: Row) -> str:
         if row.label == comparison.reference
         else f"RMS error {1e3 * row.rms_error:.2g} mm"
     )
-    ms = 1e3 * row.seconds_a_frame
-    time = f"{ms:.3g}" if ms < 999.5 else f"{ms:.0f}"  # no powers of ten
+    time = three_digits(1e3 * row.seconds_a_frame)
     refused = refused_share(comparison, row)
     return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame" + (
         f"\n{refused}" if refused else ""

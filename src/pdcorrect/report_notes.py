@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
-from pdcorrect.comparison_cases import without_best
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
+from pdcorrect.run_text import foreign_integrator, inverted_frames, refused_corrections
 from pdcorrect.scene import Scene
-from pdcorrect.state import Status, Trajectory
-
-_MEANINGS = {
-    "not finite": "the network's answer is not a number",
-    "features": "the network's inputs are unlike those of its training",
-    "inversion": "cells of the corrected state are crushed or turned inside out",
-    "energy": "the corrected state has more energy than the loads account for",
-    "solver": "the coarse step itself failed",
-    "body": "the body at rest is unlike those of its training",
-}
-"""Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
+from pdcorrect.state import Trajectory
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -34,7 +21,7 @@ def notes(comparison: Comparison) -> list[str]:
             for label, why in comparison.failures.items()
         ),
         *_of_the_reference(comparison),
-        *_of_the_best(comparison),
+        *_of_the_rows(comparison),
         *_of_the_solvers(comparison),
         *_of_the_models(comparison),
         *_of_the_cells(comparison),
@@ -54,50 +41,6 @@ def refused_share(comparison: Comparison, row: Row) -> str:
     frames = len(comparison.runs[row.label])
     every = row.refused_frames == frames
     return "all refused" if every else f"{row.refused_frames} of {frames} refused"
-
-
-def inverted_frames(stats: Mapping[str, Any], step: float) -> str | None:
-    """How many frames of a run ended with inverted cells, and which was the first; None if none.
-
-    Parameters
-    ----------
-    stats : mapping of str to (T,) arrays
-        Those of a run from its first step on.
-    step : float
-        s.
-    """
-    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
-    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
-        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
-    if not inverted.any():
-        return None
-    first = 1 + int(inverted.argmax())
-    return (
-        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
-        f"first of them frame {first} (t = {first * step:g} s)"
-    )
-
-
-def refused_corrections(stats: Mapping[str, Any]) -> list[str]:
-    """How many corrections of a hybrid's run were refused and why; empty if none was.
-
-    Parameters
-    ----------
-    stats : mapping of str to (T,) arrays
-        With ``refused`` and ``gate``.
-    """
-    from pdcorrect.corrector.gate import refusals
-
-    counts = {reason: n for reason, n in refusals(stats["gate"]).items() if n}
-    if not counts:
-        return []
-    reasons = ", ".join(f"{n} by {reason}" for reason, n in counts.items())
-    meaning = "; ".join(f"'{reason}': {_MEANINGS[reason]}" for reason in counts)
-    refused, frames = sum(counts.values()), len(stats["gate"])
-    return [
-        f"{refused} of {frames} corrections were refused by the gate ({reasons}).",
-        f"Of its refusals, {meaning}.",
-    ]
 
 
 # --- one group of notes each --------------------------------------------------------------
@@ -184,47 +127,90 @@ def _lost_share(run: Trajectory) -> float | None:
     return lost / work if work > lost > 0 else None
 
 
-def _of_the_best(comparison: Comparison) -> list[str]:
-    """Elements of the rows whose names tell another than the scene's."""
-    shown = {row.label for row in comparison.rows}
-    cases = {case.label: case for case in comparison.cases if case.label in shown}
-    better = cases[comparison.reference].base == "best"
+def _of_the_rows(comparison: Comparison) -> list[str]:
+    """Elements and masses of the rows, beside the reference's, and what is special about some."""
+    shown = {row.label for row in comparison.rows} - {comparison.reference}
     found = []
-    for label, case in cases.items():
-        if label == comparison.reference or case.model is not None:
+    for case in comparison.cases:
+        if case.label not in shown or case.model is not None:
             continue
-        run = comparison.runs[label]
+        run = comparison.runs[case.label]
         if case.element is not None:
             found.append(
-                f"{label}: {_discretisation(run)}, on the scene's cells; it has {len(run.points)} "
-                "nodes, and its errors are those of the coarse ones among them."
+                f"{case.label}: {_discretisation(run)}, on the scene's cells; it has "
+                f"{len(run.points)} nodes, and its errors are those of the coarse ones among them."
             )
-        elif case.base == "best" and better:
+        elif case.base == "total-mass":
+            found.append(_of_the_total_mass(case.label, run))
+        elif case.base == "best" and not _unlike(run, comparison.runs[comparison.reference]):
             found.append(
-                f"{label}: {_discretisation(run)}, as the reference; speed-ups are over that, "
+                f"{case.label}: {_discretisation(run)}, as the reference; speed-ups are over that, "
                 "which takes longer than a fine mesh of the scene's own element."
             )
-        elif case.base == "best":
-            found.append(
-                f"{label}: {_discretisation(run)}, unlike the reference's. Its errors are "
-                "distances from a run of that element and mass, whose own errors are in them: from "
-                "a fine mesh of its own element it may be nearer."
-            )
-    why = without_best(comparison.scene)
-    if why and not any(case.base == "best" for case in comparison.cases):
-        found.append(f"There is no row of the best coarse model: {why}.")
+    found += _unlike_the_reference(comparison)
+    if comparison.without_best:
+        found.append(f"There is no row of the best coarse model: {comparison.without_best}.")
     return found
+
+
+def _of_the_total_mass(label: str, run: Trajectory) -> str:
+    """What the coarse model of the base "total-mass" is."""
+    rule = run.attributes["mass"]
+    what = (
+        f"{label}: the scene's coarse mesh, its density scaled so that it is as heavy as the mesh "
+        "with each cell cut 4×4×4. "
+    )
+    if rule == "per-node":
+        return what + "By the mass rule per-node a mesh is the heavier the coarser it is."
+    return what + (
+        f"By the mass rule {rule} meshes have one mass, so it changes nothing but for regions of "
+        "another density that end inside of cells."
+    )
+
+
+def _unlike_the_reference(comparison: Comparison) -> list[str]:
+    """The rows that differ from the reference, those that do in the same way together."""
+    truth = comparison.runs[comparison.reference]
+    alike: dict[str, list[str]] = {}
+    for row in comparison.rows:
+        run = comparison.runs[row.label]
+        unlike = _unlike(run, truth)
+        if unlike:
+            mass = f", total mass {_total_mass(run):.4g} kg" if "total mass" in unlike else ""
+            alike.setdefault(_discretisation(run) + mass, []).append(row.label)
+    if not alike:
+        return []
+    groups = "; ".join(f"{', '.join(labels)}: {what}" for what, labels in alike.items())
+    return [
+        f"{groups}, unlike the reference's ({_discretisation(truth)}, total mass "
+        f"{_total_mass(truth):.4g} kg). Their errors are distances from a run whose own errors are "
+        "in them: from a fine mesh of their own element and mass they may be nearer."
+    ]
+
+
+def _unlike(run: Trajectory, other: Trajectory) -> list[str]:
+    """In which of element, mass (the rule) and total mass (by a millionth) two runs differ."""
+    found = [name for name in ("element", "mass") if run.attributes[name] != other.attributes[name]]
+    same = np.isclose(_total_mass(run), _total_mass(other), rtol=1e-6, atol=0.0, equal_nan=True)
+    return found if same else [*found, "total mass"]
+
+
+def _total_mass(run: Trajectory) -> float:
+    """Of all nodes, kg; not a number where the run does not know what was stepped."""
+    return float("nan") if run.problem is None else float(run.problem.mass.sum())
 
 
 def _of_the_solvers(comparison: Comparison) -> list[str]:
     found = []
     if comparison.solver_error is not None:
-        best = {c.label for c in comparison.cases if c.base == "best"}
-        of_element = " and the element's" if comparison.reference in best else ""
+        (coarse,) = (c.label for c in comparison.cases if c.plain and c.solver == "pd")
+        unlike = _unlike(comparison.runs[coarse], comparison.runs[comparison.reference])
+        parts = ["the mesh's", *(f"the {name}'s" for name in unlike)]
+        rest = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
         found.append(
             f"PD and Newton on the coarse mesh differ by at most "
             f"{1e3 * comparison.solver_error:.2g} mm (solver error); the rest of their error is "
-            f"the mesh's{of_element}."
+            f"{rest}."
         )
     return found + [
         f"{row.label}: {row.unusual_frames} of {_frames(comparison)} frames converged only by a "
@@ -242,6 +228,13 @@ def _of_the_models(comparison: Comparison) -> list[str]:
         + ("its gate need not notice." if gated[label] else "it has no gate.")
         for label, about in comparison.models.items()
     ]
+    found += filter(
+        None,
+        (
+            foreign_integrator(comparison.scene.time.integrator, about["trained_integrator"], label)
+            for label, about in comparison.models.items()
+        ),
+    )
     for row in comparison.rows:
         if not row.refused_frames:
             continue

@@ -13,6 +13,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated
 
 if TYPE_CHECKING:
+    from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.rollout import StepLog
     from pdcorrect.state import Stepper, Trajectory
@@ -33,8 +34,8 @@ def simulate(
     model: Annotated[
         Optional[str],
         typer.Option(
-            help="Correct the steps by this model, a name or a folder, on the coarse model that it "
-            "is for (extra 'learn')."
+            help="Correct the steps by this model, a name (docs/results.md and models/README.md "
+            "list them) or a folder, on the coarse model that it is for (extra 'learn')."
         ),
     ] = None,
     gate: Annotated[
@@ -65,6 +66,7 @@ def simulate(
         make_folder(vtu)
     tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, model, gate)
+    say(_told_of_model(stepper))
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     log = _run(stepper, count, output, earlier, overwrite)
@@ -75,7 +77,9 @@ def simulate(
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
-        series = write_vtu_series(load_trajectory(output), vtu, stress_of=stepper.problem)
+        series = write_vtu_series(
+            load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
+        )
         say(f"wrote {series}")
 
 
@@ -103,6 +107,18 @@ def _make_stepper(
     from pdcorrect.evaluate import make_stepper
 
     return make_stepper(scene, solver.value, refine)
+
+
+def _told_of_model(stepper: Stepper) -> str:
+    """Which model corrects, and whether it knows the scene's integrator; empty without one."""
+    from pdcorrect.run_text import foreign_integrator
+
+    about = getattr(stepper, "origin", None)
+    if not about:
+        return ""
+    told = f"model {about['model']} on the base {about['base']!r}, trained on {about['dataset']!r}"
+    trained, found = about["trained_integrator"], stepper.problem.scene.time.integrator
+    return "\n".join(filter(None, (told, foreign_integrator(found, trained, about["model"]))))
 
 
 def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | None:
@@ -162,7 +178,7 @@ def _run(
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
-    from pdcorrect.report_notes import inverted_frames
+    from pdcorrect.run_text import inverted_frames, three_digits
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
@@ -171,9 +187,9 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     say(
         f"{ran} of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
         f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
-        f"{seconds:.2f} s: {1e3 * seconds / count:.3g} ms a frame"
+        f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
     )
-    say(", ".join(f"{k}: {v}" for k, v in stepper.describe().items()))
+    say(", ".join(f"{k}: {v}" for k, v in _described(stepper).items()))
     say(
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
         f"{stats['iterations'].max()}; frames: {ends}"
@@ -192,20 +208,42 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         _corrections(stats, stepper)
 
 
+def _described(stepper: Stepper) -> dict[str, str]:
+    """What a stepper says of itself, but for the model, which is told before the run."""
+    origin = getattr(stepper, "origin", {})
+    told = {name: text for name, text in stepper.describe().items() if name not in origin}
+    if told.get("gate", "none") != "none":
+        told["gate"] = "default"  # the program has no other
+    return told
+
+
 def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
     from pdcorrect.corrector.gate import Reason
     from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.report_notes import refused_corrections
+    from pdcorrect.run_text import refused_corrections
 
-    say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
+    every = bool(stats["refused"].all())
+    if not every:
+        say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
     for sentence in refused_corrections(stats):
         say(sentence)
     if isinstance(stepper, HybridStepper) and (stats["gate"] == Reason.BODY).any():
-        measures = [f"{name} by {excess:.2g}" for name, excess in stepper.body_excess().items()]
-        say(f"Measures of the body beyond their range in training: {', '.join(measures)}.")
-    if stats["refused"].all():
+        say(_refused_measures(stepper))
+    if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
+
+
+def _refused_measures(stepper: HybridStepper) -> str:
+    """By which measures a gate refuses a body, the farthest out first."""
+    bound = stepper.gate.body if stepper.gate else None
+    beyond = {name: x for name, x in stepper.body_excess().items() if bound and x > bound}
+    far = sorted(beyond.items(), key=lambda item: -item[1])
+    measures = ", ".join(f"{name} {excess:.1f}" for name, excess in far)
+    return (
+        f"Outside the range of the training bodies by more than the bound {bound} "
+        f"(dimensionless): {measures}."
+    )
 
 
 def _other_work(stats: dict[str, Any]) -> str:

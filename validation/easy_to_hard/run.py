@@ -113,9 +113,7 @@ def methods(scene: pc.Scene, models: Sequence[str]) -> dict[str, Callable[[], An
 
 
 def _hybrid(scene: pc.Scene, name: str) -> pc.HybridStepper:
-    model = pc.load_model(home_folder("models") / name)
-    coarse = pc.ProjectiveDynamics(pc.coarse_model(scene, model.base))
-    return pc.HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=pc.Gate())
+    return pc.hybrid_of(scene, home_folder("models") / name)
 
 
 def rows_of(scene: pc.Scene, models: Sequence[str]) -> tuple[list[Row], float]:

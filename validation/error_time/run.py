@@ -164,9 +164,7 @@ class Comparison:
         return pc.Newton(make(), time_step=step)
 
     def _hybrid(self, name: str) -> Any:
-        model = released(name)
-        coarse = pc.ProjectiveDynamics(pc.coarse_model(self.scene, model.base))
-        return pc.HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=pc.Gate())
+        return pc.hybrid_of(self.scene, released(name))
 
     def _right_mass(self) -> pc.ProjectiveDynamics:
         mass = self.reference.problem.mass.sum()

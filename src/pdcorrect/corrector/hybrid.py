@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Self
 
@@ -59,6 +60,8 @@ class HybridStepper:
     gate : Gate, optional
         What else is refused than corrections that are not finite, and those of steps that
         the coarse solver fails.
+    origin : mapping of str to str, optional
+        Whence the corrector comes, for `describe` and the files of runs.
 
     Attributes
     ----------
@@ -96,6 +99,7 @@ class HybridStepper:
         *,
         velocity: Velocity = "recomputed",
         gate: Gate | None = None,
+        origin: Mapping[str, str] | None = None,
     ) -> None:
         if not isinstance(coarse_stepper, ImplicitStepper):
             raise InputError(
@@ -106,7 +110,7 @@ class HybridStepper:
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate, corrector)
-        self.velocity, self.gate = velocity, gate
+        self.velocity, self.gate, self.origin = velocity, gate, dict(origin or {})
         self.placement = corrector.config.placement
         h = coarse_stepper.time_step
         self.bodies = BodyGraph.of([self.problem], h, dtype=torch.float64)
@@ -130,7 +134,7 @@ class HybridStepper:
         return self
 
     def describe(self) -> dict[str, str]:
-        """The coarse stepper's description, the network's with a digest, and the gate."""
+        """The coarse stepper's description, the network's with a digest, the gate, the origin."""
         config = self.corrector.config
         return {
             **self.coarse.describe(),
@@ -140,6 +144,7 @@ class HybridStepper:
             "placement": self.placement,
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
+            **self.origin,
         }
 
     def body_excess(self) -> dict[str, float]:

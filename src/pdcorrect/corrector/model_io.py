@@ -48,6 +48,9 @@ FORMAT = "pdcorrect-model"
 VERSION = 3
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
+BACKWARD_EULER = "backward-euler"
+"""What all data sets have, also those of models that do not record it."""
+
 JOINT = "+"
 """Between the names of data sets that a model was trained on together."""
 _NORMALISER = "normaliser."
@@ -107,6 +110,11 @@ class LoadedModel:
     def base(self) -> str:
         """Run of the coarse model that it corrects: "plain", "best" or "total-mass"."""
         return str(self.configuration.get("base", "plain"))
+
+    @property
+    def integrator(self) -> str:
+        """Time integrator of the runs that it was trained on; backward Euler if not recorded."""
+        return str(self.record.training.get("integrator", BACKWARD_EULER))
 
     @property
     def data_sets(self) -> list[tuple[str, str | None]]:

@@ -50,7 +50,9 @@ class Problem(ElasticBody):
     clamps : Clamps
     loads : tuple of NodalLoad
     material_changed : bool
-        Whether the materials are no longer those of ``scene``.
+        Whether the moduli are no longer those of ``scene``.
+    density_changed : bool
+        Whether the density is not, as `with_total_mass` makes it.
     """
 
     scene: Scene
@@ -59,6 +61,7 @@ class Problem(ElasticBody):
     clamps: Clamps
     loads: tuple[NodalLoad, ...]
     material_changed: bool = False
+    density_changed: bool = False
 
     def __repr__(self) -> str:
         return (
@@ -167,7 +170,11 @@ class Problem(ElasticBody):
         """
         materials = self.materials.changed(self.scene.material, young, poisson, density)
         changed = ElasticBody(self.mesh, self.space, self.quadrature, materials, self.cell_size)
-        return replace(problem_from_body(self.scene, self.refine, changed), material_changed=True)
+        return replace(
+            problem_from_body(self.scene, self.refine, changed),
+            material_changed=self.material_changed or young is not None,
+            density_changed=self.density_changed or density is not None,
+        )
 
     def with_total_mass(self, mass: float) -> Problem:
         """The same problem, its density scaled so that its nodes have this mass together, kg.

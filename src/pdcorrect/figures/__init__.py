@@ -56,6 +56,8 @@ _OVERLAID = (
 """Of faces and edges: blue, green, red, and three more."""
 _STILL, _FILM = 1600, 1000
 """Default widths of pictures and films, pixels."""
+_ROW = 5
+"""Panels side by side in a picture, at most."""
 
 
 def render(
@@ -90,7 +92,8 @@ def render(
     frame : int or sequence of int, optional
         Which of the common frames; negative ones count from the end.  By
         default the last one in a picture, all in a film.  Several in a picture
-        are drawn in rows below each other, or side by side for a single run.
+        are drawn in rows below each other, or side by side for a single run.  Of one frame
+        more than five runs are drawn in several rows, likewise more than five frames of a run.
     fps : float
         Frames a second of a film.
     window : int, optional
@@ -211,17 +214,20 @@ class _Picture:
         self._times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
         count = len(bodies[0].frames)
         strip = not film and len(bodies) == 1
-        columns = count if strip else len(bodies)
-        rows = 1 if film or strip else count
+        side = count if strip else len(bodies)
+        table = not film and not strip and count > 1
+        rows, columns = (count, side) if table else (1, side) if film else _wrapped(side)
         bar = None
         if colour:
             bodies, bar = _scaled(bodies, colour)
         rest = _moves(bodies)
         view = View.fitted(shown_points(bodies, rest), max(16, width // columns))
-        captions = labels + [""] * (columns - len(labels))
+        captions = labels + [""] * (side - len(labels))
         longest = max(map(max, self._times))
         font = _font(width, columns)
-        self._sheet = Sheet(view, captions, rows, bar, font, longest=longest)
+        self._sheet = Sheet(
+            view, captions, rows, bar, font, None if table else columns, longest=longest
+        )
         palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
         self._painter = Painter(bodies, view, palette, limit, rest)
         self._panels = [(body, time) for time in range(count) for body in range(len(bodies))]
@@ -246,8 +252,16 @@ class _Picture:
 
 
 def _font(width: int, columns: int) -> float:
-    """Height of the text: a sixtieth of a picture of several panels."""
-    return width / 62 if columns > 2 else width / 50 if columns == 2 else width / 36
+    """Height of the text: a sixtieth of a picture, and of many panels an eighteenth of one."""
+    if columns > 2:
+        return min(width / 62, width / columns / 18)
+    return width / 50 if columns == 2 else width / 36
+
+
+def _wrapped(panels: int) -> tuple[int, int]:
+    """Rows and columns of a picture's panels, about as many in each row."""
+    rows = -(-panels // _ROW)
+    return rows, -(-panels // rows)
 
 
 def _check_arguments(

@@ -16,6 +16,8 @@ from pdcorrect.state import Trajectory
 Array = NDArray[np.float64]
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_FONT = 9
+"""Of legends, points."""
 _STYLES = ("-", "--", "-.", ":")
 _ENERGIES = {
     "elastic_energy": "elastic [J]",
@@ -58,19 +60,32 @@ def _labelled(
 
 
 def _legend(figure: Any, axes: Sequence[Any]) -> None:
-    """Above the axes, so that it hides nothing, in as many columns as fit."""
+    """Above the axes, so that it hides nothing, in as many columns as fit.
+
+    The figure grows by the rows beyond the first, and letters of a name that is wider than the
+    figure are smaller.
+    """
     lines: dict[str, Any] = {}
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
         lines |= dict(zip(labels, handles, strict=True))
-    for columns in range(min(4, len(lines)), 0, -1):
+    font, columns = _FONT, min(4, len(lines))
+    while True:
         legend = figure.legend(
             lines.values(), lines, loc="outside upper center", ncols=columns, frameon=False,
-            fontsize=9,
+            fontsize=font,
         )  # fmt: skip
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
-            return
+        extent = legend.get_window_extent()
+        if extent.width <= figure.bbox.width:
+            break
         legend.remove()
+        if columns > 1:
+            columns -= 1
+        else:
+            font *= 0.95 * figure.bbox.width / extent.width
+    rows = -(-len(lines) // columns)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + extent.height / figure.dpi * (rows - 1) / rows)
 
 
 def _style(index: int) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene
+from pdcorrect.solvers.rollout import DENSITY_CHANGED
 from pdcorrect.state import Trajectory
 
 _ROUNDING = 1e-9
@@ -16,11 +17,14 @@ _ROUNDING = 1e-9
 def problem_of(run: Trajectory) -> Problem:
     """The run's own problem, or one made anew from the scene that its file holds.
 
+    Its density is the scene's, also where the run had another one, as of `with_total_mass`:
+    Cauchy stress at given positions does not depend on it.
+
     Raises
     ------
     InputError
         If the file does not say enough: it holds no scene, or only a part of the nodes, or its
-        material was changed after the scene had been read.
+        moduli were changed after the scene had been read.
     SceneError, MeshError
         If the scene cannot be read or discretised, as where the file of its mesh is gone.
     """
@@ -29,7 +33,7 @@ def problem_of(run: Trajectory) -> Problem:
     if not run.scene_toml:
         raise InputError("it holds no scene: expected a run that pdcorrect has computed.")
     changed = run.attributes.get("material", "the scene's")
-    if changed != "the scene's":
+    if changed not in ("the scene's", DENSITY_CHANGED):
         raise InputError(
             f"its material was {changed} had been read, and the file does not say to what: "
             "expected a run with the scene's material; simulate --vtu writes the stress of others."

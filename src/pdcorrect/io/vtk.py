@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
-from glob import escape
+from collections.abc import Callable, Container, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.stress import stress, von_mises
-from pdcorrect.replacement import replacing
+from pdcorrect.replacement import make_folder, write_bytes
 from pdcorrect.state import Trajectory
 
 Array = NDArray[np.float64]
@@ -36,7 +36,8 @@ def write_vtu_series(
 
     Points are the current positions; ``displacement`` (m) and ``velocity``
     (m/s) are point data.  An older series of the same name in the folder is
-    replaced.
+    replaced: its PVD goes first and the new one comes last, so that a PVD never
+    names files that are missing or of another run.
 
     Parameters
     ----------
@@ -61,22 +62,21 @@ def write_vtu_series(
 
     Raises
     ------
+    InputError
+        If a frame is not finite, or ``stress_of`` has another mesh; then nothing is touched.
     OutputError
         If the folder cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: expected 1 or more.")
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be created ({error.strerror}).") from error
-    for stale in folder.glob(f"{escape(name)}_[0-9][0-9][0-9][0-9]*.vtu"):
-        stale.unlink()
-    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
-    collection = ET.SubElement(root, "Collection")
-    for frame in range(0, len(trajectory.times), every):
-        file = f"{name}_{frame:04d}.vtu"
+    _check_frames(trajectory, name)
+    if stress_of is not None:
+        _check_problem(stress_of, trajectory, name)
+    files = {k: f"{name}_{k:04d}.vtu" for k in range(0, len(trajectory.times), every)}
+    folder = make_folder(folder)
+    path = folder / f"{name}.pvd"
+    _delete(path)
+    for frame, file in files.items():
         positions = trajectory.positions[frame]
         of_points, of_cells = _stresses(stress_of, positions) if stress_of else ({}, {})
         write_vtu(
@@ -91,16 +91,68 @@ def write_vtu_series(
             },
             {**of_cells, **(cell_data(frame) if cell_data else {})},
         )
-        time = repr(float(trajectory.times[frame]))
-        ET.SubElement(collection, "DataSet", timestep=time, part="0", file=file)
-    ET.indent(root)
-    path = folder / f"{name}.pvd"
-    try:
-        with replacing(path) as part:
-            ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from error
+    _delete_frames(folder, name, but=files.values())
+    write_bytes(path, _collection({file: trajectory.times[k] for k, file in files.items()}))
     return path
+
+
+def delete_vtu_series(folder: Path, name: str) -> None:
+    """Delete ``name.pvd`` and then its frames, and no other series' files.
+
+    Raises
+    ------
+    OutputError
+        If one cannot be deleted.
+    """
+    _delete(folder / f"{name}.pvd")
+    _delete_frames(folder, name, but=())
+
+
+def _delete_frames(folder: Path, name: str, but: Container[str]) -> None:
+    """``name_0000.vtu`` and so on, not those of ``name_2026``, without some."""
+    own = re.compile(rf"{re.escape(name)}_\d{{4,}}\.vtu")
+    for path in folder.glob("*.vtu"):
+        if own.fullmatch(path.name) and path.name not in but:
+            _delete(path)
+
+
+def _delete(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be deleted ({error.strerror}).") from error
+
+
+def _check_frames(run: Trajectory, name: str) -> None:
+    """Refuse what ParaView would draw as nothing."""
+    for what, values in (("positions", run.positions), ("velocities", run.velocities)):
+        finite = np.isfinite(values).all(axis=(1, 2))
+        if not finite.all():
+            raise InputError(
+                f"{name}: frame {int(finite.argmin())} has {what} that are infinite or not a "
+                "number: expected finite ones."
+            )
+
+
+def _check_problem(problem: Problem, run: Trajectory, name: str) -> None:
+    """Refuse another mesh than the run's, whose stresses would be of other nodes."""
+    here, there = problem.positions.shape, run.points.shape
+    if here != there or not np.array_equal(problem.cells, run.cells):
+        raise InputError(
+            f"{name}: stress_of has {here[0]} nodes and {len(problem.cells)} cells, the run "
+            f"{there[0]} and {len(run.cells)}: expected what was stepped, with the same cells."
+        )
+
+
+def _collection(times: Mapping[str, float]) -> bytes:
+    """XML of a PVD: files and their times, s."""
+    root = ET.Element("VTKFile", type="Collection", version="0.1", byte_order="LittleEndian")
+    collection = ET.SubElement(root, "Collection")
+    for file, time in times.items():
+        ET.SubElement(collection, "DataSet", timestep=f"{time:.12g}", part="0", file=file)
+    ET.indent(root)
+    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text
 
 
 def _stresses(problem: Problem, positions: Array) -> tuple[dict[str, Array], dict[str, Array]]:

@@ -17,6 +17,9 @@ from pdcorrect.state import State, Stepper, StepResult, Trajectory
 
 Array = NDArray[np.float64]
 OnStep = Callable[[StepResult, float], None]
+DENSITY_CHANGED = "the scene's but for its density"
+"""Attribute "material" of runs of `Problem.with_total_mass`."""
+
 OnFailure = Literal["raise", "stop", "continue"]
 
 
@@ -191,9 +194,16 @@ def run_attributes(stepper: Stepper) -> dict[str, str]:
         "refine": str(problem.refine),
         "element": problem.element,
         "mass": problem.mass_rule,
-        "material": "changed after the scene" if problem.material_changed else "the scene's",
+        "material": _material(problem),
         **stepper.describe(),
     }
+
+
+def _material(problem: Problem) -> str:
+    """Whether it is the scene's; a density that was changed alone is told, for stress has none."""
+    if problem.material_changed:
+        return "changed after the scene"
+    return DENSITY_CHANGED if problem.density_changed else "the scene's"
 
 
 def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:

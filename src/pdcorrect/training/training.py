@@ -26,6 +26,7 @@ from pdcorrect.corrector.model_io import (
 )
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, folders_of, splits_of
+from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.missing import check_whole
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
@@ -317,6 +318,7 @@ class Training:
                 dataset_hash=self._identity["data"],
                 training={
                     **self._identity,
+                    "integrator": INTEGRATOR,
                     "data_sets": [{"name": name, "config_hash": x} for name, x in known],
                     "iterations": self.progress.total, "seconds": self.progress.seconds,
                     "processes": self.world.size,
