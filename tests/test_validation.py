@@ -88,6 +88,26 @@ def test_recorded_rows_give_the_recorded_figures_and_tables(monkeypatch):
                 assert cell == (pytest.approx(told, rel=1e-9) if isinstance(told, float) else told)
 
 
+def test_recorded_rows_of_easy_and_hard_simulations_can_be_drawn_again(monkeypatch):
+    pytest.importorskip("torch")
+    case = CASES["easy_to_hard"]
+    monkeypatch.syspath_prepend(case.folder)
+    redraw = importlib.import_module("redraw")
+    for name in ("redraw", "run"):
+        del sys.modules[name]
+    record = json.loads((case.folder.parent / "results" / "easy_to_hard.json").read_text())
+    for table in record["tables"]:
+        found = redraw.simulations(table)
+        assert len(found) == 5
+        for rows in found:
+            plain, reference = rows["plain"], rows["reference"]
+            assert (plain.omega, reference.omega, reference.error) == (0.0, 100.0, 0.0)
+            left = {name: (row.error / plain.error) ** 2 for name, row in rows.items()}
+            assert {n: 100.0 * (1.0 - x) for n, x in left.items()} == pytest.approx(
+                {name: row.omega for name, row in rows.items()}, abs=0.02
+            )
+
+
 def test_the_models_of_error_against_time_are_inputs_of_the_case():
     case = CASES["error_time"]
     models = {name for names in case._module().MODELS.values() for name in names}

@@ -237,7 +237,8 @@ def outcome(measured: Measured, quick: bool, caption: str) -> common.Outcome:
         speed_up = middle.milliseconds / as_near.milliseconds
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
-    hybrids = [row for row in rows if row.family == "hybrid"]
+    models = MODELS.get((measured.motion, measured.setting), ())
+    hybrids = [by_name[f"hybrid, {name}"] for name in models if f"hybrid, {name}" in by_name]
     for row in hybrids:
         base = by_name[ROWS[released(row.name.removeprefix("hybrid, ")).base]]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
