@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
-from run import HEADS, Row, common, draw
+from run import HEADS, Row, caption, common, draw
 
 from pdcorrect.validation.cases import find_cases
 from pdcorrect.validation.outcome import missing, outside
@@ -40,6 +40,7 @@ def main() -> None:
     for table in record.tables:
         picture = f"{case.name}/{table['name']}.png"
         assert picture in record.pictures
+        record.pictures[picture] = caption(table["name"])
         draw(common.RESULTS / picture, simulations(table))
     record.outside = outside(record.figures, case.expected)
     record.outside += missing(record.figures, case.expected, quick=False)

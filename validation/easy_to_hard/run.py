@@ -173,11 +173,7 @@ def measure(motion: str) -> common.Outcome:
         body += [
             (*first, r.name, r.nodes, r.milliseconds, 1e3 * r.error, r.omega) for r in rows
         ]  # fmt: skip
-    caption = (
-        f"{motion}, exact: RMS error over the plain mesh's, against time over the plain mesh's, in "
-        "five simulations of the evaluation split; the larger the mark, the harder for the corrector."
-    )
-    picture = common.Picture(motion, caption, lambda path: draw(path, found))
+    picture = common.Picture(motion, caption(motion), lambda path: draw(path, found))
     return common.Outcome(figures, (common.Table(motion, HEADS, tuple(body)),), (picture,))
 
 
@@ -192,6 +188,14 @@ def beside(label: str, rows: Mapping[str, Row], name: str) -> common.Figures:
             rows["reference"].milliseconds / hybrid.milliseconds
         ),
     }
+
+
+def caption(motion: str) -> str:
+    """Of a data set's picture."""
+    return (
+        f"{motion}, exact: RMS error and time of a frame over the plain mesh's, in five simulations "
+        "of the evaluation split; the larger a mark, the harder for the corrector."
+    )
 
 
 def draw(path: Path, simulations: Sequence[Mapping[str, Row]]) -> None:
