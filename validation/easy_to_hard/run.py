@@ -193,8 +193,8 @@ def beside(label: str, rows: Mapping[str, Row], name: str) -> common.Figures:
 def caption(motion: str) -> str:
     """Of a data set's picture."""
     return (
-        f"{motion}, exact: RMS error and time of a frame over the plain mesh's, in five simulations "
-        "of the evaluation split; the larger a mark, the harder for the corrector."
+        f"{motion}, exact: RMS error and time of a frame over the plain mesh's, in five "
+        "simulations of the evaluation split; the larger a mark, the harder for the corrector."
     )
 
 
