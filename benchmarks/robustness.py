@@ -4,8 +4,8 @@
 
 Runs `tests/test_faults.py`, `tests/test_fuzz.py` and `tests/test_fuzz_learning.py` with their slow
 tests, and ``pdcorrect validate --quick``, and counts from pytest's report.  A fault hits where it
-ends the program or makes it fail; what is lost is what the same command, called again, does not
-make up for.
+ends the program or makes it fail; nothing is lost where the same command, called again, ends with
+what a run without faults leaves.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ def tested(slow: bool) -> list[dict[str, Any]]:
         report = Path(folder) / "report.xml"
         chosen = [] if slow else ["-m", "not slow"]
         command = [sys.executable, "-m", "pytest", "-q", *TESTS, *chosen, f"--junitxml={report}"]
+        command += ["-o", "junit_family=xunit1"]  # the one that has properties
         subprocess.run(command, cwd=ROOT, check=False)  # failures are in the report
         cases = ElementTree.parse(report).getroot().iter("testcase")
         return [_row(case) for case in cases]
@@ -53,8 +54,8 @@ def faults(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     for row in rows:
         if "fault" in row:
-            lost = 0 if row["outcome"] == "passed" else row["injected"]
             keys = ("program", "fault", "injected", "hits")
+            lost = row.get("lost", f"not known: {row['outcome']}")
             found.append({**{key: row[key] for key in keys}, "lost": lost})
     return found
 
@@ -88,6 +89,7 @@ def main() -> None:
             "tests": len(fuzzed),
             "tests_failed": [r["test"] for r in fuzzed if r["outcome"] != "passed"],
         },
+        "skipped": [row["test"] for row in rows if row["outcome"] == "skipped"],
         "tests": rows,
     }
     text = json.dumps(record, indent=1)

@@ -403,3 +403,9 @@ def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_pa
     command = ("compare", tmp_path / "scene.toml", "--frames", 1, "--no-figures", "-o")
     assert "is of an earlier run" in program(*command, tmp_path)[1]
     assert "is of an earlier run" not in program(*command, tmp_path / "new")[1]
+
+
+def test_notes_name_the_solvers_rest_beside_two_plain_coarse_cases(thick):
+    again = dataclasses.replace(pc.evaluate.CASES[2], label="coarse PD again")
+    found = pc.compare(thick, 2, (*pc.evaluate.CASES[1:], again))
+    assert any("the rest of their error is" in note for note in report.notes(found))

@@ -203,7 +203,7 @@ def _total_mass(run: Trajectory) -> float:
 def _of_the_solvers(comparison: Comparison) -> list[str]:
     found = []
     if comparison.solver_error is not None:
-        (coarse,) = (c.label for c in comparison.cases if c.plain and c.solver == "pd")
+        coarse = [c.label for c in comparison.cases if c.plain and c.solver == "pd"][-1]
         unlike = _unlike(comparison.runs[coarse], comparison.runs[comparison.reference])
         parts = ["the mesh's", *(f"the {name}'s" for name in unlike)]
         rest = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -6,11 +6,10 @@ asked.  A factor is stored in strips of 16 columns.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
-from llvmlite import binding, ir
+from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -26,12 +25,6 @@ STRIP = 16
 """Columns whose sums are in registers together: one of AVX-512 in single precision."""
 ROWS = 8
 """Rows of them: enough sums under way to hide how long a fused multiply-add takes."""
-WIDE = 3 if binding.get_host_cpu_features().get("avx512f") else 1
-"""Strips taken together in single precision, so that what is read of x serves as often.
-
-Three have 24 sums and three lines of the factor, which leave five of AVX-512's 32 registers; AVX2
-has 16, of half the length, which one strip fills.
-"""
 
 
 def filled_up(count: int, to: int = STRIP) -> int:
@@ -59,82 +52,58 @@ def product(x, factor, bias, least, out):  # type: ignore[no-untyped-def]
     bias : (b,)
     out : (m, b or more)
     """
-    together = 0
-    if factor.itemsize == 4:
-        together = factor.shape[0] - factor.shape[0] % WIDE
-    for strip in range(0, together, WIDE):
+    for strip in range(factor.shape[0]):
         for row in range(0, x.shape[0], ROWS):
-            _wide_tile(x, row, factor, strip, bias, least, out)
-    for strip in range(together, factor.shape[0]):
-        for row in range(0, x.shape[0], ROWS):
-            _tile(x, row, factor, strip, bias, least, out)
+            _tile(x, row, factor, strip, bias, least, out)  # type: ignore[call-arg]
 
 
-def _tiles(count: int) -> Any:
-    """Rows ``row`` to row + 7 of `product` in the columns of ``count`` strips from ``strip``."""
+@intrinsic  # type: ignore[misc]
+def _tile(typing, x, row, factor, strip, bias, least, out):  # type: ignore[no-untyped-def]
+    """Rows ``row`` to row + 7 of `product` in the columns of one strip."""
+    number = factor.dtype
 
-    @intrinsic  # type: ignore[misc]
-    def tile(typing, x, row, factor, strip, bias, least, out):  # type: ignore[no-untyped-def]
-        signature = types.void(x, row, factor, strip, bias, least, out)
-        return signature, partial(_generate, count, factor.dtype)
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        scalar = context.get_value_type(number)
+        vector = ir.VectorType(scalar, STRIP)
+        splat = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
+        nothing = ir.Constant(vector, ir.Undefined)
+        size = context.get_abi_sizeof(scalar)
 
-    return tile
+        def array(index: int) -> tuple[Any, list[Any]]:
+            found = context.make_array(signature.args[index])(context, builder, args[index])
+            return found.data, parts.unpack_tuple(builder, found.shape)
 
+        def integer(index: int) -> Any:
+            return context.cast(builder, args[index], signature.args[index], types.intp)
 
-def _generate(
-    count: int, number: Any, context: Any, builder: Any, signature: Any, args: Any
-) -> Any:
-    """The tile's code; the arguments after ``number``, the type of entries, are Numba's."""
-    scalar = context.get_value_type(number)
-    vector = ir.VectorType(scalar, STRIP)
-    splat = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
-    nothing = ir.Constant(vector, ir.Undefined)
-    size = context.get_abi_sizeof(scalar)
+        def load(pointer: Any, offset: Any) -> Any:
+            at = builder.bitcast(builder.gep(pointer, [offset]), vector.as_pointer())
+            return builder.load(at, align=size)
 
-    def array(index: int) -> tuple[Any, list[Any]]:
-        found = context.make_array(signature.args[index])(context, builder, args[index])
-        return found.data, parts.unpack_tuple(builder, found.shape)
+        def spread(value: Any) -> Any:
+            one = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
+            return builder.shuffle_vector(one, nothing, splat)
 
-    def integer(index: int) -> Any:
-        return context.cast(builder, args[index], signature.args[index], types.intp)
-
-    def constant(value: int) -> Any:
-        return context.get_constant(types.intp, value)
-
-    def place(pointer: Any, offset: Any) -> Any:
-        return builder.bitcast(builder.gep(pointer, [offset]), vector.as_pointer())
-
-    def load(pointer: Any, offset: Any) -> Any:
-        return builder.load(place(pointer, offset), align=size)
-
-    def spread(value: Any) -> Any:
-        one = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(one, nothing, splat)
-
-    (xs, (_, x_width)), (ws, (_, depth, _)), (bs, _), (outs, (_, out_width)) = map(
-        array, (0, 2, 4, 6)
-    )
-    rows = [builder.add(integer(1), constant(r)) for r in range(ROWS)]
-    chosen = [builder.add(integer(3), constant(s)) for s in range(count)]
-    columns = [builder.mul(strip, constant(STRIP)) for strip in chosen]
-    starts = [builder.mul(r, x_width) for r in rows]
-    sums = [[parts.alloca_once_value(builder, load(bs, at)) for at in columns] for _ in rows]
-    with parts.for_range(builder, depth, intp=depth.type) as loop:
-        lines = [builder.add(builder.mul(strip, depth), loop.index) for strip in chosen]
-        factors = [load(ws, builder.mul(line, constant(STRIP))) for line in lines]
-        for start, totals in zip(starts, sums, strict=True):
-            value = spread(builder.load(builder.gep(xs, [builder.add(start, loop.index)])))
-            for factor, total in zip(factors, totals, strict=True):
-                by = builder.fmul(value, factor, flags=("contract",))
+        (xs, (_, x_width)), (ws, (_, depth, _)), (bs, _), (outs, (_, out_width)) = map(
+            array, (0, 2, 4, 6)
+        )
+        first, column = integer(1), builder.mul(integer(3), context.get_constant(types.intp, STRIP))
+        rows = [builder.add(first, context.get_constant(types.intp, r)) for r in range(ROWS)]
+        sums = [parts.alloca_once_value(builder, load(bs, column)) for _ in rows]
+        starts = [builder.mul(r, x_width) for r in rows]
+        with parts.for_range(builder, depth, intp=depth.type) as loop:
+            line = builder.add(builder.mul(integer(3), depth), loop.index)
+            w = load(ws, builder.mul(line, context.get_constant(types.intp, STRIP)))
+            for start, total in zip(starts, sums, strict=True):
+                value = spread(builder.load(builder.gep(xs, [builder.add(start, loop.index)])))
+                by = builder.fmul(value, w, flags=("contract",))
                 builder.store(builder.fadd(builder.load(total), by, flags=("contract",)), total)
-    floor = spread(context.cast(builder, args[5], signature.args[5], number))
-    for r, totals in zip(rows, sums, strict=True):
-        for column, total in zip(columns, totals, strict=True):
+        floor = spread(context.cast(builder, args[5], signature.args[5], number))
+        for r, total in zip(rows, sums, strict=True):
             value = builder.load(total)
             value = builder.select(builder.fcmp_ordered("<", value, floor), floor, value)
-            at = builder.add(builder.mul(r, out_width), column)
-            builder.store(value, place(outs, at), align=size)
-    return context.get_dummy_value()
+            at = builder.gep(outs, [builder.add(builder.mul(r, out_width), column)])
+            builder.store(value, builder.bitcast(at, vector.as_pointer()), align=size)
+        return context.get_dummy_value()
 
-
-_tile, _wide_tile = _tiles(1), _tiles(WIDE)
+    return types.void(x, row, factor, strip, bias, least, out), generate
