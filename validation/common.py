@@ -117,6 +117,16 @@ def plot(
     figure.savefig(path, dpi=150)
 
 
+def plain_log_axes(axis: Any, labels: tuple[str, str]) -> None:
+    """Logarithmic axes with plain numbers at 1, 2 and 5 of each decade, a grid and no frame."""
+    axis.set(xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+    axis.grid(alpha=0.3, which="both")
+    axis.spines[["top", "right"]].set_visible(False)
+
+
 def main(file: str) -> int:
     """Run the case of a file in full, write its result to `RESULTS`; 1 if a figure is outside."""
     case = ValidationCase(Path(file).resolve().parent)

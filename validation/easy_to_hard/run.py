@@ -216,15 +216,9 @@ def draw(path: Path, simulations: Sequence[Mapping[str, Row]]) -> None:
                 20 + 28 * rank, common.COLOURS[k], "osD^vP"[k], alpha=0.8, label=label,
             )  # fmt: skip
             label = None
-    axis.set(
-        xscale="log", yscale="log", xlabel="time of a frame over the plain mesh's",
-        ylabel="RMS error over the plain mesh's",
-    )  # fmt: skip
-    for side in (axis.xaxis, axis.yaxis):
-        side.set_major_formatter("{x:g}")
-        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
-    axis.grid(alpha=0.3, which="both")
-    axis.spines[["top", "right"]].set_visible(False)
+    common.plain_log_axes(
+        axis, ("time of a frame over the plain mesh's", "RMS error over the plain mesh's")
+    )
     figure.legend(loc="outside upper center", ncols=3, frameon=False)
     figure.savefig(path, dpi=150)
 

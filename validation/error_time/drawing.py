@@ -34,15 +34,7 @@ def draw(path: Path, rows: Sequence[Row], scale: float) -> None:
                 label=None if row.name == FITTED else label,
             )  # fmt: skip
             label = label if row.name == FITTED else None
-    axis.set(
-        xscale="log", yscale="log", xlabel="ms a frame",
-        ylabel="RMS error, per cent of the largest displacement",
-    )  # fmt: skip
-    for side in (axis.xaxis, axis.yaxis):
-        side.set_major_formatter("{x:g}")
-        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
-    axis.grid(alpha=0.3, which="both")
-    axis.spines[["top", "right"]].set_visible(False)
+    common.plain_log_axes(axis, ("ms a frame", "RMS error, per cent of the largest displacement"))
     axis.margins(x=0.14, y=0.08)
     figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=9)
     last = [r for r in rows if r not in best and r.family != FAMILIES[3]]  # tolerances crowd
