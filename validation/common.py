@@ -117,6 +117,15 @@ def plot(
     figure.savefig(path, dpi=150)
 
 
+def axis_of_meshes(axis: Any, title: str, label: str, counts: Sequence[int]) -> None:
+    """A panel over numbers of cells, each of them a tick, at equal distances where they double."""
+    axis.set(xscale="log", title=title, xlabel=label)
+    axis.set_xticks(counts, [str(n) for n in counts])
+    axis.minorticks_off()
+    axis.grid(alpha=0.3)
+    axis.spines[["top", "right"]].set_visible(False)
+
+
 def plain_log_axes(axis: Any, labels: tuple[str, str]) -> None:
     """Logarithmic axes with plain numbers at 1, 2 and 5 of each decade, a grid and no frame."""
     axis.set(xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])

@@ -203,11 +203,7 @@ def draw(figures: common.Figures, path: Path) -> None:
             places = [n * (1.0 + 0.03 * (k - 2)) for n in MESHES]  # beside each other
             axis.plot(places, ratios, color=colour, marker=mark, markersize=5, label=element)
         axis.axhline(1.0, color="0.4", linewidth=0.8)
-        axis.set(xscale="log", title=what, xlabel="cells through the thickness")
-        axis.set_xticks(MESHES, [str(n) for n in MESHES])
-        axis.minorticks_off()
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
+        common.axis_of_meshes(axis, what, "cells through the thickness", MESHES)
     panels[0].set_ylabel("ratio to beam theory")
     figure.legend(
         *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False

@@ -131,12 +131,8 @@ def draw(figures: common.Figures, path: Path) -> None:
             axis.plot(SIZES, lifts, color=colour, marker=mark, markersize=5, label=element)
         least, largest = PUBLISHED[problem]
         axis.axhspan(least, largest, color="0.6", linewidth=1.2, label="published")
-        axis.set(xscale="log", title=problem, xlabel="cells along an edge")
-        axis.set_xticks(SIZES, [str(n) for n in SIZES])
-        axis.minorticks_off()
+        common.axis_of_meshes(axis, problem, "cells along an edge", SIZES)
         axis.set_ylim(bottom=0.0)
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("lift, units of length")
     figure.legend(
         *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False

@@ -114,7 +114,7 @@ class ElasticBody:
         left is a tenth of them at most, and the energy is flat at the equilibrium.
         """
         tolerance = None if modes is None else _FLAT
-        return self.energy_of(self.relaxed(positions, modes=modes, tolerance=tolerance))
+        return self.energy_and_forces(self.relaxed(positions, modes=modes, tolerance=tolerance))[0]
 
     def forces(self, positions: Array) -> Array:
         """Elastic nodal forces -dW/dp, (N, 3), N."""
@@ -138,15 +138,6 @@ class ElasticBody:
                 "expected a shape that is strained less. Use project=True."
             ) from None
         return Assembly(self.cells, len(self.positions)).matrix(modes.blocks)
-
-    def energy_of(self, configuration: Array) -> float:
-        """Elastic energy, J, of a configuration (N + B, 3), m, without its forces."""
-        energy = np.empty(len(self.cells))
-        kernels.energies(
-            self.materials.model, self._displacement(configuration), self.assembly.cells,
-            self.quadrature.lanes, self.point_weights, self.quadrature.first_volume, energy,
-        )  # fmt: skip
-        return float(energy.sum())
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""

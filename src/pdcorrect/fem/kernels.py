@@ -69,29 +69,6 @@ def energy_and_forces(  # type: ignore[no-untyped-def]
 
 
 @njit(**PARALLEL)
-def energies(model, u, cells, gradients, weights, first, energy):  # type: ignore[no-untyped-def]
-    """Elastic energy (C,), J, of each cell, for the arguments of `energy_and_forces`."""
-    count, points = cells.shape[0], weights.shape[2]
-    size, lanes = block_shape(points)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        U, V, t = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((3, lanes))
-        s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
-        w, one = np.empty((2, lanes)), np.empty((9, points))
-        density, part = np.empty((1, lanes)), np.empty((1, points))
-        last = min(count, (chunk + 1) * CHUNK)
-        for begin in range(chunk * CHUNK, last, size):
-            end = min(last, begin + size)
-            fill(u, cells, gradients, weights, begin, end, first, one, F, w)
-            signed_svd_lanes(F, U, s, V, B, S)
-            lane = first_volume_lane(first, points, w)
-            principal_stress_lanes(model, s, v, k, w[0], w[1], lane, density[0], t)
-            for c in range(begin, end):
-                take(density, c - begin, size, first, part)
-                energy[c] = total(part[0])
-
-
-@njit(**PARALLEL)
 def smallest_determinants(u, cells, gradients, out):  # type: ignore[no-untyped-def]
     """Smallest det F of each cell, out (C,), of the nodes' displacements u alone."""
     count, lanes = cells.shape[0], gradients.shape[3]

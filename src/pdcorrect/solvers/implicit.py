@@ -350,7 +350,7 @@ def _outcome(
     return _Outcome(
         after,
         minimum,
-        elastic_energy=problem.energy_of(end),
+        elastic_energy=problem.energy_and_forces(end)[0],
         external_work=float(np.vdot(objective.forces[:nodes], moved)),
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, h),
