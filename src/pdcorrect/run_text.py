@@ -16,6 +16,7 @@ _MEANINGS = {
     "energy": "the corrected state has more energy than the loads account for",
     "solver": "the coarse step itself failed",
     "body": "the body at rest is unlike those of its training",
+    "pause": "it would have passed, too soon after one that did not",
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from pdcorrect.batch.checks import check_nodal, start_times
+from pdcorrect.batch.checks import check_nodal, check_state, start_times
 from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
@@ -21,6 +21,7 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.decision import corrected_step
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, check_gate
+from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.corrector.recorded import UNRECORDABLE, RecordedCorrector, recordable
 from pdcorrect.errors import InputError
@@ -111,6 +112,7 @@ class BatchHybrid(WithNodes):
         Parameters
         ----------
         state : BatchState
+            Its memory, too, is what the result's was: a gate that is shut keeps its count there.
         previous : (n, 3) tensor, optional
             Correction of the step before, m, for networks that ask for it; zero by default.
 
@@ -119,13 +121,26 @@ class BatchHybrid(WithNodes):
         InputError
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
+        check_state(self.stepper.cells, state)
+        left = None if self.gate is None else steps_left(state.memory)
         with self.stepper.alone():
-            step = BatchCoarseStep(self._hybrid, state, previous)
+            step = BatchCoarseStep(self._hybrid, _open(state), previous)
             answers = self.corrector if self._recorded is None else self._recorded
-            answer, coarse, decision = corrected_step(step, answers, self.gate)
+            answer, coarse, decision = corrected_step(step, answers, self.gate, left)
+        after = answer.state
+        if self.gate is not None:
+            after = self._shut(after, self.gate.steps_shut(decision.reasons, left))
         return BatchHybridResult(
-            answer.state, decision.correction, coarse, decision.reasons, decision.factors
+            after, decision.correction, coarse, decision.reasons, decision.factors
         )
+
+    def _shut(self, state: BatchState, steps: Tensor) -> BatchState:
+        """The state with what it has to remember if the gate stays shut for steps (B,)."""
+        if not steps.any():
+            return state
+        own = self.stepper.node_mask[..., None].expand_as(state.positions)
+        kept = own * steps[:, None, None].to(state.positions.dtype)
+        return replace(state, memory={**state.memory, PAUSE: kept})
 
 
 class HybridLayer(WithNodes, nn.Module):
@@ -304,3 +319,10 @@ def _without_derivatives(x: Tensor | None, where: Tensor) -> None:
     """Make a tensor of a graph that exists already pass no derivatives back in some places."""
     if x is not None and x.requires_grad:
         x.register_hook(lambda grad: torch.where(where, 0.0, grad))  # type: ignore[no-untyped-call]
+
+
+def _open(state: BatchState) -> BatchState:
+    """The state without what it remembers of a gate, of which coarse steppers know nothing."""
+    if PAUSE not in state.memory:
+        return state
+    return replace(state, memory={name: x for name, x in state.memory.items() if name != PAUSE})

@@ -135,6 +135,13 @@ class Decision:
         """With reasons (B,) that were found for corrections that count."""
         return replace(self, reasons=where(self.counts, reasons, self.reasons))
 
+    def paused(self, left: Values | None) -> Decision:
+        """With those refused that would pass while the gate is shut, for (B,) steps more."""
+        if left is None:
+            return self
+        shut = (left > 0) & (self.reasons == 0)
+        return replace(self, reasons=where(shut, int(Reason.PAUSE), self.reasons))
+
     def judged(
         self, gate: Gate, step: CoarseStep[Answer], coarse: Answer
     ) -> tuple[Decision, Answer]:
@@ -156,44 +163,47 @@ class Decision:
 
 
 def corrected_step(
-    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None, left: Values | None = None
 ) -> tuple[Answer, Answer, Decision]:
     """The answer of a corrected step, the coarse solver's, and the decision.
 
-    Scenes whose correction is zero or refused have the plain coarse answer bit for bit.  With
+    ``left`` (B,) is for how many steps more the gate is shut; None where it is not.  Scenes whose correction is zero or refused have the plain coarse answer bit for bit.  With
     placement "state" the coarse solver's is always that; else it is the answer itself.
     """
     if corrector.config.placement == "state":
-        return _state(step, corrector, gate)
+        return _state(step, corrector, gate, left)
     view = step.view(None)
     decision = Decision.of(step, view, corrector, gate)
+    if corrector.config.placement == "guess":
+        decision = decision.paused(left)
     if not decision.counts.any():
-        answer = step.solved()
+        answer, decision = step.solved(), decision.paused(left)
     elif corrector.config.placement == "force":
-        answer, decision = _force(step, decision, gate)
+        answer, decision = _force(step, decision, gate, left)
     else:
         answer, decision = _guess(step, decision, step.own(view.snapshot.proposed))
     return answer, answer, decision
 
 
 def _state(
-    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None, left: Values | None
 ) -> tuple[Answer, Answer, Decision]:
     coarse = step.solved()
     decision = Decision.of(step, step.view(coarse), corrector, gate)
     reasons = where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
     decision = replace(decision, reasons=reasons)
     if not decision.counts.any():
-        return coarse, coarse, decision
+        return coarse, coarse, decision.paused(left)
     if gate is not None and gate.judges:
         decision, moved = decision.judged(gate, step, coarse)
     else:
         moved = step.moved(coarse, decision.correction)
+    decision = decision.paused(left)
     return step.chosen(decision.counts, moved, coarse), coarse, decision
 
 
 def _force(
-    step: CoarseStep[Answer], decision: Decision, gate: Gate | None
+    step: CoarseStep[Answer], decision: Decision, gate: Gate | None, left: Values | None
 ) -> tuple[Answer, Decision]:
     forced = step.solved(added=decision.correction)
     ok, measured = step.ok(forced), None
@@ -204,14 +214,15 @@ def _force(
         found = filled(reasons, int(Reason.ENERGY))
         found = found if before is None else gate.reasons(measured, before, rise)
         reasons = where(ok, found, reasons)
-    if not (decision.counts & (reasons > 0)).any():
-        return forced, decision
+    unused = reasons > 0 if left is None else (reasons > 0) | (left > 0)
+    if not (decision.counts & unused).any():
+        return forced, decision.paused(left)
     plain = step.solved()
     if gate is not None and measured is not None:
         found = gate.reasons(measured, step.measured(plain), gate.energy)
         found = where(step.ok(plain), found, int(Reason.SOLVER))
         reasons = where(ok & (reasons > 0), found, reasons)
-    decision = decision.refused(reasons)
+    decision = decision.refused(reasons).paused(left)
     return step.chosen(decision.counts, forced, plain), decision
 
 

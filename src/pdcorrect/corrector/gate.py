@@ -28,7 +28,8 @@ class Reason(IntEnum):
     NOT_FINITE: the network's answer is not a number.  FEATURES: its inputs are unlike those of the
     training (`Gate.margin`, `Gate.average`).  INVERSION, ENERGY: the corrected state fails
     (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
-    body at rest is unlike those of the training (`Gate.body`).
+    body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
+    soon after a step that did not (`Gate.pause`).
     """
 
     NONE = 0
@@ -38,6 +39,7 @@ class Reason(IntEnum):
     ENERGY = 4
     SOLVER = 5
     BODY = 6
+    PAUSE = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +113,11 @@ class Gate(Strict):
     limit
         Whether a correction that fails by volume or energy is halved, up to six times, until it
         passes, and refused only then; for placement "state".
+    pause
+        After a step that is refused, corrections count again after so many steps in a row that
+        would have passed: what was applied before is one half of a motion of which the gate does
+        not know the other.  The count is kept in `State.memory` while it lasts.  Zero: each step
+        is judged for itself.
     """
 
     body: NonNegative | None = 0.3
@@ -121,6 +128,7 @@ class Gate(Strict):
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
     energy: NonNegative | None = 8.0
     limit: bool = False
+    pause: Annotated[int, Field(strict=True, ge=0)] = 5
 
     def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Whether bodies at rest are too unlike those of its training, (B,) bool."""
@@ -154,6 +162,19 @@ class Gate(Strict):
             below = below | ~(answer.ratios >= bound)
         worse = below & ~(answer.ratios >= coarse.ratios)
         return where(worse.any(axis=1), int(Reason.INVERSION), reasons)
+
+    def steps_shut(self, reasons: Values, left: Values | None) -> Values:
+        """For how many steps it stays shut after one, (B,).
+
+        Parameters
+        ----------
+        reasons : (B,)
+            Of the step.
+        left : (B,), optional
+            For how many it was to stay shut before the step; by default it was open.
+        """
+        again = (reasons != Reason.NONE) & (reasons != Reason.PAUSE) & (reasons != Reason.BODY)
+        return where(again, self.pause, 0 if left is None else (left - 1).clip(min=0))
 
     @property
     def judges(self) -> bool:

@@ -23,6 +23,7 @@ from pdcorrect.corrector.compiled import CompiledCorrector, compilable
 from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.decision import Decision, corrected_step
 from pdcorrect.corrector.gate import Gate, check_gate
+from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.corrector.single_step import SingleCoarseStep
@@ -35,6 +36,8 @@ Array = NDArray[np.float64]
 MEMORY = "previous_correction"
 """In `State.memory`, m, where the network asks for the correction of the step before."""
 
+_OWN = (MEMORY, PAUSE)
+"""What a coarse stepper has no use for in `State.memory`."""
 
 _ROUNDING = 1e-5
 """Of measures whose ranges were fitted to meshes in single precision."""
@@ -160,7 +163,7 @@ class HybridStepper:
         """Tell the coarse stepper about the frames so far."""
         restore = getattr(self.coarse, "restore", None)
         if restore is not None:
-            memory = {name: x for name, x in run.memory.items() if name != MEMORY}
+            memory = {name: x for name, x in run.memory.items() if name not in _OWN}
             restore(replace(run, memory=memory))
 
     def __call__(self, state: State, forces: Array | None = None) -> StepResult:
@@ -173,15 +176,20 @@ class HybridStepper:
         """
         before, _ = self.coarse.accepted(_without(state), forces, None)
         previous = state.memory.get(MEMORY) if self._remembers else None
+        left = None if self.gate is None else steps_left(state.memory)
         step = self._step(before, forces, previous)
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):
-            result, _, decision = corrected_step(step, self._answers, self.gate)
+            result, _, decision = corrected_step(step, self._answers, self.gate, left)
         correction: Array = decision.correction
         reason = float(decision.reasons.item())
-        after = result.state
+        after, own = result.state, {}
         if self._remembers:
-            after = replace(after, memory={**after.memory, MEMORY: correction})
+            own[MEMORY] = correction
+        if self.gate is not None and (shut := self.gate.steps_shut(decision.reasons, left).item()):
+            own[PAUSE] = np.full_like(correction, shut)
+        if own:
+            after = replace(after, memory={**after.memory, **own})
         stats = {
             **result.stats,
             "correction": float(np.sqrt(np.square(correction).sum(axis=1).max())),
@@ -208,8 +216,8 @@ def digest(corrector: Corrector) -> str:
 
 
 def _without(state: State) -> State:
-    """The state without the memory of a correction."""
-    if not isinstance(state, State) or MEMORY not in state.memory:
+    """The state without what a hybrid remembers."""
+    if not isinstance(state, State) or not any(name in state.memory for name in _OWN):
         return state
-    memory = {name: x for name, x in state.memory.items() if name != MEMORY}
+    memory = {name: x for name, x in state.memory.items() if name not in _OWN}
     return replace(state, memory=memory)
