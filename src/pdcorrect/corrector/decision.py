@@ -167,7 +167,9 @@ def corrected_step(
 ) -> tuple[Answer, Answer, Decision]:
     """The answer of a corrected step, the coarse solver's, and the decision.
 
-    ``left`` (B,) is for how many steps more the gate is shut; None where it is not.  Scenes whose correction is zero or refused have the plain coarse answer bit for bit.  With
+    ``left`` (B,) is for how many steps more the gate is shut; None where it is open.
+
+    Scenes whose correction is zero or refused have the plain coarse answer bit for bit.  With
     placement "state" the coarse solver's is always that; else it is the answer itself.
     """
     if corrector.config.placement == "state":
