@@ -314,6 +314,14 @@ def test_rollouts_are_those_without_recording(device, placement):
     assert (one - two).abs().max() < 1e-8
 
 
+def assert_equal(found, expected):
+    """On a GPU to rounding, since sums over edges and corners add in any order there."""
+    if found.device.type == "cpu":
+        assert torch.equal(found, expected)
+    else:
+        assert (found - expected).abs().max() < 1e-10 * expected.abs().max()
+
+
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_of_a_hybrid_in_use_record_for_themselves(device, made, copied):
     stepper = pc.BatchStepper(problems(*CELLS), device=device)
@@ -324,8 +332,8 @@ def test_copies_of_a_hybrid_in_use_record_for_themselves(device, made, copied):
     written(other.corrector)
     anew = pc.BatchHybrid(stepper, other.corrector, gate=gate, recorded=True)
     one, two, three = (h(h.stepper.rest_state()).correction for h in (hybrid, other, anew))
-    assert torch.equal(one, first.correction)
-    assert torch.equal(two, three)
+    assert_equal(one, first.correction)
+    assert_equal(two, three)
     assert (two - one).abs().max() > 0.1 * one.abs().max()
 
 
@@ -335,7 +343,7 @@ def test_inference_mode_makes_no_difference(device, made):
     state = motion.steps[2][1].state
     with torch.inference_mode():
         found = hybrid(state).correction
-    assert torch.equal(found, hybrid(state).correction)
+    assert_equal(found, hybrid(state).correction)
 
 
 def test_of_a_recorded_batch_the_foreign_body_alone_is_refused(device, made):
