@@ -17,7 +17,7 @@ from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.features import Snapshot, View
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.products import product, strips
+from pdcorrect.corrector.products import normalise, product, strips
 
 CROSS = {
     "shape": "cross", "cells": [6, 2, 2], "cell_size": 0.05, "arms": 4, "arm_start": 2,
@@ -89,6 +89,27 @@ def test_what_is_not_a_number_passes_through_products():
     out = np.zeros((8, 16))
     product(x, strips(np.ones((2, 16))), np.zeros(16), 0.0, out)
     assert np.array_equal(np.isnan(out).all(axis=1), np.arange(8) == 3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("width", [16, 48, 128])
+def test_rows_are_normalised_as_by_torch(width, dtype):
+    rng = np.random.default_rng(0)
+    x, norm = rng.normal(3.0, 2.0, (5, width)).astype(dtype), rng.normal(size=(2, width))
+    x[1], x[2] = 0.25, 1e-4 * x[2]  # no variance, and less than what is added to it
+    weight, bias = torch.tensor(norm.astype(dtype))
+    layer_norm = torch.nn.functional.layer_norm
+    expected = layer_norm(torch.tensor(x.copy()), (width,), weight, bias).numpy()
+    normalise(x, norm.astype(dtype))
+    assert np.abs(x - expected).max() < 200 * np.finfo(dtype).eps
+
+
+def test_a_row_with_what_is_not_a_number_is_none_and_leaves_the_others():
+    x = np.random.default_rng(0).normal(size=(3, 16))
+    x[1, 4] = np.nan
+    normalise(x, np.ones((2, 16)))
+    assert np.array_equal(np.isnan(x).all(axis=1), [False, True, False])
+    assert np.isfinite(x[[0, 2]]).all()
 
 
 # --- features --------------------------------------------------------------------------------

@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from pdcorrect.corrector.network import MeshGraphNetwork
-from pdcorrect.corrector.products import ROWS, filled_up, product, strips
+from pdcorrect.corrector.products import EPSILON, ROWS, filled_up, normalise, product, strips
 from pdcorrect.fem.blocks import PARALLEL, REDUCE
 
 Array = NDArray[Any]
 
 GROUP = 16
 """Nodes that one thread takes at a time; a multiple of `ROWS`."""
-_EPSILON = 1e-5
-"""LayerNorm's, as torch has it by default."""
 
 
 class Groups:
@@ -170,6 +168,9 @@ def _normalise(x, width, norm):  # type: ignore[no-untyped-def]
     kind = x.dtype.type
     if not norm.shape[0]:
         return
+    if width == x.shape[1]:
+        normalise(x, norm)
+        return
     for row in range(x.shape[0]):
         line = x[row]
         mean, variance = kind(0.0), kind(0.0)
@@ -178,7 +179,7 @@ def _normalise(x, width, norm):  # type: ignore[no-untyped-def]
         mean = kind(mean / width)
         for k in range(width):
             variance += (line[k] - mean) * (line[k] - mean)
-        scale = kind(1.0 / np.sqrt(variance / width + _EPSILON))
+        scale = kind(1.0 / np.sqrt(variance / width + EPSILON))
         for k in range(width):
             line[k] = (line[k] - mean) * scale * norm[0, k] + norm[1, k]
 

@@ -1,7 +1,7 @@
-"""Products of tall and narrow matrices in compiled loops, whose sums stay in registers.
+"""Products of tall and narrow matrices, and LayerNorm of their rows, by vectors of 16 numbers.
 
 What BLAS does, for callers that are in a parallel loop already, where OpenBLAS may not be
-asked.  A factor is stored in strips of 16 columns.
+asked: sums stay in registers.  A factor is stored in strips of 16 columns.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ STRIP = 16
 """Columns whose sums are in registers together: one of AVX-512 in single precision."""
 ROWS = 8
 """Rows of them: enough sums under way to hide how long a fused multiply-add takes."""
+EPSILON = 1e-5
+"""LayerNorm's, as torch has it by default."""
 
 
 def filled_up(count: int, to: int = STRIP) -> int:
@@ -57,53 +59,160 @@ def product(x, factor, bias, least, out):  # type: ignore[no-untyped-def]
             _tile(x, row, factor, strip, bias, least, out)  # type: ignore[call-arg]
 
 
+@njit(**OPTIONS)
+def normalise(x, norm):  # type: ignore[no-untyped-def]
+    """LayerNorm of rows in place.
+
+    Parameters
+    ----------
+    x : (m, w)
+        w is a multiple of 16.
+    norm : (2, w)
+        Weight and bias.
+    """
+    for row in range(x.shape[0]):
+        _normalise(x, row, norm, EPSILON)  # type: ignore[call-arg]
+
+
+class _Vectors:
+    """Arrays of an intrinsic's arguments, taken by 16 numbers of one type.
+
+    Parameters
+    ----------
+    context, builder, signature, args
+        Of the intrinsic's code generator.
+    number
+        Numba's type of the numbers.
+    """
+
+    def __init__(self, context: Any, builder: Any, signature: Any, args: Any, number: Any) -> None:
+        self._context, self._builder, self._number = context, builder, number
+        self._signature, self._args = signature, args
+        self.kind = ir.VectorType(context.get_value_type(number), STRIP)
+        self._size = context.get_abi_sizeof(context.get_value_type(number))
+
+    def array(self, index: int) -> tuple[Any, list[Any]]:
+        """Pointer and shape of an argument."""
+        kind = self._signature.args[index]
+        found = self._context.make_array(kind)(self._context, self._builder, self._args[index])
+        return found.data, parts.unpack_tuple(self._builder, found.shape)
+
+    def integer(self, index: int) -> Any:
+        """An argument that counts something."""
+        given = self._args[index], self._signature.args[index]
+        return self._context.cast(self._builder, *given, types.intp)
+
+    def scalar(self, index: int) -> Any:
+        """An argument as one of the numbers."""
+        given = self._args[index], self._signature.args[index]
+        return self._context.cast(self._builder, *given, self._number)
+
+    def count(self, value: int) -> Any:
+        return self._context.get_constant(types.intp, value)
+
+    def _at(self, pointer: Any, offset: Any) -> Any:
+        at = self._builder.gep(pointer, [offset])
+        return self._builder.bitcast(at, self.kind.as_pointer())
+
+    def load(self, pointer: Any, offset: Any) -> Any:
+        return self._builder.load(self._at(pointer, offset), align=self._size)
+
+    def store(self, vector: Any, pointer: Any, offset: Any) -> None:
+        self._builder.store(vector, self._at(pointer, offset), align=self._size)
+
+    def spread(self, value: Any) -> Any:
+        """A number 16 times."""
+        nothing = ir.Constant(self.kind, ir.Undefined)
+        one = self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
+        same = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
+        return self._builder.shuffle_vector(one, nothing, same)
+
+    def total(self, vector: Any) -> Any:
+        """The sum of 16 numbers, of halves at a time."""
+        width = STRIP
+        while width > 1:
+            width //= 2
+            low, high = (
+                self._builder.shuffle_vector(
+                    vector, vector,
+                    ir.Constant(ir.VectorType(ir.IntType(32), width), [*range(k, k + width)]),
+                )
+                for k in (0, width)
+            )  # fmt: skip
+            vector = self._builder.fadd(low, high)
+        return self._builder.extract_element(vector, ir.Constant(ir.IntType(32), 0))
+
+
+@intrinsic  # type: ignore[misc]
+def _normalise(typing, x, row, norm, epsilon):  # type: ignore[no-untyped-def]
+    """One row of `normalise`."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        v = _Vectors(context, builder, signature, args, x.dtype)
+        (xs, (_, width)), (norms, _) = v.array(0), v.array(2)
+        start = builder.mul(v.integer(1), width)
+        strips_of_row = builder.udiv(width, v.count(STRIP))
+        zero = ir.Constant(v.kind, None)
+        inverse = builder.fdiv(
+            ir.Constant(v.kind.element, 1.0), builder.sitofp(width, v.kind.element)
+        )
+
+        def mean_of(function: Any) -> Any:
+            total = parts.alloca_once_value(builder, zero)
+            builder.store(zero, total)
+            with parts.for_range(builder, strips_of_row, intp=width.type) as loop:
+                at = builder.add(start, builder.mul(loop.index, v.count(STRIP)))
+                builder.store(builder.fadd(builder.load(total), function(v.load(xs, at))), total)
+            return builder.fmul(v.total(builder.load(total)), inverse)
+
+        mean = v.spread(mean_of(lambda line: line))
+
+        def squares(line: Any) -> Any:
+            away = builder.fsub(line, mean)
+            return builder.fmul(away, away)
+
+        variance = builder.fadd(mean_of(squares), v.scalar(3))
+        root = builder.module.declare_intrinsic("llvm.sqrt", [v.kind.element])
+        scale = builder.fdiv(ir.Constant(v.kind.element, 1.0), builder.call(root, [variance]))
+        scale = v.spread(scale)
+        with parts.for_range(builder, strips_of_row, intp=width.type) as loop:
+            column = builder.mul(loop.index, v.count(STRIP))
+            at = builder.add(start, column)
+            line = builder.fmul(builder.fsub(v.load(xs, at), mean), scale)
+            line = builder.fmul(line, v.load(norms, column), flags=("contract",))
+            bias = v.load(norms, builder.add(width, column))
+            v.store(builder.fadd(line, bias, flags=("contract",)), xs, at)
+        return context.get_dummy_value()
+
+    return types.void(x, row, norm, epsilon), generate
+
+
 @intrinsic  # type: ignore[misc]
 def _tile(typing, x, row, factor, strip, bias, least, out):  # type: ignore[no-untyped-def]
     """Rows ``row`` to row + 7 of `product` in the columns of one strip."""
     number = factor.dtype
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        scalar = context.get_value_type(number)
-        vector = ir.VectorType(scalar, STRIP)
-        splat = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
-        nothing = ir.Constant(vector, ir.Undefined)
-        size = context.get_abi_sizeof(scalar)
-
-        def array(index: int) -> tuple[Any, list[Any]]:
-            found = context.make_array(signature.args[index])(context, builder, args[index])
-            return found.data, parts.unpack_tuple(builder, found.shape)
-
-        def integer(index: int) -> Any:
-            return context.cast(builder, args[index], signature.args[index], types.intp)
-
-        def load(pointer: Any, offset: Any) -> Any:
-            at = builder.bitcast(builder.gep(pointer, [offset]), vector.as_pointer())
-            return builder.load(at, align=size)
-
-        def spread(value: Any) -> Any:
-            one = builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
-            return builder.shuffle_vector(one, nothing, splat)
-
+        v = _Vectors(context, builder, signature, args, number)
         (xs, (_, x_width)), (ws, (_, depth, _)), (bs, _), (outs, (_, out_width)) = map(
-            array, (0, 2, 4, 6)
+            v.array, (0, 2, 4, 6)
         )
-        first, column = integer(1), builder.mul(integer(3), context.get_constant(types.intp, STRIP))
-        rows = [builder.add(first, context.get_constant(types.intp, r)) for r in range(ROWS)]
-        sums = [parts.alloca_once_value(builder, load(bs, column)) for _ in rows]
+        first, column = v.integer(1), builder.mul(v.integer(3), v.count(STRIP))
+        rows = [builder.add(first, v.count(r)) for r in range(ROWS)]
+        sums = [parts.alloca_once_value(builder, v.load(bs, column)) for _ in rows]
         starts = [builder.mul(r, x_width) for r in rows]
         with parts.for_range(builder, depth, intp=depth.type) as loop:
-            line = builder.add(builder.mul(integer(3), depth), loop.index)
-            w = load(ws, builder.mul(line, context.get_constant(types.intp, STRIP)))
+            line = builder.add(builder.mul(v.integer(3), depth), loop.index)
+            w = v.load(ws, builder.mul(line, v.count(STRIP)))
             for start, total in zip(starts, sums, strict=True):
-                value = spread(builder.load(builder.gep(xs, [builder.add(start, loop.index)])))
-                by = builder.fmul(value, w, flags=("contract",))
+                value = builder.load(builder.gep(xs, [builder.add(start, loop.index)]))
+                by = builder.fmul(v.spread(value), w, flags=("contract",))
                 builder.store(builder.fadd(builder.load(total), by, flags=("contract",)), total)
-        floor = spread(context.cast(builder, args[5], signature.args[5], number))
+        floor = v.spread(v.scalar(5))
         for r, total in zip(rows, sums, strict=True):
             value = builder.load(total)
             value = builder.select(builder.fcmp_ordered("<", value, floor), floor, value)
-            at = builder.gep(outs, [builder.add(builder.mul(r, out_width), column)])
-            builder.store(value, builder.bitcast(at, vector.as_pointer()), align=size)
+            v.store(value, outs, builder.add(builder.mul(r, out_width), column))
         return context.get_dummy_value()
 
     return types.void(x, row, factor, strip, bias, least, out), generate
