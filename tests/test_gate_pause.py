@@ -376,7 +376,7 @@ def test_rollouts_of_an_evaluation_carry_the_pause_on():
 @pytest.mark.parametrize("integrator", ["backward-euler", "generalised-alpha"])
 def test_a_run_goes_on_from_its_file_in_the_middle_of_a_pause(tmp_path, integrator):
     problem = pushed_in(2, time={"integrator": integrator})
-    corrector = wary(problem)
+    corrector = wary(pushed_in())
     hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=Gate(**NOTHING, pause=3))
     whole = pc.rollout(hybrid, 7)
     assert whole.stats["gate"].tolist() == [0, N, P, P, P, 0, 0]
