@@ -188,6 +188,7 @@ ORDER = [
     "corrector.model_io",
     "corrector.placements",
     "corrector.gate",
+    "corrector.pause",
     "corrector.decision",
     "corrector.recorded",
     "corrector.batch_bodies",

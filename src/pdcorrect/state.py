@@ -51,9 +51,10 @@ class State:
     Attributes
     ----------
     memory : mapping of str to (N, 3) float64
-        What a time integrator needs besides to take the next step, by name:
-        accelerations, or positions and velocities of an earlier frame.  It belongs to
-        these positions and velocities: leave it out when you change them.
+        What the next step depends on besides, by name: for a time integrator accelerations, or
+        positions and velocities of an earlier frame; for a `HybridStepper` the correction before,
+        and for how many steps its gate is shut.  It belongs to these positions and velocities:
+        leave it out when you change them.
     """
 
     positions: Array

@@ -124,7 +124,7 @@ class BatchStaging:
         """Whether the states have the memory for a step of this length."""
         before = state.memory.get("previous_times")
         if before is None:
-            return bool(state.memory)
+            return "accelerations" in state.memory
         lengths = [t - e for t, e in zip(state.times, before[:, 0, 0].tolist(), strict=True)]
         rounding = 2.0 * torch.finfo(before.dtype).eps
         started = [

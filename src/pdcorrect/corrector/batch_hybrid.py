@@ -122,7 +122,7 @@ class BatchHybrid(WithNodes):
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
         check_state(self.stepper.cells, state)
-        left = None if self.gate is None else steps_left(state.memory)
+        left = steps_left(self.gate, state.memory)
         with self.stepper.alone():
             step = BatchCoarseStep(self._hybrid, _open(state), previous)
             answers = self.corrector if self._recorded is None else self._recorded

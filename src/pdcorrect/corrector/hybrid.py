@@ -176,7 +176,7 @@ class HybridStepper:
         """
         before, _ = self.coarse.accepted(_without(state), forces, None)
         previous = state.memory.get(MEMORY) if self._remembers else None
-        left = None if self.gate is None else steps_left(state.memory)
+        left = steps_left(self.gate, state.memory)
         step = self._step(before, forces, previous)
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):

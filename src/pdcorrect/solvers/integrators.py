@@ -159,7 +159,7 @@ def _started(state: State, h: float) -> bool:
     """Whether a state has the memory for a step of h seconds."""
     before = state.memory.get("previous_times")
     if before is None:
-        return bool(state.memory)
+        return "accelerations" in state.memory
     return equal_steps(state.time - before[0, 0], h)
 
 
