@@ -79,19 +79,21 @@ def run(scenario: Scenario, solver: str) -> Run:
     problem = problem_of(scenario, solver)
     if solver == "batch":
         return _batch(scenario, problem)
-    return _steps(scenario, MAKE[solver](problem))
+    return steps_of(scenario, MAKE[solver](problem))
 
 
 def tight(scenario: Scenario, solver: str) -> Run:
     """The same steps by the other method, solved tightly."""
     problem = problem_of(scenario, solver)
     other = pc.ProjectiveDynamics(problem, TIGHT) if solver == "Newton" else pc.Newton(problem)
-    return _steps(scenario, other)
+    return steps_of(scenario, other)
 
 
 def finer(scenario: Scenario) -> Run:
     """The same steps by PD on a finer mesh of the best coarse model's element, at its nodes."""
-    fine = _steps(scenario, pc.ProjectiveDynamics(problem_of(scenario, "PD best", scenario.finer)))
+    fine = steps_of(
+        scenario, pc.ProjectiveDynamics(problem_of(scenario, "PD best", scenario.finer))
+    )
     coarse, shared = problem_of(scenario, "PD best"), fine.problem.mesh.coarse_nodes
     return replace(fine, problem=coarse, positions=fine.positions[:, shared])
 
@@ -115,7 +117,8 @@ MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
 }
 
 
-def _steps(scenario: Scenario, stepper: pc.Stepper) -> Run:
+def steps_of(scenario: Scenario, stepper: pc.Stepper) -> Run:
+    """All of a scene's steps by a stepper."""
     problem, state = stepper.problem, scenario.state(stepper.problem)
     results = []
     for number in range(scenario.scene.time.frames):
