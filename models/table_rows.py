@@ -34,7 +34,7 @@ _FURTHER = "through-further/model"
 ROWS = (
     Row("impulse-as-published", "impulse-as-published-fourth", "model", _IMPULSE),
     Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
-    Row("stretch-as-published", "stretch-as-published-third", "model", _STRETCH),
+    Row("stretch-as-published", "stretch-as-published-fourth", "model", _STRETCH),
     Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),
     Row("torsion-as-published", "torsion-as-published-second", "torsion-as-published", _TORSION),
     Row(_HEAVY, "torsion-as-published-second", _HEAVY, _TORSION),
