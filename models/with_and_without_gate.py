@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--one-clamp", action="store_true", help="hold bodies there only")
     parser.add_argument("--strength-factor", type=float, default=1.0, help="on the loads")
     parser.add_argument("--frames", type=int, default=None, help="all of the data set by default")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     if options.family and not options.coarse_nodes:
         parser.error("--family: expected --coarse-nodes, too.")
     if options.coarse_nodes and options.split != EVALUATION:

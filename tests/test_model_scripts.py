@@ -261,7 +261,7 @@ def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
 def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):
     config, record = ROOT / "datasets" / "tiny" / "config.toml", tmp_path / "record.json"
     command = [sys.executable, ROOT / "models" / "with_and_without_gate.py", config]
-    options = ["0/0", "--model", "tiny", "-o", record, "--frames", "2"]
+    options = ["--model", "tiny", "0/0", "-o", record, "--frames", "2"]  # as its usage has it
     subprocess.run([*command, *options], check=True, capture_output=True)
     found = json.loads(record.read_text())
     (simulation,) = found["simulations"]
