@@ -108,6 +108,7 @@ class _Vectors:
         return self._context.cast(self._builder, *given, self._number)
 
     def count(self, value: int) -> Any:
+        """A number of rows or columns."""
         return self._context.get_constant(types.intp, value)
 
     def _at(self, pointer: Any, offset: Any) -> Any:
@@ -115,9 +116,11 @@ class _Vectors:
         return self._builder.bitcast(at, self.kind.as_pointer())
 
     def load(self, pointer: Any, offset: Any) -> Any:
+        """16 numbers from an offset on, wherever they are aligned."""
         return self._builder.load(self._at(pointer, offset), align=self._size)
 
     def store(self, vector: Any, pointer: Any, offset: Any) -> None:
+        """The reverse of `load`."""
         self._builder.store(vector, self._at(pointer, offset), align=self._size)
 
     def spread(self, value: Any) -> Any:
@@ -159,7 +162,6 @@ def _normalise(typing, x, row, norm, epsilon):  # type: ignore[no-untyped-def]
 
         def mean_of(function: Any) -> Any:
             total = parts.alloca_once_value(builder, zero)
-            builder.store(zero, total)
             with parts.for_range(builder, strips_of_row, intp=width.type) as loop:
                 at = builder.add(start, builder.mul(loop.index, v.count(STRIP)))
                 builder.store(builder.fadd(builder.load(total), function(v.load(xs, at))), total)
