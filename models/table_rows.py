@@ -32,9 +32,9 @@ _KICKED = "impulse-as-published-total-mass"
 _HEAVY = "torsion-as-published-total-mass"
 _FURTHER = "through-further/model"
 ROWS = (
-    Row("impulse-as-published", "impulse-as-published-fourth", "model", _IMPULSE),
+    Row("impulse-as-published", "impulse-as-published-fifth", "model", _IMPULSE),
     Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
-    Row("stretch-as-published", "stretch-as-published-fourth", "model", _STRETCH),
+    Row("stretch-as-published", "stretch-as-published-fifth", "model", _STRETCH),
     Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),
     Row("torsion-as-published", "torsion-as-published-second", "torsion-as-published", _TORSION),
     Row(_HEAVY, "torsion-as-published-second", _HEAVY, _TORSION),
