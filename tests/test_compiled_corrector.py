@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numba.core.errors import TypingError
 
 import pdcorrect as pc
 from conftest import rotation
@@ -110,6 +111,20 @@ def test_a_row_with_what_is_not_a_number_is_none_and_leaves_the_others():
     normalise(x, np.ones((2, 16)))
     assert np.array_equal(np.isnan(x).all(axis=1), [False, True, False])
     assert np.isfinite(x[[0, 2]]).all()
+
+
+def test_arrays_that_vectors_would_misread_are_refused():
+    x, norm = np.ones((8, 32)), np.ones((2, 16))
+    with pytest.raises(TypingError, match="C-contiguous"):
+        normalise(x[:, :16], norm)
+    with pytest.raises(TypingError, match="one type"):
+        normalise(np.ones((8, 16)), norm.astype(np.float32))
+    factor, bias = strips(np.ones((32, 16))), np.zeros(16)
+    with pytest.raises(TypingError, match="one type"):
+        product(x.astype(np.float32), factor, bias, 0.0, np.empty((8, 16)))
+    with pytest.raises(TypingError, match="C-contiguous"):
+        product(x, factor, bias, 0.0, np.empty((8, 32))[:, :16])
+    assert (x == 1.0).all()
 
 
 # --- features --------------------------------------------------------------------------------

@@ -192,6 +192,53 @@ def test_a_failed_coarse_step_shuts_the_gate(placement):
     assert found == [Reason.SOLVER, P, P, 0, 0]
 
 
+class FailsThird(pc.ProjectiveDynamics):
+    """Says of every step of the scene's own loads from time 2 h that it failed."""
+
+    def __call__(self, state, forces=None, **options):
+        result = super().__call__(state, forces, **options)
+        if forces is None and np.isclose(state.time, 2 * STEP):
+            result = replace(result, status=pc.Status.ITERATION_LIMIT)
+        return result
+
+
+@pytest.mark.parametrize("size", [1.0, 0.0])
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_coarse_step_that_fails_in_a_pause_begins_it_anew(placement, size):
+    """Also where a network has nothing to correct; forces of a correction would have helped."""
+    problem = pushed_in(1)
+    corrector = wary(problem, placement=placement)
+    corrector.answer = size * corrector.answer
+    hybrid = HybridStepper(FailsThird(problem), corrector, gate=Gate(**NOTHING, pause=2))
+    pairs = results_of(hybrid, 6)
+    assert [r.status.ok for _, r in pairs] == [True, True, False, True, True, True]
+    assert [r.stats["gate"] for _, r in pairs] == [N, P, Reason.SOLVER, P, P, 0]
+
+
+class SomeFail(pc.BatchStepper):
+    """Says of the second scene's steps from time h that they failed."""
+
+    def __call__(self, state, *args, **options):
+        result = super().__call__(state, *args, **options)
+        statuses = list(result.statuses)
+        if np.isclose(state.times[1], STEP):
+            statuses[1] = pc.Status.ITERATION_LIMIT
+        return replace(result, statuses=tuple(statuses))
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_of_a_batch_the_scene_whose_step_fails_in_a_pause_begins_it_anew(placement):
+    scenes = [pushed_in(1), pushed_in(1, cells=(2, 2, 1))]
+    stepper = SomeFail(scenes)
+    hybrid = BatchHybrid(stepper, wary(*scenes, placement=placement), gate=Gate(**NOTHING, pause=2))
+    state, reasons = stepper.rest_state(), []
+    for _ in range(5):
+        result = hybrid(state)
+        state = result.state
+        reasons.append(result.reasons.tolist())
+    assert reasons == [[N, N], [P, Reason.SOLVER], [P, P], [0, P], [0, 0]]
+
+
 def test_inputs_unlike_the_training_shut_the_gate():
     """Without the test of them the same steps are corrected."""
     problem = pc.discretise(soft_beam(loads=[TORSION]))

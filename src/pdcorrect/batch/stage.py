@@ -122,9 +122,12 @@ class BatchStaging:
 
     def _started(self, state: BatchState) -> bool:
         """Whether the states have the memory for a step of this length."""
-        before = state.memory.get("previous_times")
-        if before is None:
-            return "accelerations" in state.memory
+        needed = self._integrate.remembered(self._h)
+        if not needed <= state.memory.keys():
+            return False
+        if "previous_times" not in needed:
+            return True
+        before = state.memory["previous_times"]
         lengths = [t - e for t, e in zip(state.times, before[:, 0, 0].tolist(), strict=True)]
         rounding = 2.0 * torch.finfo(before.dtype).eps
         started = [

@@ -142,6 +142,11 @@ class Decision:
         shut = (left > 0) & (self.reasons == 0)
         return replace(self, reasons=where(shut, int(Reason.PAUSE), self.reasons))
 
+    def failed_in_pause(self, ok: Values) -> Decision:
+        """With the solver's reason where a step (B,) failed while the gate was shut."""
+        failed = (self.reasons == Reason.PAUSE) & ~ok
+        return replace(self, reasons=where(failed, int(Reason.SOLVER), self.reasons))
+
     def judged(
         self, gate: Gate, step: CoarseStep[Answer], coarse: Answer
     ) -> tuple[Decision, Answer]:
@@ -184,6 +189,8 @@ def corrected_step(
         answer, decision = _force(step, decision, gate, left)
     else:
         answer, decision = _guess(step, decision, step.own(view.snapshot.proposed))
+    if left is not None:
+        decision = decision.failed_in_pause(step.ok(answer))
     return answer, answer, decision
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from llvmlite import ir
 from numba import njit, types
 from numba.core import cgutils
+from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -146,9 +147,17 @@ class _Vectors:
         return self._builder.extract_element(vector, ir.Constant(ir.IntType(32), 0))
 
 
+def _check_arrays(*arrays: Any) -> None:
+    """Refuse types of arrays that would be misread: vectors know pointers and one type alone."""
+    kinds = {(getattr(a, "layout", None), getattr(a, "dtype", None)) for a in arrays}
+    if len(kinds) > 1 or kinds.pop()[0] != "C":
+        raise TypingError(f"{arrays}: expected C-contiguous arrays of one type of numbers.")
+
+
 @intrinsic  # type: ignore[misc]
 def _normalise(typing, x, row, norm, epsilon):  # type: ignore[no-untyped-def]
     """One row of `normalise`."""
+    _check_arrays(x, norm)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         v = _Vectors(context, builder, signature, args, x.dtype)
@@ -192,6 +201,7 @@ def _normalise(typing, x, row, norm, epsilon):  # type: ignore[no-untyped-def]
 @intrinsic  # type: ignore[misc]
 def _tile(typing, x, row, factor, strip, bias, least, out):  # type: ignore[no-untyped-def]
     """Rows ``row`` to row + 7 of `product` in the columns of one strip."""
+    _check_arrays(x, factor, bias, out)
     number = factor.dtype
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

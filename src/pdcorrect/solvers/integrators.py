@@ -74,15 +74,28 @@ class Integrator:
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        return _scheme(self.scheme_of, h, _started(state, h))
+        return _scheme(self.scheme_of, h, self._started(state, h))
 
     def held(self, state: State, h: float) -> Integrator:
         """The same integrator with the scheme of that step, whatever the length of its own step.
 
         As if the steps before ``state`` had the same length.
         """
-        started = _started(state, h)
+        started = self._started(state, h)
         return Integrator(lambda length, _: self.scheme_of(length, started))
+
+    def remembered(self, h: float) -> frozenset[str]:
+        """Names in the memory of a state after a step of h seconds, which the next one needs."""
+        return frozenset(_scheme(self.scheme_of, h, False).memory)
+
+    def _started(self, state: State, h: float) -> bool:
+        """Whether a state has the memory for a step of h seconds; other entries do not count."""
+        needed = self.remembered(h)
+        if not needed <= state.memory.keys():
+            return False
+        if "previous_times" not in needed:
+            return True
+        return equal_steps(state.time - state.memory["previous_times"][0, 0], h)
 
     def known(
         self, problem: Problem, state: State, h: float, forces: Array | None
@@ -153,14 +166,6 @@ def nodal_solution(scheme: Scheme, before: Any, after: Any) -> Any:
     row = scheme.positions.coefficients
     rest = Linear(**{name: c for name, c in row.items() if name != "y"})
     return (after - rest({"positions": before})) / row["y"]
-
-
-def _started(state: State, h: float) -> bool:
-    """Whether a state has the memory for a step of h seconds."""
-    before = state.memory.get("previous_times")
-    if before is None:
-        return "accelerations" in state.memory
-    return equal_steps(state.time - before[0, 0], h)
 
 
 def equal_steps(a: float, b: float) -> bool:
