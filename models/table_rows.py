@@ -101,31 +101,20 @@ JOINT_HEADINGS = (
     "intermediate mesh: Ω mean", "stress error, %: one model, of this motion, intermediate",
 )  # fmt: skip
 
-_TORSIONS, _IMPULSES, _STRETCHES = (
-    "torsion-exact-fourth",
-    "impulse-exact-second",
-    "stretch-exact-second",
-)
+_TORSIONS = "torsion-exact-fourth"
+_IMPULSES, _STRETCHES = "impulse-exact-second", "stretch-exact-second"
+_SPREAD = "200 bodies, 2 loads each, from scratch, seed 0"
+_AXES = "plain base, 200 bodies, the scene's axes"
 TRAININGS = (
     ("torsion exact", _TORSIONS, "models/torsion-exact", "90 bodies, 10 loads each; released"),
     ("torsion exact", "torsion-exact-fifth", "model", "the same, then 199 others, 2 loads each"),
-    (
-        "torsion exact",
-        _TORSIONS,
-        "best-longer/model",
-        "200 bodies, 2 loads each, from scratch, seed 0",
-    ),
+    ("torsion exact", _TORSIONS, "best-longer/model", _SPREAD),
     ("torsion exact", _TORSIONS, "best-second/model", "the same, seed 1"),
     ("torsion exact", _TORSIONS, "best-third/model", "the same, seed 2"),
     ("torsion exact", "torsion-many", "best-200/model", "200 bodies, two thirds of the time"),
     ("torsion exact", "torsion-many", "best-100/model", "100 of them"),
     ("torsion exact", "torsion-many", "best-50/model", "50 of them"),
-    (
-        "torsion exact",
-        "torsion-many",
-        "axes-unrolled/model",
-        "plain base, 200 bodies, the scene's axes",
-    ),
+    ("torsion exact", "torsion-many", "axes-unrolled/model", _AXES),
     ("impulse exact", _IMPULSES, "through-further/model", "released"),
     ("impulse exact", _IMPULSES, "models/impulse-exact", "before it was trained on"),
     ("impulse exact", _IMPULSES, "plain/model", "plain base"),

@@ -47,6 +47,7 @@ def test_the_page_of_results_has_the_tables_of_the_records():
     assert tables.steps_table() in page
     assert tables.baselines_table() in page
     assert tables.together_table() in page
+    assert tables.trainings_table() in page
     made = {"other-scenes": tables.others_table(), "other-bodies": tables.bodies_table()}
     for folder, found in made.items():
         records = list((ROOT / "validation" / "results" / folder).glob("*.json"))

@@ -14,7 +14,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
 from crosses import CROSSES
 from diagnosis import ENDS, PARTING, minimum, parting
-from PIL import Image
 from scenarios import SCENARIOS, Scenario
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -249,6 +248,8 @@ def draw(scenario: Scenario, found: Run, path: Path) -> None:
 
 def with_palette(path: Path) -> None:
     """Store a picture with 256 colours, which takes a quarter of the room: the report has fifty."""
+    from PIL import Image
+
     with Image.open(path) as picture:
         few = picture.convert("RGB").quantize(
             256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -118,16 +119,11 @@ class BatchStaging:
         return torch.cat([nodal, modes], dim=1)
 
     def _scheme(self, state: BatchState) -> Scheme:
-        return self._integrate.scheme_of(self._h, self._started(state))
+        started = self._integrate.started(state.memory, self._h, partial(self._is_a_step, state))
+        return self._integrate.scheme_of(self._h, started)
 
-    def _started(self, state: BatchState) -> bool:
-        """Whether the states have the memory for a step of this length."""
-        needed = self._integrate.remembered(self._h)
-        if not needed <= state.memory.keys():
-            return False
-        if "previous_times" not in needed:
-            return True
-        before = state.memory["previous_times"]
+    def _is_a_step(self, state: BatchState, before: Tensor) -> bool:
+        """Whether the times before (B, N, 3) are a step of this length earlier, in all scenes."""
         lengths = [t - e for t, e in zip(state.times, before[:, 0, 0].tolist(), strict=True)]
         rounding = 2.0 * torch.finfo(before.dtype).eps
         started = [

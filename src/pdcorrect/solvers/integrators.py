@@ -6,7 +6,7 @@ also knows how its solution gives the next state.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -74,28 +74,32 @@ class Integrator:
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        return _scheme(self.scheme_of, h, self._started(state, h))
+        return _scheme(self.scheme_of, h, self._begun(state, h))
 
     def held(self, state: State, h: float) -> Integrator:
         """The same integrator with the scheme of that step, whatever the length of its own step.
 
         As if the steps before ``state`` had the same length.
         """
-        started = self._started(state, h)
+        started = self._begun(state, h)
         return Integrator(lambda length, _: self.scheme_of(length, started))
 
-    def remembered(self, h: float) -> frozenset[str]:
-        """Names in the memory of a state after a step of h seconds, which the next one needs."""
-        return frozenset(_scheme(self.scheme_of, h, False).memory)
+    def started(
+        self, memory: Mapping[str, Any], h: float, is_a_step: Callable[[Any], bool]
+    ) -> bool:
+        """Whether a state's memory has what a step of h seconds needs; other entries do not count.
 
-    def _started(self, state: State, h: float) -> bool:
-        """Whether a state has the memory for a step of h seconds; other entries do not count."""
-        needed = self.remembered(h)
-        if not needed <= state.memory.keys():
+        ``is_a_step`` says of the times before, where they are needed, whether they are h earlier.
+        """
+        needed = _scheme(self.scheme_of, h, False).memory.keys()
+        if not needed <= memory.keys():
             return False
-        if "previous_times" not in needed:
-            return True
-        return equal_steps(state.time - state.memory["previous_times"][0, 0], h)
+        return "previous_times" not in needed or is_a_step(memory["previous_times"])
+
+    def _begun(self, state: State, h: float) -> bool:
+        return self.started(
+            state.memory, h, lambda before: equal_steps(state.time - before[0, 0], h)
+        )
 
     def known(
         self, problem: Problem, state: State, h: float, forces: Array | None
