@@ -6,7 +6,8 @@ The first has models on unseen meshes of their evaluation splits, the second sce
 of the training, with the default gate of then and without one, the third bodies of other sizes and
 families, the fourth, for the models of the first, errors of single steps beside those of rollouts,
 the fifth what needs no network, the sixth the model of all motions beside those of one, the
-seventh other trainings in the exact setting: seeds, numbers of bodies, the plain base.
+seventh other trainings in the exact setting: seeds, numbers of bodies, the plain base, the eighth
+further splits as a whole, with today's default gate and without one.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def main() -> None:
     """Print them."""
     every = (
         table, others_table, bodies_table, steps_table, baselines_table, together_table,
-        trainings_table,
+        trainings_table, splits_table,
     )  # fmt: skip
     print("\n\n".join(make() for make in every))
 
@@ -154,6 +155,36 @@ def trainings_table() -> str:
             f"{nearer}",
         ]))  # fmt: skip
     return "\n".join(lines)
+
+
+def splits_table() -> str:
+    """The eighth table in Markdown."""
+    head = [_line(OTHER_HEADINGS), _line(["---", "---", *["---:"] * (len(OTHER_HEADINGS) - 2)])]
+    names = [
+        (row, split) for row in ROWS for split in OTHERS
+        if (RESULTS / _split_record(row, split)).is_dir()
+    ]  # fmt: skip
+    return "\n".join([*head, *(_line(_split_cells(*name)) for name in names)])
+
+
+def _split_record(row: Row, split: str) -> str:
+    return f"other-splits/{row.model}-{split}"
+
+
+def _split_cells(row: Row, split: str) -> list[str]:
+    record = _split_record(row, split)
+    runs = _summary(record)["runs"]
+    run = next(name for name, found in runs.items() if "gate_rate" in found["measures"])
+    found, ratios = runs[run], []
+    for gate in ("", "-no-gate"):
+        each = _over(Row(row.model, f"{record}{gate}", run, row.thesis), found["base"], "rms_error")
+        ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
+    omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))
+    return [
+        f"`{row.model}`", split.replace("-", " "), f"{omega['count']}",
+        f"{found['measures']['gate_rate']['mean']:.0f}", _signed(f"{base['mean']:.1f}"),
+        _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}"), *ratios,
+    ]  # fmt: skip
 
 
 def _baseline_cell(record: dict[str, Any], run: str) -> str:

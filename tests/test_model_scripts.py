@@ -48,6 +48,8 @@ def test_the_page_of_results_has_the_tables_of_the_records():
     assert tables.baselines_table() in page
     assert tables.together_table() in page
     assert tables.trainings_table() in page
+    assert tables.splits_table() in page
+    assert tables.splits_table().count("\n") > 2
     made = {"other-scenes": tables.others_table(), "other-bodies": tables.bodies_table()}
     for folder, found in made.items():
         records = list((ROOT / "validation" / "results" / folder).glob("*.json"))
