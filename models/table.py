@@ -62,7 +62,6 @@ def table() -> str:
 
 def others_table() -> str:
     """The second table in Markdown."""
-    head = [_line(OTHER_HEADINGS), _line(["---", "---", *["---:"] * (len(OTHER_HEADINGS) - 2)])]
     lines = []
     for dataset in ("impulse-exact", "stretch-exact", "torsion-exact"):
         plans = make_plan(DatasetConfig.load(ROOT / "datasets" / dataset / "config.toml"))
@@ -72,7 +71,11 @@ def others_table() -> str:
                 frames = next(plan.frames for plan in plans if plan.split == split)
                 record = json.loads(path.read_text(encoding="utf-8"))
                 lines.append(_line(_other_cells(record, dataset, split, frames)))
-    return "\n".join([*head, *lines])
+    return "\n".join([*_other_head(), *lines])
+
+
+def _other_head() -> list[str]:
+    return [_line(OTHER_HEADINGS), _line(["---", "---", *["---:"] * (len(OTHER_HEADINGS) - 2)])]
 
 
 def bodies_table() -> str:
@@ -159,29 +162,28 @@ def trainings_table() -> str:
 
 def splits_table() -> str:
     """The eighth table in Markdown."""
-    head = [_line(OTHER_HEADINGS), _line(["---", "---", *["---:"] * (len(OTHER_HEADINGS) - 2)])]
     names = [
-        (row, split) for row in ROWS for split in OTHERS
-        if (RESULTS / _split_record(row, split)).is_dir()
+        (row.model, split) for row in ROWS for split in OTHERS
+        if (RESULTS / _split_record(row.model, split)).is_dir()
     ]  # fmt: skip
-    return "\n".join([*head, *(_line(_split_cells(*name)) for name in names)])
+    return "\n".join([*_other_head(), *(_line(_split_cells(*name)) for name in names)])
 
 
-def _split_record(row: Row, split: str) -> str:
-    return f"other-splits/{row.model}-{split}"
+def _split_record(model: str, split: str) -> str:
+    return f"other-splits/{model}-{split}"
 
 
-def _split_cells(row: Row, split: str) -> list[str]:
-    record = _split_record(row, split)
+def _split_cells(model: str, split: str) -> list[str]:
+    record = _split_record(model, split)
     runs = _summary(record)["runs"]
     run = next(name for name, found in runs.items() if "gate_rate" in found["measures"])
     found, ratios = runs[run], []
     for gate in ("", "-no-gate"):
-        each = _over(Row(row.model, f"{record}{gate}", run, row.thesis), found["base"], "rms_error")
+        each = _over(Row(model, f"{record}{gate}", run, 0.0), found["base"], "rms_error")
         ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
     omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))
     return [
-        f"`{row.model}`", split.replace("-", " "), f"{omega['count']}",
+        f"`{model}`", split.replace("-", " "), f"{omega['count']}",
         f"{found['measures']['gate_rate']['mean']:.0f}", _signed(f"{base['mean']:.1f}"),
         _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}"), *ratios,
     ]  # fmt: skip
