@@ -121,7 +121,7 @@ def together_table() -> str:
         omega, other = (
             runs[one.run]["measures"]["omega"] for runs, one in ((found, row), (alone, own))
         )
-        ratios = _over(row, found["model"]["base"], "rms_error").values()
+        ratios = _over(row.record, row.run, found["model"]["base"], "rms_error").values()
         stress = (
             100.0 * runs[run]["measures"]["stress_error"]["mean"]
             for runs, run in ((found, "model"), (alone, own.run), (found, "intermediate"))
@@ -143,11 +143,10 @@ def trainings_table() -> str:
     """The seventh table in Markdown."""
     lines = [_line(TRAINING_HEADINGS), _line(["---"] * 3 + ["---:"] * 7)]
     for split, record, run, what in TRAININGS:
-        row = Row(run, record, run, 0.0)
-        found = _summary(row.record)["runs"][run]
+        found = _summary(record)["runs"][run]
         omega, base = found["measures"]["omega"], found["base"]
         harmed, nearer = (
-            sum(x > bound for x in _over(row, other, "rms_error").values())
+            sum(x > bound for x in _over(record, run, other, "rms_error").values())
             for other, bound in ((base, HARM), ("intermediate", 1.0))
         )
         lines.append(_line([
@@ -179,7 +178,7 @@ def _split_cells(model: str, split: str) -> list[str]:
     run = next(name for name, found in runs.items() if "gate_rate" in found["measures"])
     found, ratios = runs[run], []
     for gate in ("", "-no-gate"):
-        each = _over(Row(model, f"{record}{gate}", run, 0.0), found["base"], "rms_error")
+        each = _over(f"{record}{gate}", run, found["base"], "rms_error")
         ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
     omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))
     return [
@@ -199,7 +198,9 @@ def _baseline_cell(record: dict[str, Any], run: str) -> str:
 def _step_cells(row: Row) -> list[str]:
     summary = _summary(row.record)
     base = summary["runs"][row.run]["base"]
-    single, rolled = (_over(row, base, name) for name in ("step_rms_error", "rms_error"))
+    single, rolled = (
+        _over(row.record, row.run, base, name) for name in ("step_rms_error", "rms_error")
+    )
     harmed = [key for key, ratio in rolled.items() if ratio > HARM]
     spread = (
         f"{statistics.median(found.values()):.2f}, {max(found.values()):.2f}"
@@ -211,15 +212,15 @@ def _step_cells(row: Row) -> list[str]:
     ]  # fmt: skip
 
 
-def _over(row: Row, base: str, name: str) -> dict[tuple[str, str], float]:
+def _over(record: str, run: str, base: str, name: str) -> dict[tuple[str, str], float]:
     """A measure of the corrected run over that of its base, by mesh and simulation."""
-    found: dict[str, dict[tuple[str, str], float]] = {row.run: {}, base: {}}
-    path = RESULTS / row.record / "trajectories.csv"
+    found: dict[str, dict[tuple[str, str], float]] = {run: {}, base: {}}
+    path = RESULTS / record / "trajectories.csv"
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             if line["run"] in found:
                 found[line["run"]][line["mesh"], line["simulation"]] = float(line[name])
-    return {key: x / found[base][key] for key, x in found[row.run].items()}
+    return {key: x / found[base][key] for key, x in found[run].items()}
 
 
 def _body_cells(record: dict[str, Any], model: str, bodies: str, frames: int) -> list[str]:

@@ -114,6 +114,14 @@ def test_the_models_of_error_against_time_are_inputs_of_the_case():
     assert {path.split("/")[1] for path in case.inputs() if path.startswith("models/")} == models
 
 
+def test_the_models_and_records_of_easy_and_hard_simulations_are_inputs_of_the_case():
+    case = CASES["easy_to_hard"]
+    subjects = case._module().SUBJECTS.values()
+    inputs = {path.rsplit("/", 1)[0] for path in case.inputs() if not path.startswith("datasets/")}
+    models = {f"models/{name}" for subject in subjects for name in subject.models}
+    assert inputs == models | {f"validation/results/{subject.record}" for subject in subjects}
+
+
 def test_the_report_and_the_documentation_recommend_the_same():
     folder = find_cases()[0].folder.parents[1]
 
