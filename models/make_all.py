@@ -5,7 +5,8 @@ python models/make_all.py WORK [RECIPE | MODEL ...] [--device cuda] [--generator
 
 A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  In place of a data set
 there may be ``all-as-published``, for the three of that setting together.  MODEL is the name of a
-released model, which is evaluated only, beside what is trained for its data sets.  WORK gets
+released model, which is evaluated only, beside what is trained for its data sets: on the set that
+it is named after, or else on all that it has learned.  WORK gets
 
     data/DATASET                 splits as needed, by ``pdcorrect dataset generate``
     trainings/DATASET/NAME       by ``pdcorrect train``
@@ -177,7 +178,7 @@ def plan(
     until = None if options.seconds is None else time.time() + options.seconds
     starts = {recipe: TrainingConfig.load(recipe).start_from for recipe in recipes}
     _refuse_circles({_output(work, r) / MODEL: work / (starts[r] or "") for r in recipes})
-    known = {model: [name for name, _ in load_model(HERE / model).data_sets] for model in released}
+    known = {model: _judged_on(model) for model in released}
     learnt = list(dict.fromkeys(name for recipe in recipes for name in _data_of(recipe)))
     names = list(dict.fromkeys([*learnt, *(name for each in known.values() for name in each)]))
     before: dict[str, list[Job]] = {name: [] for name in names}
@@ -237,6 +238,12 @@ def _generation(
         after,
         "generate",
     )  # fmt: skip
+
+
+def _judged_on(released: str) -> list[str]:
+    """The data set that a released model is named after, or else all that it has learned."""
+    names = [name for name, _ in load_model(HERE / released).data_sets]
+    return [released] if released in names else names
 
 
 def _data_of(recipe: Path) -> list[str]:

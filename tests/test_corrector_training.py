@@ -24,7 +24,9 @@ from pdcorrect.corrector.features import View  # noqa: E402
 from pdcorrect.corrector.gate import Gate  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
+from pdcorrect.data.schema import write_shard  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
     ConvergenceError,
     FileFormatError,
@@ -1234,8 +1236,24 @@ def test_a_training_starts_from_a_models_weights_and_normalisation(earlier, tmp_
             assert torch.equal(found, known), name
     training.run()
     assert not torch.equal(weights(training.corrector), weights(before))
-    found = load_model(tmp_path / "out" / "model").record
-    assert found.training["config"]["start_from"] == str(earlier)
+    found = load_model(tmp_path / "out" / "model")
+    assert found.record.training["config"]["start_from"] == str(earlier)
+    assert found.data_sets == load_model(earlier).data_sets  # of one configuration
+
+
+def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, tmp_path):
+    data = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
+    for path in data.rglob("*.h5"):
+        shard = read_shard(path)
+        other = {**shard.attributes, "dataset": "other", "config_hash": "0" * 64}
+        path.unlink()
+        write_shard(path, replace(shard, attributes=other), "float32")
+    settings = samples.config(samples.one_step(), start_from=str(earlier))
+    Training(settings, data, tmp_path / "out").run()
+    (before,) = load_model(earlier).data_sets
+    found = load_model(tmp_path / "out" / "model")
+    assert found.data_sets == [before, ("other", "0" * 64)]
+    assert found.record.dataset == "tiny+other"
 
 
 def test_the_ranges_of_a_start_grow_by_the_new_data(short, earlier, tmp_path):

@@ -16,6 +16,7 @@ pytest.importorskip("torch_geometric")
 from torch_geometric.data import Batch  # noqa: E402
 from torch_geometric.loader import DataLoader  # noqa: E402
 
+import pdcorrect.data.statistics as statistics_module  # noqa: E402
 import reader_samples as samples  # noqa: E402
 from pdcorrect.data.graph import mesh_edges, node_means  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E402
@@ -497,6 +498,22 @@ def test_statistics_do_not_depend_on_the_order_of_the_files(folder, tmp_path):
     one, other = compute_statistics(folder), compute_statistics(tmp_path)
     for name in one.quantities:
         close(one[name], other[name])
+
+
+def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 2)
+    samples.write(tmp_path, [samples.shard(number) for number in range(7)])
+    one, several = (compute_statistics(tmp_path, processes=count) for count in (1, 3))
+    assert several.quantities.keys() == one.quantities.keys()
+    for name in one.quantities:
+        close(several[name], one[name], 0)
+    path = tmp_path / "training" / "mesh-0005.h5"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 :] = bytes(len(content) - len(content) // 2)  # of the same size
+    path.write_bytes(content)
+    for count in (1, 3):
+        with pytest.raises(FileFormatError, match=r"mesh-0005\.h5: damaged"):
+            compute_statistics(tmp_path, processes=count)
 
 
 def test_saved_statistics_are_loaded_as_they_were(folder):

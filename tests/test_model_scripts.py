@@ -21,6 +21,7 @@ import pdcorrect.errors  # noqa: E402
 from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
+from pdcorrect.corrector.model_io import save_model  # noqa: E402
 from pdcorrect.corrector.shapes import SHAPE_MEASURES  # noqa: E402
 from pdcorrect.data.config import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
@@ -323,3 +324,43 @@ def test_bodies_that_a_gate_refuses_are_counted_by_split(tmp_path):
     assert set(near) > {"evaluation", "stiffer", "half-step", "long"}
     assert large["evaluation"]["refused"] == large["evaluation"]["meshes"] == 10
     assert large["evaluation"]["measure"] in SHAPE_MEASURES
+
+
+def rolled_out(output, *models, meshes):
+    """What `seen_and_unseen` records of models on tiny's data."""
+    command = [sys.executable, ROOT / "models" / "seen_and_unseen.py", ROOT / "datasets" / "tiny"]
+    command += [*models, "--meshes", str(meshes), "-o", output]
+    run = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert run.returncode == 0, run.stderr
+    return json.loads(output.read_text())["rollouts"]
+
+
+def test_models_and_means_of_their_weights_roll_out_seen_and_unseen_bodies(tmp_path):
+    rows = rolled_out(tmp_path / "record.json", "tiny", "models/tiny+models/tiny", meshes=2)
+    assert [(r["model"], r["split"], r["simulations"]) for r in rows] == [
+        (name, *of_split) for name in ("tiny", "models/tiny+models/tiny")
+        for of_split in (("training", 3), ("validation", 4))
+    ]  # fmt: skip
+    seen, unseen, *averaged = rows
+    meshes = {name.split("/")[1] for name in seen["names"]}
+    assert meshes == {"mesh-0000", "mesh-0003"}  # of six
+    assert seen["omega_mean"] > 99.0 > unseen["omega_mean"] > 80.0
+    for row, same in zip((seen, unseen), averaged, strict=True):
+        assert row["omega_mean"] == np.mean(row["omegas"])
+        np.testing.assert_allclose(same["omegas"], row["omegas"], atol=0.01)
+
+
+def test_a_mean_of_weights_lies_between_them_and_wants_models_alike(tmp_path):
+    averaged, model = script("seen_and_unseen").averaged, pc.load_model("tiny")
+    state, other = model.corrector.state_dict(), str(tmp_path / "other")
+    name = next(key for key in state if key.startswith("network.") and state[key].dim() == 2)
+    before = state[name].clone()
+    state[name] += 1.0
+    save_model(model.corrector, other, record=model.record)
+    mean = averaged(["tiny", other], "cpu").corrector.state_dict()
+    torch.testing.assert_close(mean[name], before + 0.5)
+    state["normaliser.output_scale"] *= 2.0
+    save_model(model.corrector, other, record=model.record)
+    for unlike in (other, "torsion-exact"):
+        with pytest.raises(pdcorrect.errors.InputError, match="another architecture, base or nor"):
+            averaged(["tiny", unlike], "cpu")

@@ -265,9 +265,10 @@ def test_ranks_share_the_groups_of_all_data_sets(folders):
 
 
 def test_models_of_before_know_their_one_data_set():
-    record = json.loads((MODELS / "torsion-exact" / "model.json").read_text())["record"]
+    name = "torsion-exact-compact"
+    record = json.loads((MODELS / name / "model.json").read_text())["record"]
     expected = ("torsion-exact", record["training"]["config_hash"])
-    assert load_model("torsion-exact").data_sets == [expected]
+    assert load_model(name).data_sets == [expected]
 
 
 def test_published_sets_share_a_few_meshes():
@@ -288,3 +289,20 @@ def test_published_sets_share_a_few_meshes():
         (("impulse", "training"), ("stretch", "evaluation")): 1,
         (("stretch", "training"), ("impulse", "validation")): 1,
     }
+
+
+def test_a_recipe_names_the_bodies_that_another_set_keeps_for_evaluation():
+    folder = MODELS.parent / "datasets"
+    kept = {
+        plan.design.key()
+        for plan in make_plan(DatasetConfig.load(folder / "torsion-exact" / "config.toml"))
+        if plan.split not in ("training", "validation")
+    }
+    found = {"training": [], "validation": []}
+    for plan in make_plan(DatasetConfig.load(folder / "torsion-more" / "config.toml")):
+        if plan.split in found and plan.design.key() in kept:
+            found[plan.split].append(plan.number)
+    told = (MODELS / "recipes" / "torsion-more" / "best-further.toml").read_text(encoding="utf-8")
+    comment = " ".join(line.strip("# ") for line in told.splitlines() if line.startswith("#"))
+    for split, numbers in found.items():
+        assert f"{split} {', '.join(map(str, numbers))}" in comment

@@ -46,9 +46,7 @@ class Subject:
 SUBJECTS = {
     "impulse": Subject(("impulse-exact",), "impulse-exact-third", "model"),
     "stretch": Subject(("stretch-exact",), "stretch-exact-second", "through-further/model"),
-    "torsion": Subject(
-        ("torsion-exact", "torsion-exact-compact"), "torsion-exact-fourth", "models/torsion-exact"
-    ),
+    "torsion": Subject(("torsion-exact", "torsion-exact-compact"), "torsion-exact-sixth", "model"),
 }
 
 

@@ -144,7 +144,7 @@ def generate(
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
     if all(hashes[plan.name] for plan in plans if plan.split == TRAINING):
-        _write_statistics(folder)
+        _write_statistics(folder, workers.count)
     if None not in hashes.values():
         _write_manifest(config, folder, hashes)
     return _generated(plans, chosen, hashes)
@@ -272,9 +272,9 @@ def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, st
     write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")
 
 
-def _write_statistics(folder: Path) -> None:
+def _write_statistics(folder: Path, processes: int) -> None:
     """Those of the training split, unless they are there."""
     with contextlib.suppress(InputError):
         load_statistics(folder)
         return
-    compute_statistics(folder).save(folder)
+    compute_statistics(folder, processes=processes).save(folder)

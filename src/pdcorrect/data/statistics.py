@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+import signal
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import partial, reduce
+from itertools import chain
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +31,8 @@ from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.replacement import write_text
 
 VERSION = 1
+_FILES_A_PROCESS = 16
+"""At least; a process takes some seconds to start, a file some hundredths of a second."""
 
 Array = NDArray[np.float64]
 
@@ -140,7 +146,9 @@ class Statistics:
         return path
 
 
-def compute_statistics(folder: str | Path, *, skip_damaged: bool = False) -> Statistics:
+def compute_statistics(
+    folder: str | Path, *, skip_damaged: bool = False, processes: int = 1
+) -> Statistics:
     """Statistics of a data set's training split.
 
     Corrections are those of every run that has predictions in all its simulations.
@@ -150,6 +158,8 @@ def compute_statistics(folder: str | Path, *, skip_damaged: bool = False) -> Sta
     folder : path
     skip_damaged : bool
         Leave out files that are damaged; all files are read twice then.
+    processes : int
+        At most so many share the files where there are many; the result has the same bits.
 
     Raises
     ------
@@ -163,9 +173,22 @@ def compute_statistics(folder: str | Path, *, skip_damaged: bool = False) -> Sta
     headers = [read_header(path) for path in paths]
     config_hash, shards = _identity(headers)
     bases = frozenset.intersection(*(names for h in headers for _, names in h.runs))
-    parts = (part for h in headers for part in _parts(h, sorted(bases)))
-    merged: dict[str, Moments] = reduce(_merged, parts)
+    work = partial(_parts, bases=sorted(bases))
+    count = min(processes, len(paths) // _FILES_A_PROCESS)
+    if count < 2:
+        return Statistics(_all_merged(map(work, paths)), config_hash, shards, damaged)
+    with ProcessPoolExecutor(count, get_context("spawn"), _leave_interrupts) as pool:
+        merged = _all_merged(pool.map(work, paths, chunksize=4))
     return Statistics(merged, config_hash, shards, damaged)
+
+
+def _leave_interrupts() -> None:
+    """To the process that waits for this one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _all_merged(files: Iterable[list[dict[str, Moments]]]) -> dict[str, Moments]:
+    return reduce(_merged, chain.from_iterable(files))
 
 
 def load_statistics(folder: str | Path) -> Statistics:
@@ -217,13 +240,12 @@ def _identity(headers: list[ShardHeader]) -> tuple[str, dict[str, str]]:
     return configs.pop(), {header.path.name: header.content_hash for header in headers}
 
 
-def _parts(header: ShardHeader, bases: list[str]) -> Iterator[dict[str, Moments]]:
-    """Moments of the mesh, then of each of its simulations."""
-    mesh, motions = read_arrays(header.path, bases)
+def _parts(path: Path, bases: list[str]) -> list[dict[str, Moments]]:
+    """Moments of a file's mesh, then of each of its simulations."""
+    mesh, motions = read_arrays(path, bases)
     steps = sum(len(motion.forces) for motion in motions)
-    yield {name: moments.repeated(steps) for name, moments in _of_mesh(mesh).items()}
-    for motion in motions:
-        yield _of_motion(mesh, motion)
+    whole = {name: moments.repeated(steps) for name, moments in _of_mesh(mesh).items()}
+    return [whole, *(_of_motion(mesh, motion) for motion in motions)]
 
 
 def _of_mesh(mesh: MeshArrays) -> dict[str, Moments]:

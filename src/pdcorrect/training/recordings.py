@@ -84,9 +84,9 @@ class Recording:
 
 
 def load_recordings(
-    folder: Folders, split: str, base: Base, *, scenes: bool = True
+    folder: Folders, split: str, base: Base, *, scenes: bool = True, meshes: int | None = None
 ) -> list[Recording]:
-    """All simulations of a split, mesh by mesh.
+    """The simulations of a split, mesh by mesh.
 
     Parameters
     ----------
@@ -96,6 +96,8 @@ def load_recordings(
     base : {"plain", "best", "total-mass"}
     scenes : bool
         Whether the base model is to step again, for which it takes the scenes.
+    meshes : int, optional
+        At most so many, spread evenly over the split; all by default.
 
     Raises
     ------
@@ -105,8 +107,9 @@ def load_recordings(
     FileFormatError
         If a file is damaged.
     """
-    found = []
-    for path in _paths(folder, split):
+    found, paths = [], _paths(folder, split)
+    count = len(paths) if meshes is None else min(meshes, len(paths))
+    for path in (paths[k * len(paths) // count] for k in range(count)):
         _check_complete(read_header(path), base, scenes)
         shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
         for number, simulation in enumerate(shard.simulations):

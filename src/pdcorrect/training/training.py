@@ -113,6 +113,7 @@ class Training:
             json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
         )
         start, self._teachers = self._start(), load_teachers(config, self.device)
+        self._learned = [] if start is None else start.data_sets
         if start is not None:
             self._identity["start"] = weights_digest(str(config.start_from))
         if self._teachers:
@@ -312,7 +313,8 @@ class Training:
         self.progress.metrics = metrics
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
-            known = dict.fromkeys((r.dataset, r.config_hash) for r in self._recordings)
+            own = ((r.dataset, r.config_hash) for r in self._recordings)
+            known = dict.fromkeys((*self._learned, *own))
             record = ModelRecord(
                 dataset=JOINT.join(dict.fromkeys(name for name, _ in known)),
                 dataset_hash=self._identity["data"],
