@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from run_record import write_record
@@ -37,17 +38,18 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
-    known: dict[tuple[str, str], Validation] = {}
+    known: dict[tuple[str, str, str], Validation] = {}
     rows = []
     for name in options.models:
         model = averaged(name.split("+"), options.device)
         for split in options.splits:
-            if (split, model.base) not in known:
-                known[split, model.base] = Validation(
+            key = split, model.base, model.velocity
+            if key not in known:
+                known[key] = Validation(
                     load_recordings(options.data, split, model.base, meshes=options.meshes),
-                    model.base, device=options.device,
+                    model.base, velocity=model.velocity, device=options.device,
                 )  # fmt: skip
-            rollouts = known[split, model.base]
+            rollouts = known[key]
             scores = rollouts(model.corrector)
             rows.append(
                 {
@@ -70,23 +72,27 @@ def averaged(names: Sequence[str], device: str) -> LoadedModel:
     Raises
     ------
     InputError
-        If their architecture, base or normalisation differ.
+        If their architecture, base, velocity or normalisation differ.
     """
     first, *others = [pc.load_model(name, device) for name in names]
     states = [first.corrector.network.state_dict()]
     scales = _normalisation(first)
     for name, model in zip(names[1:], others, strict=True):
-        alike = model.corrector.config == first.corrector.config and model.base == first.base
+        alike = _kind(model) == _kind(first)
         theirs = _normalisation(model)
         if not alike or any(not torch.equal(scales[key], theirs[key]) for key in scales):
             raise InputError(
-                f"{name}: another architecture, base or normalisation than {names[0]}: expected "
-                "models of which one went on from the other."
+                f"{name}: another architecture, base, velocity or normalisation than {names[0]}: "
+                "expected models of which one went on from the other."
             )
         states.append(model.corrector.network.state_dict())
     mean = {key: torch.stack([s[key] for s in states]).mean(dim=0) for key in states[0]}
     first.corrector.network.load_state_dict(mean)
     return first
+
+
+def _kind(model: LoadedModel) -> tuple[Any, ...]:
+    return model.corrector.config, model.base, model.velocity
 
 
 def _normalisation(model: LoadedModel) -> dict[str, torch.Tensor]:

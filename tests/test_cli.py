@@ -433,7 +433,7 @@ def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program
     record = json.loads((folder / "report.json").read_text())
     about = record["models"][coarse[3]]
     assert (about["base"], about["dataset"]) == ("best", "torsion-exact")
-    assert any("trained on scenes of the data set 'torsion-exact'" in x for x in record["notes"])
+    assert any("trained on scenes of 'torsion-exact'" in x for x in record["notes"])
 
 
 def test_a_corrector_of_the_plain_mesh_is_held_against_the_plain_fine_run():

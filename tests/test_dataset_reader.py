@@ -2,9 +2,13 @@
 
 import itertools
 import json
+import os
 import pickle
 import shutil
+import signal
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from functools import partial
 
 import h5py
 import numpy as np
@@ -501,9 +505,17 @@ def test_statistics_do_not_depend_on_the_order_of_the_files(folder, tmp_path):
 
 
 def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 2)
-    samples.write(tmp_path, [samples.shard(number) for number in range(7)])
-    one, several = (compute_statistics(tmp_path, processes=count) for count in (1, 3))
+    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 4)
+    by_several, counts = statistics_module._moments_by_several, []
+
+    def noted(work, paths, count):
+        counts.append(count)
+        return by_several(work, paths, count)
+
+    monkeypatch.setattr(statistics_module, "_moments_by_several", noted)
+    samples.write(tmp_path, [samples.shard(number) for number in range(13)])
+    one, several = (compute_statistics(tmp_path, processes=count) for count in (1, 8))
+    assert counts == [3]
     assert several.quantities.keys() == one.quantities.keys()
     for name in one.quantities:
         close(several[name], one[name], 0)
@@ -514,6 +526,25 @@ def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatc
     for count in (1, 3):
         with pytest.raises(FileFormatError, match=r"mesh-0005\.h5: damaged"):
             compute_statistics(tmp_path, processes=count)
+
+
+def parts_of_no_other(path, process):
+    """Parts of a file; any other process than this one is killed."""
+    if os.getpid() != process:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return statistics_module._parts(path, ["plain"])
+
+
+def test_statistics_are_computed_here_if_a_process_is_killed(tmp_path, monkeypatch):
+    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 4)
+    samples.write(tmp_path, [samples.shard(number) for number in range(8)])
+    paths = sorted((tmp_path / "training").iterdir())
+    work = partial(parts_of_no_other, process=os.getpid())
+    with pytest.raises(BrokenProcessPool):
+        statistics_module._moments_by_several(work, paths, 2)
+    one, other = (statistics_module._moments(work, paths, count) for count in (1, 2))
+    for name in one:
+        close(other[name], one[name], 0)
 
 
 def test_saved_statistics_are_loaded_as_they_were(folder):

@@ -264,6 +264,17 @@ def test_ranks_share_the_groups_of_all_data_sets(folders):
     assert len(set(names)) == 5
 
 
+def test_so_many_meshes_are_spread_over_a_split(folders):
+    every = load_recordings(folders, "training", "plain")
+    paths = list(dict.fromkeys(r.path for r in every))
+    some = load_recordings(folders, "training", "plain", meshes=2)
+    assert list(dict.fromkeys(r.path for r in some)) == [paths[0], paths[len(paths) // 2]]
+    names = [r.name for r in load_recordings(folders, "training", "plain", meshes=99)]
+    assert names == [r.name for r in every]
+    with pytest.raises(InputError, match="meshes = 0: expected 1 or more"):
+        load_recordings(folders, "training", "plain", meshes=0)
+
+
 def test_models_of_before_know_their_one_data_set():
     name = "torsion-exact-compact"
     record = json.loads((MODELS / name / "model.json").read_text())["record"]
@@ -303,6 +314,25 @@ def test_a_recipe_names_the_bodies_that_another_set_keeps_for_evaluation():
         if plan.split in found and plan.design.key() in kept:
             found[plan.split].append(plan.number)
     told = (MODELS / "recipes" / "torsion-more" / "best-further.toml").read_text(encoding="utf-8")
-    comment = " ".join(line.strip("# ") for line in told.splitlines() if line.startswith("#"))
+    comments = [line.strip("# ") for line in told.splitlines() if line.startswith("#")]
     for split, numbers in found.items():
-        assert f"{split} {', '.join(map(str, numbers))}" in comment
+        assert f"{split} {', '.join(map(str, numbers))}" in comments
+        assert numbers
+
+
+def test_a_released_model_names_the_data_sets_of_all_its_trainings():
+    folder = MODELS.parent / "datasets"
+    names = ("torsion-exact", "torsion-many", "torsion-more")
+    expected = [(n, DatasetConfig.load(folder / n / "config.toml").hash()) for n in names]
+    assert load_model("torsion-exact").data_sets == expected
+
+
+def test_the_one_body_of_torsion_many_that_is_kept_for_evaluation_is_named():
+    folder, found = MODELS.parent / "datasets", {}
+    for name, split in (("torsion-exact", "evaluation"), ("torsion-many", "training")):
+        plans = make_plan(DatasetConfig.load(folder / name / "config.toml"))
+        found[split] = {p.design.key(): p.number for p in plans if p.split == split}
+    shared = found["training"].keys() & found["evaluation"].keys()
+    (number,) = (found["training"][key] for key in shared)
+    told = (MODELS / "recipes" / "README.md").read_text(encoding="utf-8")
+    assert f"`mesh-{number:04d}` of `torsion-many`" in told

@@ -1,4 +1,4 @@
-"""SIGTERM as an exception, so that files are closed before the process ends."""
+"""SIGTERM as an exception, so that files are closed before the process ends; and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -35,6 +35,19 @@ def terminable() -> Iterator[None]:
     finally:
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, handler)
+
+
+@contextlib.contextmanager
+def ctrl_c_ignored() -> Iterator[None]:
+    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _silent(lost: Any) -> None:

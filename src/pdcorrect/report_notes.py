@@ -223,8 +223,8 @@ def _of_the_solvers(comparison: Comparison) -> list[str]:
 def _of_the_models(comparison: Comparison) -> list[str]:
     gated = {case.label: case.gate for case in comparison.cases}
     found = [
-        f"{label}: trained on scenes of the data set {about['dataset']!r} and with references of "
-        "its setting; on others it may be of no use, and "
+        f"{label}: trained on scenes of {about['dataset']!r} and with references of their "
+        "setting; on others it may be of no use, and "
         + ("its gate need not notice." if gated[label] else "it has no gate.")
         for label, about in comparison.models.items()
     ]

@@ -52,7 +52,7 @@ BACKWARD_EULER = "backward-euler"
 """What all data sets have, also those of models that do not record it."""
 
 JOINT = "+"
-"""Between the names of data sets that a model was trained on together."""
+"""Between the names of data sets that a model was trained on, together or one after another."""
 _NORMALISER = "normaliser."
 _CHECKSUM = "checksum"
 
@@ -63,8 +63,8 @@ class ModelRecord(Strict):
     Attributes
     ----------
     dataset, dataset_hash
-        Name of the data set, or names of several with a plus sign between them, and the hash of
-        their configuration or content.
+        Name of the data set, or names of several with a plus sign between them; and the hash of
+        the configuration or content of what its last training learned.
     training, metrics
         Settings of the training, and what the model achieved; any JSON with finite numbers.
     code_version, code_digest

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import signal
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial, reduce
 from itertools import chain
@@ -28,11 +29,14 @@ from pdcorrect.data.shard_arrays import (
     read_header,
 )
 from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.interruption import ctrl_c_ignored
 from pdcorrect.replacement import write_text
 
 VERSION = 1
 _FILES_A_PROCESS = 16
 """At least; a process takes some seconds to start, a file some hundredths of a second."""
+_MOST_PROCESSES = 60
+"""Windows waits for no more."""
 
 Array = NDArray[np.float64]
 
@@ -174,17 +178,30 @@ def compute_statistics(
     config_hash, shards = _identity(headers)
     bases = frozenset.intersection(*(names for h in headers for _, names in h.runs))
     work = partial(_parts, bases=sorted(bases))
-    count = min(processes, len(paths) // _FILES_A_PROCESS)
-    if count < 2:
-        return Statistics(_all_merged(map(work, paths)), config_hash, shards, damaged)
-    with ProcessPoolExecutor(count, get_context("spawn"), _leave_interrupts) as pool:
-        merged = _all_merged(pool.map(work, paths, chunksize=4))
-    return Statistics(merged, config_hash, shards, damaged)
+    return Statistics(_moments(work, paths, processes), config_hash, shards, damaged)
 
 
-def _leave_interrupts() -> None:
-    """To the process that waits for this one."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+_Work = Callable[[Path], list[dict[str, Moments]]]
+
+
+def _moments(work: _Work, paths: list[Path], processes: int) -> dict[str, Moments]:
+    """Of all files, in their order."""
+    count = min(processes, len(paths) // _FILES_A_PROCESS, _MOST_PROCESSES)
+    if count > 1:
+        # A process may be killed, for want of memory say; this one then does its work.
+        with contextlib.suppress(BrokenProcessPool):
+            return _moments_by_several(work, paths, count)
+    return _all_merged(map(work, paths))
+
+
+def _moments_by_several(work: _Work, paths: list[Path], count: int) -> dict[str, Moments]:
+    pool = ProcessPoolExecutor(count, get_context("spawn"))
+    try:
+        with ctrl_c_ignored():
+            found = pool.map(work, paths, chunksize=_FILES_A_PROCESS // 4)
+        return _all_merged(found)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _all_merged(files: Iterable[list[dict[str, Moments]]]) -> dict[str, Moments]:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import os
 import re
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -21,6 +18,7 @@ from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.produce import produce
 from pdcorrect.errors import InputError, require_extra
+from pdcorrect.interruption import ctrl_c_ignored
 
 _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
@@ -135,21 +133,8 @@ def local_cluster(count: int) -> Any:
     distributed = require_extra("distributed", "cluster")
     names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
     quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
-    with _ctrl_c_ignored():
+    with ctrl_c_ignored():
         return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
-
-
-@contextlib.contextmanager
-def _ctrl_c_ignored() -> Iterator[None]:
-    """For processes started now: this one ends them, and they need not complain of Ctrl-C."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
 
 
 def _scheduler_client(distributed: Any, address: str) -> Any:

@@ -70,7 +70,8 @@ class SavedCandidate:
                 "loads, materials and the coarse model's setting may be others than it knows, and "
                 "its training meshes may be among these."
             ]
-        if split not in (TRAINING, VALIDATION) and len(self.model.data_sets) > 1:
+        several = len({own for own, _ in self.model.data_sets}) > 1
+        if split not in (TRAINING, VALIDATION) and several:
             return [
                 f"{name} was trained on {record.dataset!r}: meshes of this split may be among the "
                 "training meshes of the other sets."

@@ -102,11 +102,13 @@ def load_recordings(
     Raises
     ------
     InputError
-        If there is no such split, or a simulation lacks a run or a scene that is needed; names
-        the file and all that it lacks.
+        If there is no such split, or ``meshes`` is less than 1, or a simulation lacks a run or a
+        scene that is needed; names the file and all that it lacks.
     FileFormatError
         If a file is damaged.
     """
+    if meshes is not None and meshes < 1:
+        raise InputError(f"meshes = {meshes}: expected 1 or more.")
     found, paths = [], _paths(folder, split)
     count = len(paths) if meshes is None else min(meshes, len(paths))
     for path in (paths[k * len(paths) // count] for k in range(count)):
