@@ -60,7 +60,7 @@ def main() -> None:
                     "omegas": scores.omegas.tolist(),
                 }
             )  # fmt: skip
-            told = {key: rows[-1][key] for key in ("model", "split", *scores.metrics())}
+            told = {part: rows[-1][part] for part in ("model", "split", *scores.metrics())}
             print(told, flush=True)
             if options.output:
                 write_record(options.output, rollouts=rows)

@@ -100,14 +100,9 @@ _IMPULSES, _STRETCHES = "impulse-exact-second", "stretch-exact-second"
 _SPREAD = "200 bodies, 2 loads each, from scratch, seed 0"
 _AXES = "plain base, 200 bodies, the scene's axes"
 TRAININGS = (
-    ("torsion exact", "torsion-exact-sixth", "model", "released: then 638, a load each"),
-    ("torsion exact", "torsion-exact-fifth", "model", "before its last two: 199, 2 loads each"),
-    (
-        "torsion exact",
-        _TORSIONS,
-        "models/torsion-exact",
-        "before its last three: 90, 10 each",
-    ),
+    ("torsion exact", "torsion-exact-sixth", "model", "released: then 638 bodies, a load each"),
+    ("torsion exact", "torsion-exact-fifth", "model", "before: then 199 bodies, 2 loads each"),
+    ("torsion exact", _TORSIONS, "models/torsion-exact", "first: 90 bodies, 10 loads each"),
     ("torsion exact", _TORSIONS, "best-longer/model", _SPREAD),
     ("torsion exact", _TORSIONS, "best-second/model", "the same, seed 1"),
     ("torsion exact", _TORSIONS, "best-third/model", "the same, seed 2"),
