@@ -1,13 +1,14 @@
 """Measure what needs no network beside a data set's reference: elements, mass, a fitted stiffness.
 
 python models/baselines.py DATA -o OUTPUT [--split evaluation] [--device cuda] [--batch 60]
-    [--workers 2] [--fit 40]
+    [--workers 2] [--fit 40] [--fit-split validation]
 
 The plain coarse mesh is stepped again with other elements, with the consistent mass, and with
 Young's modulus times one factor for the whole data set, which makes the mean Omega of the first
-``--fit`` simulations of the training split largest (of the split itself, with a note, where there
-is none).  They are measured like correctors, by `pdcorrect.evaluation.evaluate`, beside the stored
-runs; OUTPUT gets the same files as by ``pdcorrect evaluate``.  Scenes of mesh files cannot be
+``--fit`` simulations of ``--fit-split`` largest (by default of the training split, or, with a note,
+of the split itself where there is none).  They are measured like correctors, by
+`pdcorrect.evaluation.evaluate`, beside the stored runs; OUTPUT gets the same files as by
+``pdcorrect evaluate``.  Scenes of mesh files cannot be
 discretised again and are refused.
 """
 
@@ -121,9 +122,11 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=60)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--fit", type=int, default=40, help="simulations")
+    parser.add_argument("--fit-split", default=None, help="of which they are")
     options = parser.parse_args()
-    own = not (options.data / TRAINING).is_dir()
-    split = options.split if own else TRAINING
+    split = options.fit_split or TRAINING
+    if options.fit_split is None and not (options.data / TRAINING).is_dir():
+        split = options.split
     cases = read_cases(options.data, split, skip_damaged=False).cases[: options.fit]
     factor = fitted(cases, options.device, options.batch)
     changes = {
@@ -141,7 +144,7 @@ def main() -> None:
     )  # fmt: skip
     notes = [
         f"Young's modulus times {factor:.3f}, fitted to {len(cases)} simulations of {split}"
-        + (", the split itself: too good" if own and split == options.split else "")
+        + (", the split itself: too good" if split == options.split else "")
     ]
     print(markdown(found), *notes, sep="\n")
     record = {**origin(), "stiffness_factor": factor, "notes": notes}

@@ -178,6 +178,9 @@ def _split_cells(model: str, split: str) -> list[str]:
     run = next(name for name, found in runs.items() if "gate_rate" in found["measures"])
     found, ratios = runs[run], []
     for gate in ("", "-no-gate"):
+        if not (RESULTS / f"{record}{gate}").is_dir():  # not computed
+            ratios.append("")
+            continue
         each = _over(f"{record}{gate}", run, found["base"], "rms_error")
         ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
     omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))

@@ -1,5 +1,6 @@
 """One training on several data sets, whose meshes have the same numbers and are others."""
 
+import csv
 import hashlib
 import json
 import shutil
@@ -23,6 +24,7 @@ from pdcorrect.data.shard_arrays import read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
+from pdcorrect.training.config import TrainingConfig  # noqa: E402
 from pdcorrect.training.recordings import data_hash, load_recordings, make_problems  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
@@ -166,6 +168,66 @@ def test_the_hash_is_that_of_the_files_in_their_order(folders):
     assert data_hash(list(folders), splits) == by_hand(*folders)
 
 
+LEFT_OUT = ("training/mesh-0003", "validation/mesh-0000")
+
+
+@pytest.fixture
+def several(tmp_path):
+    """A data set of two training and two validation meshes."""
+    return samples.dataset(tmp_path / "several", training=(0, 3), validation=(0, 1), frames=5)
+
+
+def test_what_is_left_out_might_as_well_not_be_there(several, tmp_path, few_threads):
+    whole = settings(*STAGES, validate_every={"iterations": 4})
+    config = whole.model_copy(update={"without": LEFT_OUT})
+    Training(config, several, tmp_path / "left out").run()
+    for name in LEFT_OUT:
+        (several / f"{name}.h5").rename(tmp_path / name.replace("/", "-"))
+    Training(whole, several, tmp_path / "removed", incomplete=True).run()
+    one, other = (load_model(tmp_path / name / "model") for name in ("left out", "removed"))
+    for name, x in one.corrector.state_dict().items():
+        assert torch.equal(x, other.corrector.state_dict()[name]), name
+    assert one.record.dataset_hash == other.record.dataset_hash
+    assert _omegas(tmp_path / "left out") == _omegas(tmp_path / "removed")
+
+
+def _omegas(folder):
+    """What a training's models had on its validation split."""
+    with (folder / "history.csv").open(newline="", encoding="utf-8") as file:
+        found = [row["omega_mean"] for row in csv.DictReader(file) if row["omega_mean"]]
+    assert found
+    return found
+
+
+def test_readers_leave_out_files_by_name(several):
+    for split, name in (("training", LEFT_OUT[0]), ("validation", LEFT_OUT[1])):
+        found = TrajectoryDataset(several, split, without=LEFT_OUT)
+        recordings = load_recordings(several, split, "plain", without=LEFT_OUT)
+        (kept,) = {header.path for header in found.headers}
+        assert {recording.path for recording in recordings} == {kept}
+        assert kept != several / f"{name}.h5"
+        with pytest.raises(InputError, match=rf"{split}: all 2 files are left out"):
+            TrajectoryDataset(several, split, without=[name, f"{split}/{kept.stem}"])
+
+
+def test_files_that_cannot_be_left_out_are_refused(folders, several, tmp_path):
+    config = settings(*STAGES).model_copy(update={"without": LEFT_OUT})
+    with pytest.raises(InputError, match="expected one data set, got 2"):
+        Training(config, folders, tmp_path / "two")
+    other = config.model_copy(update={"without": ("training/mesh-0042",)})
+    with pytest.raises(InputError, match="has no training/mesh-0042"):
+        Training(other, several, tmp_path / "unknown")
+    Training(other, several, tmp_path / "permitted", incomplete=True)
+    for names, told in (
+        (["mesh-0042"], "such as 'training/mesh-0042'"),
+        (["evaluation/mesh-0042"], "such as 'training/mesh-0042'"),
+        (["training/mesh-0042.h5"], "such as 'training/mesh-0042'"),
+        (["training/mesh-0042"] * 2, "each file once"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            settings(*STAGES, without=names)
+
+
 @pytest.fixture(scope="module")
 def trained(folders, tmp_path_factory):
     output = tmp_path_factory.mktemp("trained")
@@ -302,22 +364,28 @@ def test_published_sets_share_a_few_meshes():
     }
 
 
-def test_a_recipe_names_the_bodies_that_another_set_keeps_for_evaluation():
-    folder = MODELS.parent / "datasets"
+@pytest.mark.parametrize(
+    ("recipe", "other"),
+    [
+        ("torsion-more/best-further", "torsion-exact"),
+        ("impulse-more/through-more", "impulse-as-published"),
+        ("stretch-more/through-more", "stretch-as-published"),
+    ],
+)
+def test_a_recipe_leaves_out_the_bodies_that_another_set_keeps_for_evaluation(recipe, other):
+    folder, own = MODELS.parent / "datasets", recipe.partition("/")[0]
     kept = {
         plan.design.key()
-        for plan in make_plan(DatasetConfig.load(folder / "torsion-exact" / "config.toml"))
+        for plan in make_plan(DatasetConfig.load(folder / other / "config.toml"))
         if plan.split not in ("training", "validation")
     }
-    found = {"training": [], "validation": []}
-    for plan in make_plan(DatasetConfig.load(folder / "torsion-more" / "config.toml")):
-        if plan.split in found and plan.design.key() in kept:
-            found[plan.split].append(plan.number)
-    told = (MODELS / "recipes" / "torsion-more" / "best-further.toml").read_text(encoding="utf-8")
-    comments = [line.strip("# ") for line in told.splitlines() if line.startswith("#")]
-    for split, numbers in found.items():
-        assert f"{split} {', '.join(map(str, numbers))}" in comments
-        assert numbers
+    found = [
+        plan.name
+        for plan in make_plan(DatasetConfig.load(folder / own / "config.toml"))
+        if plan.split in ("training", "validation") and plan.design.key() in kept
+    ]
+    assert found
+    assert list(TrainingConfig.load(MODELS / "recipes" / f"{recipe}.toml").without) == found
 
 
 def test_a_released_model_names_the_data_sets_of_all_its_trainings():
@@ -327,12 +395,13 @@ def test_a_released_model_names_the_data_sets_of_all_its_trainings():
     assert load_model("torsion-exact").data_sets == expected
 
 
-def test_the_one_body_of_torsion_many_that_is_kept_for_evaluation_is_named():
+def test_the_one_body_of_torsion_many_that_is_kept_for_evaluation_is_left_out():
     folder, found = MODELS.parent / "datasets", {}
     for name, split in (("torsion-exact", "evaluation"), ("torsion-many", "training")):
         plans = make_plan(DatasetConfig.load(folder / name / "config.toml"))
         found[split] = {p.design.key(): p.number for p in plans if p.split == split}
     shared = found["training"].keys() & found["evaluation"].keys()
     (number,) = (found["training"][key] for key in shared)
-    told = (MODELS / "recipes" / "README.md").read_text(encoding="utf-8")
-    assert f"`mesh-{number:04d}` of `torsion-many`" in told
+    for name in ("best-without-ahead", "best-small-rate"):
+        recipe = TrainingConfig.load(MODELS / "recipes" / "torsion-many" / f"{name}.toml")
+        assert recipe.without == (f"training/mesh-{number:04d}",), name

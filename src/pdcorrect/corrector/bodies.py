@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pdcorrect.corrector.folds import corner_jacobians, least_by_body
 from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
 from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.corrector.shapes import shape_measures
@@ -159,6 +160,20 @@ class BodyGraph:
             found = shape_measures(*(part.detach().cpu().numpy() for part in exact))
             return torch.as_tensor(found).to(self.rest)
 
+    @cached_property
+    def rest_corners(self) -> Tensor:
+        """Determinants of the cells' trilinear maps at their corners at rest, (c, 8), m3."""
+        with torch.inference_mode(False):
+            return corner_jacobians(self.rest, self.cells)
+
+    def least_corners(self, positions: Tensor) -> Tensor:
+        """Least det F at the corners of each body's cells at positions (n, 3), m: (B,).
+
+        See `pdcorrect.fem.elastic_body.ElasticBody.corner_volume_ratios`.
+        """
+        ratios = corner_jacobians(positions, self.cells) / self.rest_corners
+        return least_by_body(ratios, self.cells, self.graph, self.bodies)
+
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""
         return values.index_select(0, self.graph)
@@ -198,7 +213,7 @@ class BodyGraph:
             self, mass=mass.to(self.rest), young=mean(young), poisson=mean(poisson),
             density=mean(density),
         )  # fmt: skip
-        known = {name: vars(self)[name] for name in (*KNOWN, "shapes") if name in vars(self)}
+        known = {name: vars(self)[name] for name in (*KNOWN, *KNOWN_TO_GATES) if name in vars(self)}
         vars(found).update(known)
         return found
 
@@ -218,6 +233,8 @@ REST_OF_EDGES = ("rest_edges", "rest_turns")
 REST_OF_CELLS = ("rest_inverses",)
 KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
 """What a graph computes of its bodies at rest once for a network, when first asked for."""
+KNOWN_TO_GATES = ("shapes", "rest_corners")
+"""The same for a gate."""
 
 _NODAL = ("rest", "free", "mass", "young", "poisson", "density")
 

@@ -91,6 +91,11 @@ class CompiledCorrector:
         """See `Corrector.unlike`."""
         return np.array([self._known(view).strangeness()])
 
+    def least_corners(self, view: View) -> Array:
+        """See `Corrector.least_corners`."""
+        found: Array = self._corrector.least_corners(view).numpy()
+        return found
+
     def shape_excess(self, bodies: BodyGraph) -> Array:
         """See `Corrector.shape_excess`."""
         normaliser = self._corrector.normaliser

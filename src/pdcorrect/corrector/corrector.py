@@ -40,6 +40,9 @@ class Answers(Protocol):
     def unlike(self, view: View) -> Values:
         """How far each body's mean inputs are from those of training bodies, (B,)."""
 
+    def least_corners(self, view: View) -> Values:
+        """Least det F at corners of each body's cells after the step, (B,)."""
+
     def shape_excess(self, bodies: BodyGraph) -> Values:
         """How far measures of each body at rest lie outside their range in training, (B,)."""
 
@@ -119,6 +122,10 @@ class Corrector(nn.Module):
         nodes = features.values(NODE_FEATURES, config.node_features, view)
         averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
         return self.normaliser.strangeness(averages).amax(dim=1)
+
+    def least_corners(self, view: View) -> Tensor:
+        """Least det F at corners of each body's cells after the step, (B,)."""
+        return view.bodies.least_corners(view.snapshot.proposed)
 
     def shape_excess(self, bodies: BodyGraph) -> Tensor:
         """How far measures of each body at rest lie outside their range in training, (B,).

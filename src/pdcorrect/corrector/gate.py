@@ -26,10 +26,10 @@ class Reason(IntEnum):
     """Why a correction was refused; 0 where it was not.
 
     NOT_FINITE: the network's answer is not a number.  FEATURES: its inputs are unlike those of the
-    training (`Gate.margin`, `Gate.average`).  INVERSION, ENERGY: the corrected state fails
-    (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
-    body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
-    soon after a step that did not (`Gate.pause`).
+    training (`Gate.margin`, `Gate.average`), or of a folded body (`Gate.corners`).  INVERSION,
+    ENERGY: the corrected state fails (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER:
+    the coarse step failed.  BODY: the body at rest is unlike those of the training (`Gate.body`).
+    PAUSE: it would have passed, too soon after a step that did not (`Gate.pause`).
     """
 
     NONE = 0
@@ -94,6 +94,12 @@ class Gate(Strict):
         training, in deviations of such means there, of which the farthest of them counts as 3.5
         at most: a body whose every node is somewhere in what was seen may yet move as none did.
         For inputs that are large in few steps, as in kicks, that is a test of their range.
+    corners
+        Refused if det F at a corner of a cell is not above this bound in what the network sees as
+        the positions after the step: the coarse answer, or, before it is solved ("force",
+        "guess"), where inertia and loads alone would lead.  A cell may be folded at a corner
+        while det F is positive at all its quadrature points, and its body so be held away from
+        equilibrium by corrections that pass all other tests.
     volume
         Refused if in any cell the smallest det F at the quadrature points, of the nodes'
         displacements, is not above this bound, unless it is no smaller than in the same cell
@@ -124,6 +130,7 @@ class Gate(Strict):
     margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     average: NonNegative | None = 4.5
+    corners: Number | None = None
     volume: Number | None = 0.0
     crushing: Annotated[float, Field(strict=True, ge=0, lt=1)] | None = 0.1
     energy: NonNegative | None = 8.0
@@ -143,6 +150,8 @@ class Gate(Strict):
             found = found | (corrector.outside(view, self.margin) > self.share)
         if self.average is not None:
             found = found | (corrector.unlike(view) > self.average)
+        if self.corners is not None:
+            found = found | ~(corrector.least_corners(view) > self.corners)
         return found
 
     def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Values:

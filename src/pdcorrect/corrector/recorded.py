@@ -113,6 +113,11 @@ class RecordedCorrector:
         return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
 
     @torch.no_grad()
+    def least_corners(self, view: View) -> Tensor:
+        """See `Corrector.least_corners`."""
+        return self._corrector.least_corners(view)
+
+    @torch.no_grad()
     def shape_excess(self, bodies: BodyGraph) -> Tensor:
         """See `Corrector.shape_excess`."""
         return self._corrector.shape_excess(bodies)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
@@ -67,13 +67,13 @@ def splits_of(folder: str | Path) -> list[str]:
     return found
 
 
-def shard_paths(folder: str | Path, split: str) -> list[Path]:
-    """Files of a split, by number.
+def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -> list[Path]:
+    """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
 
     Raises
     ------
     InputError
-        If there are none.
+        If there are none, or none are left.
     """
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
@@ -81,7 +81,10 @@ def shard_paths(folder: str | Path, split: str) -> list[Path]:
         few = " (it has round(validation_share * training.meshes) meshes, which may be none)"
         hint = few if split == VALIDATION else ""
         raise InputError(f"{folder}: no split {split!r}{hint}: expected one of {names}.")
-    return paths
+    kept = [path for path in paths if f"{split}/{path.stem}" not in without]
+    if not kept:
+        raise InputError(f"{folder}, {split}: all {len(paths)} files are left out: expected fewer.")
+    return kept
 
 
 def _rank(split: str) -> tuple[int, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         Of everything but indices and masks.
     skip_damaged : bool
         Leave out files that are damaged; all files are read once to find them.
+    without : collection of str
+        Files to be left out, such as ``training/mesh-0042``.
 
     Attributes
     ----------
@@ -120,6 +122,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         cache_bytes: int = CACHE_BYTES,
         dtype: torch.dtype = torch.float32,
         skip_damaged: bool = False,
+        without: Collection[str] = (),
     ) -> None:
         super().__init__()
         if not isinstance(window, (int, np.integer)) or window < 1:
@@ -130,7 +133,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
         self.damaged: Damage = {}
-        every = [path for each in self.folders for path in shard_paths(each, split)]
+        every = [path for each in self.folders for path in shard_paths(each, split, without)]
         paths = whole_files(every, self.damaged if skip_damaged else None)
         self.headers = [read_header(path) for path in paths]
         for header in self.headers:

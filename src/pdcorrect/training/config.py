@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -13,6 +14,7 @@ from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount,
 from pdcorrect.toml_config import TomlConfig
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+_FILE = re.compile(r"(training|validation)/mesh-\d{4,}")
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
 
 
@@ -26,6 +28,19 @@ def _rising(steps: tuple[int, ...]) -> tuple[int, ...]:
     return steps
 
 
+def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    for name in names:
+        if not _FILE.fullmatch(name):
+            raise ValueError(
+                f"{name!r}: expected files of the training and validation splits without their "
+                "ending, such as 'training/mesh-0042'"
+            )
+    if len(set(names)) < len(names):
+        raise ValueError("expected each file once")
+    return names
+
+
+Files = Annotated[tuple[str, ...], AfterValidator(_file_names)]
 Horizon = Annotated[tuple[PositiveCount, ...], BeforeValidator(_several), AfterValidator(_rising)]
 
 
@@ -232,6 +247,9 @@ class TrainingConfig(TomlConfig):
         Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
         training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
         architecture.  A folder's path starts where the program does.
+    without
+        Files of the data set that are left out, such as "training/mesh-0042": of bodies that
+        another set keeps for its evaluation, say.  For one data set.
     base
         Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
     velocity
@@ -248,6 +266,7 @@ class TrainingConfig(TomlConfig):
 
     corrector: Architecture = Architecture()
     start_from: Annotated[str, Field(min_length=1)] | None = None
+    without: Files = ()
     base: Base = "plain"
     velocity: Literal["recomputed", "kept"] = "recomputed"
     seed: Count = 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,9 @@ class Recording:
 
 
 def load_recordings(
-    folder: Folders, split: str, base: Base, *, scenes: bool = True, meshes: int | None = None
-) -> list[Recording]:
+    folder: Folders, split: str, base: Base, *, scenes: bool = True, meshes: int | None = None,
+    without: Collection[str] = (),
+) -> list[Recording]:  # fmt: skip
     """The simulations of a split, mesh by mesh.
 
     Parameters
@@ -98,6 +99,8 @@ def load_recordings(
         Whether the base model is to step again, for which it takes the scenes.
     meshes : int, optional
         At most so many, spread evenly over the split; all by default.
+    without : collection of str
+        Files to be left out, such as ``training/mesh-0042``.
 
     Raises
     ------
@@ -109,7 +112,7 @@ def load_recordings(
     """
     if meshes is not None and meshes < 1:
         raise InputError(f"meshes = {meshes}: expected 1 or more.")
-    found, paths = [], _paths(folder, split)
+    found, paths = [], _paths(folder, split, without)
     count = len(paths) if meshes is None else min(meshes, len(paths))
     for path in (paths[k * len(paths) // count] for k in range(count)):
         _check_complete(read_header(path), base, scenes)
@@ -153,18 +156,18 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     return problems
 
 
-def data_hash(folder: Folders, splits: Sequence[str]) -> str:
-    """SHA-256 of the content hashes of the files of some splits."""
+def data_hash(folder: Folders, splits: Sequence[str], without: Collection[str] = ()) -> str:
+    """SHA-256 of the content hashes of the files of some splits, those left out left out."""
     digest, folders = hashlib.sha256(), folders_of(folder)
     for split in splits:
-        for path in _paths(folders, split):
+        for path in _paths(folders, split, without):
             digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
     return digest.hexdigest()
 
 
-def _paths(folder: Folders, split: str) -> list[Path]:
+def _paths(folder: Folders, split: str, without: Collection[str]) -> list[Path]:
     """Files of a split of all data sets."""
-    return [path for each in folders_of(folder) for path in shard_paths(each, split)]
+    return [path for each in folders_of(folder) for path in shard_paths(each, split, without)]
 
 
 def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:

@@ -28,6 +28,7 @@ from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.missing import check_whole
+from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.toml_config import as_toml
@@ -108,9 +109,15 @@ class Training:
         if not incomplete:
             for folder in data:
                 check_whole(folder, (TRAINING, VALIDATION))
-        splits = _common_splits(data)
+        splits, without = _common_splits(data), config.without
+        _check_left_out(without, data, incomplete)
         self._identity = json.loads(
-            json.dumps({"config": config.model_dump(mode="json"), "data": data_hash(data, splits)})
+            json.dumps(
+                {
+                    "config": config.model_dump(mode="json"),
+                    "data": data_hash(data, splits, without),
+                }
+            )
         )
         start, self._teachers = self._start(), load_teachers(config, self.device)
         self._learned = [] if start is None else start.data_sets
@@ -120,12 +127,14 @@ class Training:
             self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
         unrolled = any(stage.kind == "unrolled" for stage in config.stages)
-        self._recordings = load_recordings(data, TRAINING, config.base, scenes=unrolled)
+        self._recordings = load_recordings(
+            data, TRAINING, config.base, scenes=unrolled, without=without
+        )
         if len(data) > 1:
             _check_alike(self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
-            workers=config.workers,
+            workers=config.workers, without=without,
         )  # fmt: skip
         self._groups = SceneGroups(
             self._recordings, config.base, self.device, seed=config.seed, rank=self.world.rank,
@@ -137,7 +146,7 @@ class Training:
         self._validation: Validation | None = None
         if VALIDATION in splits:
             self._validation = Validation(
-                load_recordings(data, VALIDATION, config.base), config.base,
+                load_recordings(data, VALIDATION, config.base, without=without), config.base,
                 velocity=config.velocity, device=self.device, world=self.world,
             )  # fmt: skip
         self.progress = Progress()
@@ -382,6 +391,18 @@ def _common_splits(folders: Sequence[Path]) -> list[str]:
                     "expected one in all data sets, or in none."
                 )
     return found
+
+
+def _check_left_out(names: Sequence[str], folders: Sequence[Path], incomplete: bool) -> None:
+    """Refuse files to be left out of several data sets, and those that are not there.
+
+    With ``incomplete`` they need not be.
+    """
+    if names and len(folders) > 1:
+        raise InputError(f"without = {list(names)}: expected one data set, got {len(folders)}.")
+    unknown = [name for name in names if not (folders[0] / f"{name}{SUFFIX}").exists()]
+    if unknown and not incomplete:
+        raise InputError(f"without: {folders[0]} has no {unknown[0]}: expected files of it.")
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:

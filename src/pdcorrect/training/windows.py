@@ -5,7 +5,7 @@ They come from the stored predictions of a data set, so no simulator runs.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -85,6 +85,8 @@ class StepWindows:
     resident : bool, optional
         Whether all windows are kept in the device's memory, see `ResidentWindows`.  By
         default if they take less than 0.3 of what is free on a GPU, or 4 GiB on the CPU.
+    without : collection of str
+        Files to be left out, such as ``training/mesh-0042``.
     """
 
     def __init__(
@@ -98,11 +100,12 @@ class StepWindows:
         workers: int = 0,
         steps: int = 1,
         resident: bool | None = None,
+        without: Collection[str] = (),
     ) -> None:
         self.config, self.device = config, torch.device(device)
         self._history = "previous-correction" in config.node_features
         steps = max(steps, 2 if self._history else 1)
-        self.dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=base)
+        self.dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=base, without=without)
         size = int(self.dataset.shard_bytes().sum())
         self.resident = _fits(size, self.device) if resident is None else resident
         self._workers = 0 if self.resident else workers
