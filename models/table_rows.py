@@ -53,7 +53,9 @@ OTHERS = (
     "other-family", "stiffer", "more-compressible", "stronger", "half-step", "double-step",
     "half-refined", "long",
 )  # fmt: skip
-"""Splits of the second table, in its order."""
+"""Splits of the second and the third table, in their order."""
+WITH_GATE_ONLY = ("torsion-exact-other-family",)
+"""Records of the second table that were not computed without a gate, too."""
 OTHER_HEADINGS = (
     "model", "split", "simulations", "steps refused, %", "base alone: Ω mean",
     "corrected: Ω mean, worst", "error over the base's: median, largest",
@@ -61,7 +63,7 @@ OTHER_HEADINGS = (
 )  # fmt: skip
 
 BODIES = ("larger", "smaller", "beams", "one-clamp", "other-family")
-"""Records of the third table, in its order."""
+"""Records of the fourth table, in its order."""
 BODY_HEADINGS = (
     "model", "bodies", "nodes", "simulations", "farthest measure of all", "steps refused, %",
     "base alone: Ω mean", "corrected: Ω mean, worst", "error over the base's: each",
@@ -76,7 +78,7 @@ STEP_HEADINGS = (
 
 PUBLISHED = ("impulse-as-published", "stretch-as-published", "torsion-as-published")
 MEASURED = (*PUBLISHED, "impulse-exact", "stretch-exact")
-"""Data sets of the fifth table."""
+"""Data sets of the sixth table."""
 WITHOUT_NETWORK = {
     "consistent mass": "consistent mass",
     "hex8-mean": "element `hex8-mean`",
@@ -87,7 +89,7 @@ WITHOUT_NETWORK = {
     "best": "the best coarse model",
     "intermediate": "intermediate mesh",
 }
-"""Runs of the fifth table, in its order, and what they are called there."""
+"""Runs of the sixth table, in its order, and what they are called there."""
 JOINT_RECORD = "all-as-published"
 JOINT_HEADINGS = (
     "data set", "one model for all: Ω mean", "95 %", "median", "worst",
@@ -118,7 +120,7 @@ TRAININGS = (
     ("stretch exact", _STRETCHES, "models/stretch-exact", "before it was trained on"),
     ("stretch exact", _STRETCHES, "plain/model", "plain base"),
 )
-"""Rows of the seventh table: evaluation split, record, run, and what it is called there."""
+"""Rows of the eighth table: evaluation split, record, run, and what it is called there."""
 TRAINING_HEADINGS = (
     "evaluation split of", "training", "base", "Ω mean", "95 %", "median", "worst",
     "of the base's error: mean", "rollouts above 1.05", "intermediate mesh nearer",

@@ -1,14 +1,15 @@
-"""`Gate.corners`: bodies that are folded at a corner, where no quadrature point sees it."""
+"""`Gate.corners`: bodies that are folded at a corner, where quadrature points may not see it."""
 
 import numpy as np
 import pytest
 import torch
 
 import pdcorrect as pc
-from hybrid_samples import Prescribed, fitted, problems, soft_beam
+from hybrid_samples import PLACEMENTS, Prescribed, fitted, problems, soft_beam
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.features import Snapshot, View
 from pdcorrect.corrector.folds import corner_jacobians
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
@@ -60,11 +61,16 @@ def test_each_body_has_its_own_least_corner():
 
 def test_what_is_no_number_does_not_pass():
     scenes = problems((3, 1, 1), (2, 2, 1))
-    positions = np.concatenate([s.positions for s in scenes])
-    positions[0] = np.nan
-    found = graph(*scenes).least_corners(torch.as_tensor(positions))
-    assert torch.isnan(found[0])
-    assert found[1] == pytest.approx(1.0)
+    corrector, bodies = fitted(scenes), graph(*scenes)
+    positions = torch.as_tensor(np.concatenate([s.positions for s in scenes]))
+    for spoilt, flags in ((None, [False, False]), (0, [True, False])):
+        proposed = positions.clone()
+        if spoilt is not None:
+            proposed[spoilt] = torch.nan
+        still = torch.zeros_like(positions)
+        view = View(bodies, Snapshot(positions, still, proposed, still))
+        assert Gate(corners=0.0).folded(corrector, view).tolist() == flags
+    assert Gate().folded(corrector, view) is False
 
 
 def test_other_materials_leave_the_corners_at_rest_as_they_are():
@@ -74,12 +80,14 @@ def test_other_materials_leave_the_corners_at_rest_as_they_are():
     assert other.rest_corners is known
 
 
+@pytest.mark.parametrize("placement", PLACEMENTS)
 @pytest.mark.parametrize("kind", [Corrector, Prescribed])
-def test_a_folded_body_passes_by_default_and_not_with_a_bound_for_corners(kind):
+def test_a_folded_body_passes_by_default_and_not_with_a_bound_for_corners(kind, placement):
     """By the compiled corrector, which takes no other class's place, and by torch."""
     problem = pc.discretise(soft_beam((3, 2, 2), time=INSTANT))
     state = pc.State(folded(problem), np.zeros_like(problem.positions))
-    coarse, corrector = pc.ProjectiveDynamics(problem), fitted([problem], kind=kind)
+    coarse = pc.ProjectiveDynamics(problem)
+    corrector = fitted([problem], kind=kind, placement=placement)
     if kind is Prescribed:
         corrector.answer = np.full(problem.positions.shape, 1e-6)
     plain = coarse(state).state.positions
@@ -88,15 +96,17 @@ def test_a_folded_body_passes_by_default_and_not_with_a_bound_for_corners(kind):
     assert least == pytest.approx(1.0 - 3 * 0.4, abs=1e-3)
     for bound, reason in (
         (None, Reason.NONE),
-        (0.0, Reason.FEATURES),
-        (least + 1e-9, Reason.FEATURES),
-        (least - 1e-9, Reason.NONE),
+        (0.0, Reason.FOLDED),
+        (least + 1e-3, Reason.FOLDED),
+        (least - 1e-3, Reason.NONE),
     ):
         hybrid = HybridStepper(coarse, corrector, gate=Gate(**NOTHING, corners=bound))
         assert hybrid.compiled == (kind is Corrector)
         found = hybrid(state)
         assert found.stats["gate"] == reason, bound
-        assert np.array_equal(found.state.positions, plain) == (reason != Reason.NONE)
+        assert found.stats["refused"] == float(reason != Reason.NONE)
+        if placement == "state":
+            assert np.array_equal(found.state.positions, plain) == (reason != Reason.NONE)
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -104,7 +114,14 @@ def test_a_batch_refuses_the_folded_body_only(recorded):
     scenes = [pc.discretise(soft_beam(c, time=INSTANT)) for c in ((3, 1, 1), (2, 2, 1))]
     stepper, corrector = pc.BatchStepper(scenes), fitted(scenes)
     bent = pc.State(folded(scenes[0]), np.zeros_like(scenes[0].positions))
-    gate = Gate(**NOTHING, corners=0.0)
-    hybrid = BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)
-    found = hybrid(stepper.state([bent, scenes[1].rest_state()]))
-    assert found.reasons.tolist() == [Reason.FEATURES, Reason.NONE]
+    state = stepper.state([bent, scenes[1].rest_state()])
+    least = 1.0 - 3 * 0.4
+    for bound, reasons in (
+        (None, [Reason.NONE, Reason.NONE]),
+        (least - 1e-3, [Reason.NONE, Reason.NONE]),
+        (least + 1e-3, [Reason.FOLDED, Reason.NONE]),
+        (1.1, [Reason.FOLDED, Reason.FOLDED]),
+    ):
+        gate = Gate(**NOTHING, corners=bound)
+        hybrid = BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)
+        assert hybrid(state).reasons.tolist() == reasons, bound

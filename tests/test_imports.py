@@ -171,6 +171,7 @@ ORDER = [
     "corrector",
     "corrector.values",
     "corrector.rotations",
+    "corrector.folds",
     "corrector.frames",
     "corrector.shapes",
     "corrector.bodies",

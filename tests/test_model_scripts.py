@@ -52,11 +52,9 @@ def test_the_page_of_results_has_the_tables_of_the_records():
     assert tables.splits_table() in page
     splits = {path.name for path in (tables.RESULTS / "other-splits").iterdir()}
     gated = {name for name in splits if not name.endswith("-no-gate")}
-    for name in gated - {name.removesuffix("-no-gate") for name in splits - gated}:
-        runs = tables._summary(f"other-splits/{name}")["runs"].values()
-        rates = [run["measures"].get("gate_rate", {"mean": 100.0})["mean"] for run in runs]
-        assert rates == [100.0] * len(rates), name  # without a gate not computed, all is refused
-    assert {name.removesuffix("-no-gate") for name in splits} == gated
+    paired = gated - set(script("table_rows").WITH_GATE_ONLY)
+    assert splits == gated | {f"{name}-no-gate" for name in paired}
+    assert len(paired) == len(gated) - 1
     assert tables.splits_table().count("\n") == 1 + len(gated) > 1
     made = {"other-scenes": tables.others_table(), "other-bodies": tables.bodies_table()}
     for folder, found in made.items():
@@ -260,13 +258,39 @@ def test_baselines_are_steps_of_changed_problems():
     assert omega(baselines.with_stiffness(0.5)) < -50
 
 
-def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path):
+@pytest.mark.parametrize("split", ["training", "validation"])
+def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path, split):
     command = [sys.executable, ROOT / "models" / "baselines.py", ROOT / "datasets" / "tiny"]
-    subprocess.run([*command, "-o", tmp_path, "--fit", "2"], check=True, capture_output=True)
+    options = [
+        "-o",
+        tmp_path,
+        "--fit",
+        "2",
+        *(["--fit-split", split] if split != "training" else []),
+    ]
+    subprocess.run([*command, *options], check=True, capture_output=True)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert {"hex8-mean", "consistent mass", "fitted stiffness", "best"} < set(summary["runs"])
     assert 0.5 < summary["stiffness_factor"] < 1.5
-    assert "fitted to 2 simulations of training" in summary["notes"][0]
+    assert summary["notes"][0].endswith(f"fitted to 2 simulations of {split}")
+
+
+def test_folded_steps_are_counted_and_compared_where_gates_differ(tmp_path, monkeypatch):
+    folded = script("folded_steps")
+    config = DatasetConfig.load(ROOT / "datasets" / "tiny" / "config.toml")
+    plan = next(plan for plan in make_plan(config) if plan.split == "evaluation")
+    model = pc.load_model("tiny")
+    row = folded.simulation(config, plan, model)
+    assert row["refused"]["default"] == row["refused"]["corners"] < plan.frames == row["steps"]
+    assert 0.0 < row["least_corner"] < 1.0
+    assert "rms_mm" not in row
+    # a bound above all corners refuses every step, and what is left is the base
+    monkeypatch.setitem(folded.GATES, "corners", pc.Gate(corners=10.0))
+    row = folded.simulation(config, plan, model)
+    assert row["refused"]["corners"] == plan.frames
+    errors = row["rms_mm"]
+    assert errors["corners"] == pytest.approx(errors["base"], rel=1e-12)
+    assert errors["default"] < errors["base"]
 
 
 def test_a_simulation_is_repeated_with_and_without_a_gate(tmp_path):

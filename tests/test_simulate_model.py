@@ -132,6 +132,15 @@ def test_a_model_of_an_unknown_base_is_named(learned, tmp_path, monkeypatch):
         released.hybrid_of(pc.Scene.load(SCENE), tmp_path / "odd")
 
 
+def test_a_hybrid_in_one_call_has_the_gate_that_it_is_given():
+    scene, gate = pc.Scene.load(SCENE), pc.Gate(corners=0.0)
+    for given, expected in ((True, pc.Gate()), (False, None), (None, None), (gate, gate)):
+        assert pc.hybrid_of(scene, MODEL, gate=given).gate == expected
+    for given in (1, "strict", {"corners": 0.0}):
+        with pytest.raises(pc.errors.InputError, match="expected a Gate"):
+            pc.hybrid_of(scene, MODEL, gate=given)
+
+
 def with_integrator(name):
     return pc.Scene.load(SCENE).with_changes(time={"integrator": name})
 

@@ -189,6 +189,10 @@ def test_what_is_left_out_might_as_well_not_be_there(several, tmp_path, few_thre
         assert torch.equal(x, other.corrector.state_dict()[name]), name
     assert one.record.dataset_hash == other.record.dataset_hash
     assert _omegas(tmp_path / "left out") == _omegas(tmp_path / "removed")
+    with pytest.raises(InputError, match="was begun with config.without"):
+        Training(whole, several, tmp_path / "left out", incomplete=True, resume=True)
+    assert TrainingConfig.load(tmp_path / "left out" / "config.toml").without == LEFT_OUT
+    assert "without" not in (tmp_path / "removed" / "config.toml").read_text(encoding="utf-8")
 
 
 def _omegas(folder):
@@ -216,8 +220,7 @@ def test_files_that_cannot_be_left_out_are_refused(folders, several, tmp_path):
         Training(config, folders, tmp_path / "two")
     other = config.model_copy(update={"without": ("training/mesh-0042",)})
     with pytest.raises(InputError, match="has no training/mesh-0042"):
-        Training(other, several, tmp_path / "unknown")
-    Training(other, several, tmp_path / "permitted", incomplete=True)
+        Training(other, several, tmp_path / "unknown", incomplete=True)
     for names, told in (
         (["mesh-0042"], "such as 'training/mesh-0042'"),
         (["evaluation/mesh-0042"], "such as 'training/mesh-0042'"),

@@ -17,6 +17,7 @@ _MEANINGS = {
     "solver": "the coarse step itself failed",
     "body": "the body at rest is unlike those of its training",
     "pause": "it would have passed, too soon after one that did not",
+    "folded": "a cell is folded at a corner",
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
 

@@ -10,9 +10,8 @@ steps a cell is folded at a corner.
 
 from __future__ import annotations
 
-import json
+import argparse
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,14 +19,13 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
+import record
 from crosses import CROSSES
 from run import distance, error
 from scenarios import Scenario
 from solvers import MODELS, Run, finer, run, steps_of
 
 import pdcorrect as pc
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 GATES = {"default": pc.Gate(), "corners": pc.Gate(corners=0.0)}
 
@@ -52,26 +50,21 @@ def rows(scenario: Scenario) -> Iterator[dict[str, Any]]:
 def figures(scenario: Scenario, found: Run, truth: Run | None) -> dict[str, Any]:
     """How far off a run is, and how often and how far it is folded."""
     least = [float(found.problem.corner_volume_ratios(x).min()) for x in found.positions[1:]]
-    name, off = (
-        ("error", error(found, truth)) if truth else ("cells", distance(scenario, found, None))
-    )
-    return {name: off, "folded": int(np.sum(np.array(least) <= 0.0)), "least_corner": min(least)}
+    off = {"error": error(found, truth)} if truth else {"cells": distance(scenario, found, None)}
+    return {**off, "folded": int(np.sum(np.array(least) <= 0.0)), "least_corner": min(least)}
 
 
 def main() -> None:
     """Compute all and write the record."""
-    (output,) = map(Path, sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("output", type=Path, metavar="RECORD.json")
+    output = parser.parse_args().output
     found = []
     for scenario in CROSSES:
         for row in rows(scenario):
             found.append(row)
             print(row, flush=True)
-    content = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": f"python validation/stress/corners.py {output}",
-        "environment": environment(), "rows": found,
-    }  # fmt: skip
-    write_text(output, json.dumps(content, indent=2) + "\n")
+    record.write(output, rows=found)
 
 
 if __name__ == "__main__":

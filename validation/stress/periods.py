@@ -8,23 +8,21 @@ PD on the finer mesh, in largest displacements, and the share of corrections tha
 
 from __future__ import annotations
 
-import json
+import argparse
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+import record
 from crosses import CROSSES
 from run import error, moved
 from scenarios import Array, Scenario
 from solvers import MODELS, finer, run, steps_of
 
 import pdcorrect as pc
-from pdcorrect.environment import environment
-from pdcorrect.replacement import write_text
 
 PERIODS = (1, 2, 3, 4, 6, 8, 10, 13)
 """Steps between two turns."""
@@ -63,18 +61,15 @@ def rows(period: int) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     """Compute all and write the record."""
-    (output,) = map(Path, sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("output", type=Path, metavar="RECORD.json")
+    output = parser.parse_args().output
     found = []
     for period in PERIODS:
         for row in rows(period):
             found.append(row)
             print(row, flush=True)
-    content = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": f"python validation/stress/periods.py {output}",
-        "environment": environment(), "rows": found,
-    }  # fmt: skip
-    write_text(output, json.dumps(content, indent=2) + "\n")
+    record.write(output, rows=found)
 
 
 if __name__ == "__main__":

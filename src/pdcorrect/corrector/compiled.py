@@ -93,7 +93,7 @@ class CompiledCorrector:
 
     def least_corners(self, view: View) -> Array:
         """See `Corrector.least_corners`."""
-        found: Array = self._corrector.least_corners(view).numpy()
+        found: Array = self._corrector.least_corners(view).detach().numpy()
         return found
 
     def shape_excess(self, bodies: BodyGraph) -> Array:

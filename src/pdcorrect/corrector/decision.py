@@ -113,6 +113,8 @@ class Decision:
         if gate is not None:
             unknown = step.own(gate.unknown(corrector, view)) & (reasons == 0)
             reasons = where(unknown, int(Reason.FEATURES), reasons)
+            folded = step.own(gate.folded(corrector, view)) & (reasons == 0)
+            reasons = where(folded, int(Reason.FOLDED), reasons)
             reasons = where(foreign, int(Reason.BODY), reasons)
         asked = where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
         return cls(bodies, asked, reasons, factors)

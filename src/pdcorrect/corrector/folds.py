@@ -1,4 +1,4 @@
-"""Whether bodies are folded at the corners of their cells, which no quadrature point sees."""
+"""Volume ratios at the corners of cells, where a body may be folded unseen by quadrature points."""
 
 from __future__ import annotations
 

@@ -26,10 +26,11 @@ class Reason(IntEnum):
     """Why a correction was refused; 0 where it was not.
 
     NOT_FINITE: the network's answer is not a number.  FEATURES: its inputs are unlike those of the
-    training (`Gate.margin`, `Gate.average`), or of a folded body (`Gate.corners`).  INVERSION,
-    ENERGY: the corrected state fails (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER:
-    the coarse step failed.  BODY: the body at rest is unlike those of the training (`Gate.body`).
-    PAUSE: it would have passed, too soon after a step that did not (`Gate.pause`).
+    training (`Gate.margin`, `Gate.average`).  INVERSION, ENERGY: the corrected state fails
+    (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
+    body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
+    soon after a step that did not (`Gate.pause`).  FOLDED: the network sees a folded body
+    (`Gate.corners`).
     """
 
     NONE = 0
@@ -40,6 +41,7 @@ class Reason(IntEnum):
     SOLVER = 5
     BODY = 6
     PAUSE = 7
+    FOLDED = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +99,10 @@ class Gate(Strict):
     corners
         Refused if det F at a corner of a cell is not above this bound in what the network sees as
         the positions after the step: the coarse answer, or, before it is solved ("force",
-        "guess"), where inertia and loads alone would lead.  A cell may be folded at a corner
-        while det F is positive at all its quadrature points, and its body so be held away from
-        equilibrium by corrections that pass all other tests.
+        "guess"), where inertia and loads alone would lead.  What a correction makes of them is not
+        tested.  A cell may be folded at a corner while det F is positive at all its quadrature
+        points; corrections may pass all other tests there, and those that do may hold the body
+        out of balance.  Others are right: bodies fold and unfold.
     volume
         Refused if in any cell the smallest det F at the quadrature points, of the nodes'
         displacements, is not above this bound, unless it is no smaller than in the same cell
@@ -150,9 +153,16 @@ class Gate(Strict):
             found = found | (corrector.outside(view, self.margin) > self.share)
         if self.average is not None:
             found = found | (corrector.unlike(view) > self.average)
-        if self.corners is not None:
-            found = found | ~(corrector.least_corners(view) > self.corners)
         return found
+
+    def folded(self, corrector: Answers, view: View) -> Values:
+        """Whether bodies are folded at a corner in what the network sees, (B,) bool, or False.
+
+        What is not a number counts as folded.
+        """
+        if self.corners is None:
+            return False
+        return ~(corrector.least_corners(view) > self.corners)
 
     def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Values:
         """Reasons (B,) to refuse an answer beside another one, which is the coarse one.

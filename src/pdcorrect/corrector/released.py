@@ -18,7 +18,7 @@ def hybrid_of(
     scene: Scene,
     model: str | Path | LoadedModel,
     *,
-    gate: bool = True,
+    gate: bool | Gate | None = True,
     problem: Problem | None = None,
 ) -> HybridStepper:
     """Projective dynamics on the coarse model that a corrector was trained for, corrected.
@@ -30,8 +30,8 @@ def hybrid_of(
         `pdcorrect.run_text.foreign_integrator`, unless it is quasi-static.
     model : str, path or LoadedModel
         Name or folder, see `load_model`, or one that is loaded.
-    gate : bool
-        Whether a default `Gate` lets the corrector pass.
+    gate : bool, Gate or None
+        True: the default `Gate`; None and False: none.
     problem : Problem, optional
         That coarse model of the scene if it is there already, or with another total mass.
 
@@ -39,14 +39,15 @@ def hybrid_of(
     ------
     FileFormatError, InputError
         If there is no such model, it is damaged, it corrects an unknown coarse model or another
-        one than ``problem``, it does not fit the scene, or the scene is quasi-static and the
-        model's training was not.
+        one than ``problem``, it does not fit the scene, the scene is quasi-static and the model's
+        training was not, or ``gate`` is something else.
     """
     loaded = model if isinstance(model, LoadedModel) else load_model(model)
     name = "the model" if isinstance(model, LoadedModel) else model_folder(model).name
     if loaded.base not in BASES:
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
     _check_integrator(scene.time.integrator, loaded.integrator, name)
+    chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
     if problem is None:
         problem = coarse_model(scene, loaded.base)
     else:
@@ -55,7 +56,7 @@ def hybrid_of(
         ProjectiveDynamics(problem),
         loaded.corrector,
         velocity=loaded.velocity,
-        gate=Gate() if gate else None,
+        gate=chosen,
         origin=None if isinstance(model, LoadedModel) else about_model(model),
     )
 

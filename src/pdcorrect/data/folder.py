@@ -70,11 +70,15 @@ def splits_of(folder: str | Path) -> list[str]:
 def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -> list[Path]:
     """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
 
+    Names of other files do not matter.
+
     Raises
     ------
     InputError
-        If there are none, or none are left.
+        If there are none, or none are left; if ``without`` is one name in place of several.
     """
+    if isinstance(without, str):
+        raise InputError(f"without = {without!r}: expected a list of names, such as [{without!r}].")
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
         names = ", ".join(splits_of(folder))

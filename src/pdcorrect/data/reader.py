@@ -91,7 +91,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     skip_damaged : bool
         Leave out files that are damaged; all files are read once to find them.
     without : collection of str
-        Files to be left out, such as ``training/mesh-0042``.
+        Files of each data set that are left out, such as ``training/mesh-0042``.
 
     Attributes
     ----------

@@ -5,16 +5,24 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from pdcorrect.corrector.config import CorrectorConfig, preset
+from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import Base
 from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 from pdcorrect.toml_config import TomlConfig
 
+_FILE = re.compile(rf"({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
-_FILE = re.compile(r"(training|validation)/mesh-\d{4,}")
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
 
 
@@ -301,6 +309,14 @@ class TrainingConfig(TomlConfig):
                     "'one-step'"
                 )
         return self
+
+    @model_serializer(mode="wrap")
+    def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without an empty ``without``, which configurations of before do not have."""
+        found: dict[str, Any] = dump(self)
+        if not self.without:
+            found.pop("without", None)
+        return found
 
     def architecture(self) -> CorrectorConfig:
         """Of the corrector."""

@@ -100,7 +100,7 @@ def load_recordings(
     meshes : int, optional
         At most so many, spread evenly over the split; all by default.
     without : collection of str
-        Files to be left out, such as ``training/mesh-0042``.
+        Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
 
     Raises
     ------

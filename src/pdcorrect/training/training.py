@@ -110,7 +110,7 @@ class Training:
             for folder in data:
                 check_whole(folder, (TRAINING, VALIDATION))
         splits, without = _common_splits(data), config.without
-        _check_left_out(without, data, incomplete)
+        _check_left_out(without, data)
         self._identity = json.loads(
             json.dumps(
                 {
@@ -393,15 +393,12 @@ def _common_splits(folders: Sequence[Path]) -> list[str]:
     return found
 
 
-def _check_left_out(names: Sequence[str], folders: Sequence[Path], incomplete: bool) -> None:
-    """Refuse files to be left out of several data sets, and those that are not there.
-
-    With ``incomplete`` they need not be.
-    """
+def _check_left_out(names: Sequence[str], folders: Sequence[Path]) -> None:
+    """Refuse files to be left out of several data sets, and those that are not there."""
     if names and len(folders) > 1:
         raise InputError(f"without = {list(names)}: expected one data set, got {len(folders)}.")
     unknown = [name for name in names if not (folders[0] / f"{name}{SUFFIX}").exists()]
-    if unknown and not incomplete:
+    if unknown:
         raise InputError(f"without: {folders[0]} has no {unknown[0]}: expected files of it.")
 
 

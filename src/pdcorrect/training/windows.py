@@ -86,7 +86,7 @@ class StepWindows:
         Whether all windows are kept in the device's memory, see `ResidentWindows`.  By
         default if they take less than 0.3 of what is free on a GPU, or 4 GiB on the CPU.
     without : collection of str
-        Files to be left out, such as ``training/mesh-0042``.
+        Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
     """
 
     def __init__(

@@ -1,0 +1,20 @@
+"""What the scripts beside the battery record: their figures, and when and by which command."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from pdcorrect.environment import environment
+from pdcorrect.replacement import write_text
+
+
+def write(path: str | Path, **content: Any) -> None:
+    """Write a record of the program that runs, as JSON."""
+    script, *arguments = sys.argv
+    command = " ".join(["python", f"validation/stress/{Path(script).name}", *arguments])
+    origin = {"date": time.strftime("%Y-%m-%d"), "command": command, "environment": environment()}
+    write_text(Path(path), json.dumps({**origin, **content}, indent=2) + "\n")
