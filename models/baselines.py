@@ -8,8 +8,7 @@ Young's modulus times one factor for the whole data set, which makes the mean Om
 ``--fit`` simulations of ``--fit-split`` largest (by default of the training split, or, with a note,
 of the split itself where there is none).  They are measured like correctors, by
 `pdcorrect.evaluation.evaluate`, beside the stored runs; OUTPUT gets the same files as by
-``pdcorrect evaluate``.  Scenes of mesh files cannot be
-discretised again and are refused.
+``pdcorrect evaluate``.  Scenes of mesh files cannot be discretised again and are refused.
 """
 
 from __future__ import annotations

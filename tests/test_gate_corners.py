@@ -52,9 +52,7 @@ def test_each_body_has_its_own_least_corner():
     moved = [s.positions + 0.1 * s.cell_size * rng.normal(size=s.positions.shape) for s in scenes]
     moved[1] = folded(scenes[1])
     found = graph(*scenes).least_corners(torch.as_tensor(np.concatenate(moved)))
-    expected = [
-        s.corner_volume_ratios(x).min() for s, x in zip(scenes, moved, strict=True)
-    ]  # fmt: skip
+    expected = [s.corner_volume_ratios(x).min() for s, x in zip(scenes, moved, strict=True)]
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
     assert found[1] == pytest.approx(1.0 - 3 * 0.4)
 

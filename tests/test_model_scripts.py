@@ -261,21 +261,17 @@ def test_baselines_are_steps_of_changed_problems():
 @pytest.mark.parametrize("split", ["training", "validation"])
 def test_a_stiffness_is_fitted_and_all_baselines_are_measured(tmp_path, split):
     command = [sys.executable, ROOT / "models" / "baselines.py", ROOT / "datasets" / "tiny"]
-    options = [
-        "-o",
-        tmp_path,
-        "--fit",
-        "2",
-        *(["--fit-split", split] if split != "training" else []),
-    ]
-    subprocess.run([*command, *options], check=True, capture_output=True)
+    options = [] if split == "training" else ["--fit-split", split]  # training by default
+    subprocess.run(
+        [*command, "-o", tmp_path, "--fit", "2", *options], check=True, capture_output=True
+    )
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert {"hex8-mean", "consistent mass", "fitted stiffness", "best"} < set(summary["runs"])
     assert 0.5 < summary["stiffness_factor"] < 1.5
     assert summary["notes"][0].endswith(f"fitted to 2 simulations of {split}")
 
 
-def test_folded_steps_are_counted_and_compared_where_gates_differ(tmp_path, monkeypatch):
+def test_folded_steps_are_counted_and_compared_where_gates_differ(monkeypatch):
     folded = script("folded_steps")
     config = DatasetConfig.load(ROOT / "datasets" / "tiny" / "config.toml")
     plan = next(plan for plan in make_plan(config) if plan.split == "evaluation")

@@ -212,6 +212,8 @@ def test_readers_leave_out_files_by_name(several):
         assert kept != several / f"{name}.h5"
         with pytest.raises(InputError, match=rf"{split}: all 2 files are left out"):
             TrajectoryDataset(several, split, without=[name, f"{split}/{kept.stem}"])
+        with pytest.raises(InputError, match="expected a list of names"):
+            TrajectoryDataset(several, split, without=name)
 
 
 def test_files_that_cannot_be_left_out_are_refused(folders, several, tmp_path):

@@ -111,13 +111,9 @@ class Training:
                 check_whole(folder, (TRAINING, VALIDATION))
         splits, without = _common_splits(data), config.without
         _check_left_out(without, data)
+        digest = data_hash(data, splits, without)
         self._identity = json.loads(
-            json.dumps(
-                {
-                    "config": config.model_dump(mode="json"),
-                    "data": data_hash(data, splits, without),
-                }
-            )
+            json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
         start, self._teachers = self._start(), load_teachers(config, self.device)
         self._learned = [] if start is None else start.data_sets
