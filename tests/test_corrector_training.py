@@ -1271,6 +1271,25 @@ def test_the_ranges_of_a_start_grow_by_the_new_data(short, earlier, tmp_path):
     assert known.get_buffer("deformation__low") < fitted
 
 
+def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(short, earlier, tmp_path):
+    model = load_model(earlier)
+    model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
+    start = save_model(model.corrector, tmp_path / "start", record=model.record)
+    found = {}
+    for widen in (True, False):
+        settings = samples.config(
+            samples.one_step(), start_from=str(start), fitting={"widen": widen}
+        )
+        Training(settings, short, tmp_path / str(widen)).run()
+        found[widen] = load_model(tmp_path / str(widen) / "model").corrector
+        assert ("widen" in settings.model_dump()["fitting"]) is not widen
+    for name, known in model.corrector.normaliser.named_buffers():
+        assert torch.equal(found[False].normaliser.get_buffer(name), known), name
+    assert (found[True].normaliser.shape_high > model.corrector.normaliser.shape_high).all()
+    assert torch.equal(weights(found[True]), weights(found[False]))
+    assert not torch.equal(weights(found[True]), weights(model.corrector))
+
+
 def test_a_start_that_training_only_worsens_is_what_is_kept(short, earlier, tmp_path):
     ruin = samples.one_step(iterations=3, rate={"peak": 1.0, "last": 1.0, "warmup": 0.0})
     settings = samples.config(ruin, start_from=str(earlier))

@@ -241,9 +241,28 @@ class Stage(Strict):
 
 
 class Fitting(Strict):
-    """Of the normalisation: most windows taken from the training split."""
+    """Of the normalisation.
+
+    Attributes
+    ----------
+    windows
+        Most that are taken from the training split.
+    widen
+        Whether a training that goes on with another model widens that one's ranges of known
+        inputs and bodies to what it learns.  They are extremes, so the more there is to learn, the
+        less a gate refuses.  Weights do not depend on it.
+    """
 
     windows: PositiveCount = 10_000
+    widen: bool = True
+
+    @model_serializer(mode="wrap")
+    def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """``widen`` where it is not the default: configurations of before do not have it."""
+        found: dict[str, Any] = dump(self)
+        if self.widen:
+            found.pop("widen", None)
+        return found
 
 
 class TrainingConfig(TomlConfig):

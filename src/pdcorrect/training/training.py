@@ -301,7 +301,7 @@ class Training:
         config = self.config
         if start is not None:
             corrector = start.corrector.train()
-            if fit:
+            if fit and config.fitting.widen:
                 widen_ranges(corrector, self._windows, config.fitting.windows, config.seed)
                 self.world.same(list(corrector.state_dict().values()))
             return corrector
