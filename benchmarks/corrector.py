@@ -83,13 +83,15 @@ def fitted(name: str, view: View) -> Corrector:
         for feature, values in features.values(table, names, view).items():
             found[feature] = Moments()
             found[feature].add(values)
-    target, averages, shapes = Moments(), Moments(), Moments()
+    target, averages, shapes, steps = (Moments() for _ in range(4))
     target.add(torch.ones(1, 1))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
     corrector.normaliser.fit_averages(averages)
     shapes.add(view.bodies.shapes)
     corrector.normaliser.fit_shapes(shapes)
+    steps.add(view.bodies.time_step.log()[:, None])
+    corrector.normaliser.fit_steps(steps)
     return corrector.eval()
 
 

@@ -93,11 +93,11 @@ def main() -> None:
         )  # fmt: skip
 
     def refused(problems: list[Problem]) -> int:
-        """Bodies that the gate refuses at rest, whose steps are the coarse ones."""
+        """Scenes that the gate refuses as a whole, whose steps are the coarse ones."""
         corrector = model.corrector
         device = corrector.normaliser.shape_low.device
         bodies = BodyGraph.of(problems, dtype=torch.float64, device=device)
-        return int(Gate().foreign(corrector, bodies).sum())
+        return int((Gate().foreign(corrector, bodies) > 0).sum())
 
     data = Path(chosen.data)
     source = drawn(data, chosen.split, base) if data.is_file() else stored(data, chosen.split, base)

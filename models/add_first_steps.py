@@ -26,7 +26,7 @@ from pdcorrect.corrector.model_io import LoadedModel, model_folder
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
 
-ANSWERS_ONLY = pc.Gate(body=None, margin=None, average=None)
+ANSWERS_ONLY = pc.Gate(body=None, step=None, margin=None, average=None)
 """Refuses no inputs, for it is these that are to be known."""
 
 

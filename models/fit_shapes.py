@@ -3,37 +3,26 @@
 python models/fit_shapes.py MODEL DATASET/config.toml
 
 For models of format version 2, from before there were such ranges; trainings fit them to their
-data.  Those of models of version 3 are fitted anew.  The bodies of the training split are drawn as
+data.  Those of later models are fitted anew.  The bodies of the training split are drawn as
 `pdcorrect dataset generate` does it; nothing is simulated.  The model is replaced by itself with
-these ranges; told is how far one of the bodies lies at most outside the ranges of all others.
+these ranges, and with that of time steps where it has none (see `fit_steps.py`); told is how far
+one of the bodies lies at most outside the ranges of all others.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import torch
 from first_steps import scenes_of
-from safetensors.torch import load_file
+from fit_steps import fit_steps, of_any_version
 
 import pdcorrect as pc
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_io import (
-    DESCRIPTION,
-    WEIGHTS,
-    LoadedModel,
-    ModelRecord,
-    model_folder,
-    weights_digest,
-)
+from pdcorrect.corrector.model_io import model_folder
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
-
-_SHAPES = "normaliser.shape_"
 
 
 def main() -> None:
@@ -43,28 +32,16 @@ def main() -> None:
     parser.add_argument("config", type=Path, help="of the data set that it was trained on")
     options = parser.parse_args()
     folder = model_folder(options.model)
-    version = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))["version"]
-    model = second_version(folder) if version == 2 else pc.load_model(folder)
-    config = DatasetConfig.load(options.config)
+    model, config = of_any_version(folder), DatasetConfig.load(options.config)
     each, shapes = shapes_of(config), Moments()
     shapes.add(each)
     model.corrector.normaliser.fit_shapes(shapes)
     model.record.training["shapes"] = {
         "dataset": config.name, "meshes": len(each), "left_out": left_out(each),
     }  # fmt: skip
+    if model.corrector.normaliser.step_low.isnan().any():
+        fit_steps(model, [config])
     print(pc.save_model(model.corrector, folder, record=model.record), left_out(each))
-
-
-def second_version(folder: Path) -> LoadedModel:
-    """A model of format version 2, which has no ranges of bodies at rest."""
-    found = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
-    if weights_digest(folder) != found["weights_sha256"]:
-        raise SystemExit(f"{folder}: its weights are not those that {DESCRIPTION} names: damaged.")
-    corrector = Corrector(CorrectorConfig.model_validate(found["architecture"]))
-    gaps = corrector.load_state_dict(load_file(folder / WEIGHTS), strict=False)
-    if gaps.unexpected_keys or not all(name.startswith(_SHAPES) for name in gaps.missing_keys):
-        raise SystemExit(f"{folder}: its weights are not those of its architecture.")
-    return LoadedModel(corrector.eval(), ModelRecord.model_validate(found["record"]))
 
 
 def shapes_of(config: DatasetConfig) -> torch.Tensor:

@@ -21,6 +21,7 @@ from run_record import write_record
 import pdcorrect as pc
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.gate import Reason
 from pdcorrect.corrector.model_io import model_folder, weights_digest
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION, VALIDATION, DatasetConfig
@@ -52,7 +53,7 @@ def counted(corrector: Corrector, config: DatasetConfig, split: str) -> dict[str
     problems = [pc.discretise(scene) for scene, _ in scenes_of(config, split, loads=1)]
     bodies = BodyGraph.of(problems, dtype=torch.float64)
     each = corrector.normaliser.shape_excess(bodies.shapes)
-    refused = pc.Gate().foreign(corrector, bodies)
+    refused = pc.Gate().foreign(corrector, bodies) == Reason.BODY
     farthest = each.amax(dim=1)
     found: dict[str, Any] = {
         "meshes": len(problems), "refused": int(refused.sum()),

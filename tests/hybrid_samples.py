@@ -56,7 +56,7 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         ):
             for name in names:
                 moments[name].add(table[name][1](views[-1]))
-    target, averages, shapes = Moments(), Moments(), Moments()
+    target, averages, shapes, lengths = (Moments() for _ in range(4))
     target.add(torch.full((4, 1), size))
     corrector.normaliser.fit(moments, target)
     for view in views:
@@ -64,6 +64,8 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         shapes.add(nodes.graph.shapes)
     corrector.normaliser.fit_averages(averages)
     corrector.normaliser.fit_shapes(shapes)
+    lengths.add(nodes.graph.time_step.log()[:, None])
+    corrector.normaliser.fit_steps(lengths)
     return corrector
 
 

@@ -122,13 +122,15 @@ def fit(corrector, view):
         for name, values in features.values(table, names, view).items():
             found[name] = Moments()
             found[name].add(values)
-    target, averages, shapes = Moments(), Moments(), Moments()
+    target, averages, shapes, steps = (Moments() for _ in range(4))
     target.add(torch.tensor([[0.1], [-0.3]]))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
     corrector.normaliser.fit_averages(averages)
     shapes.add(view.bodies.shapes)
     corrector.normaliser.fit_shapes(shapes)
+    steps.add(view.bodies.time_step.log()[:, None])
+    corrector.normaliser.fit_steps(steps)
     return corrector
 
 

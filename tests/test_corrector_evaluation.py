@@ -719,9 +719,11 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     averages = Moments()
     averages.add(torch.zeros(1, len(corrector.normaliser.average_low)))
     corrector.normaliser.fit_averages(averages)
-    shapes = Moments()
+    shapes, steps = Moments(), Moments()
     shapes.add(torch.zeros(1, len(corrector.normaliser.shape_low)))
     corrector.normaliser.fit_shapes(shapes)
+    steps.add(torch.tensor([[0.01]], dtype=torch.float64).log())
+    corrector.normaliser.fit_steps(steps)
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()

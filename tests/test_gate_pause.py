@@ -296,7 +296,7 @@ def test_no_gate_is_shut_for_longer_than_its_own_pause():
 
 # --- its definition --------------------------------------------------------------------------
 
-SHUTTING = set(Reason) - {Reason.NONE, Reason.BODY, Reason.PAUSE}
+SHUTTING = set(Reason) - {Reason.NONE, Reason.BODY, Reason.TIME_STEP, Reason.PAUSE}
 
 
 def counted(reasons, pause):

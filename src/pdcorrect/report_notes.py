@@ -6,7 +6,12 @@ import numpy as np
 
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
-from pdcorrect.run_text import foreign_integrator, inverted_frames, refused_corrections
+from pdcorrect.run_text import (
+    foreign_integrator,
+    inverted_frames,
+    refused_corrections,
+    refused_step,
+)
 from pdcorrect.scene import Scene
 from pdcorrect.state import Trajectory
 
@@ -238,16 +243,18 @@ def _of_the_models(comparison: Comparison) -> list[str]:
     for row in comparison.rows:
         if not row.refused_frames:
             continue
-        counted, meaning = refused_corrections(comparison.runs[row.label].stats)
+        stats, about = comparison.runs[row.label].stats, comparison.models[row.label]
+        counted, meaning = refused_corrections(stats)
         found.append(f"{row.label}: {counted}")
         if row.refused_frames == len(comparison.runs[row.label]):
-            base = comparison.models[row.label]["base"]
+            base = about["base"]
             found.append(
                 f"{row.label} is no corrected run: with all corrections refused its steps are "
                 f"those of the coarse model that it would correct ({base!r}), to the last bit, "
                 "and take longer."
             )
-        found.append(f"{row.label}: {meaning[0].lower()}{meaning[1:]}")
+        step = refused_step(stats, comparison.scene.time.step, about["trained_step"])
+        found += [f"{row.label}: {one[0].lower()}{one[1:]}" for one in (meaning, step) if one]
     return found
 
 

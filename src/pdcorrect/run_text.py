@@ -18,6 +18,7 @@ _MEANINGS = {
     "body": "the body at rest is unlike those of its training",
     "pause": "it would have passed, too soon after one that did not",
     "folded": "a cell is folded at a corner",
+    "time step": "the time step is unlike that of its training",
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
 
@@ -69,6 +70,25 @@ def refused_corrections(stats: Mapping[str, Any]) -> list[str]:
         f"{refused} of {frames} corrections were refused by the gate ({reasons}).",
         f"Of its refusals, {meaning}.",
     ]
+
+
+def refused_step(stats: Mapping[str, Any], step: float, trained: str) -> str | None:
+    """How a time step that a hybrid's gate refused differs from its training's; None if it was not.
+
+    Parameters
+    ----------
+    stats : mapping of str to (T,) arrays
+        With ``gate``.
+    step : float
+        s.
+    trained : str
+        The range of the training, with its unit.
+    """
+    from pdcorrect.corrector.gate import Reason
+
+    if not (np.asarray(stats["gate"]) == Reason.TIME_STEP).any():
+        return None
+    return f"The time step is {step:g} s, that of the training {trained}."
 
 
 def foreign_integrator(found: str, trained: str, name: str) -> str | None:

@@ -221,15 +221,18 @@ def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
     from pdcorrect.corrector.gate import Reason
     from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.run_text import refused_corrections
+    from pdcorrect.run_text import refused_corrections, refused_step
 
     every = bool(stats["refused"].all())
     if not every:
         say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
     for sentence in refused_corrections(stats):
         say(sentence)
-    if isinstance(stepper, HybridStepper) and (stats["gate"] == Reason.BODY).any():
-        say(_refused_measures(stepper))
+    if isinstance(stepper, HybridStepper):
+        if (stats["gate"] == Reason.BODY).any():
+            say(_refused_measures(stepper))
+        step, trained = stepper.problem.time_step, stepper.origin["trained_step"]
+        say(refused_step(stats, step, trained) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
 

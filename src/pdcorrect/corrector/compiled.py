@@ -102,6 +102,12 @@ class CompiledCorrector:
         low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
         return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
 
+    def step_excess(self, bodies: BodyGraph) -> Array:
+        """See `Corrector.step_excess`."""
+        normaliser = self._corrector.normaliser
+        low, high = normaliser.step_low.numpy(), normaliser.step_high.numpy()
+        return np.array([largest_excess(np.log(bodies.time_step.numpy()), low, high)])
+
     def _follow(self) -> None:
         if self._contents.changed:
             self.refresh()

@@ -46,6 +46,9 @@ class Answers(Protocol):
     def shape_excess(self, bodies: BodyGraph) -> Values:
         """How far measures of each body at rest lie outside their range in training, (B,)."""
 
+    def step_excess(self, bodies: BodyGraph) -> Values:
+        """How far the logarithm of each time step lies outside its range in training, (B,)."""
+
 
 class Corrector(nn.Module):
     """Displacements (n, 3), m, that are to be added to a coarse step.
@@ -133,6 +136,10 @@ class Corrector(nn.Module):
         The largest of all, dimensionless, see `shape_measures`; most are logarithms.
         """
         return self.normaliser.shape_excess(bodies.shapes).amax(dim=1)
+
+    def step_excess(self, bodies: BodyGraph) -> Tensor:
+        """How far the logarithm of each body's time step lies outside its range, (B,)."""
+        return self.normaliser.step_excess(bodies.time_step.log())
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

@@ -83,8 +83,8 @@ class Decision:
     ----------
     bodies : Bodies
     asked : (n, 3)
-        What the network gave, m; zero where that is not finite, or the body or its inputs are
-        unknown.
+        What the network gave, m; zero where that is not finite, or the body, its time step or
+        its inputs are unknown.
     reasons : (B,) int64
         Numbers of `Reason`.
     factors : (B,)
@@ -100,14 +100,14 @@ class Decision:
     def of(
         cls, step: CoarseStep[Answer], view: View, corrector: Answers, gate: Gate | None
     ) -> Decision:
-        """Ask the network, if a gate lets it see one of the bodies."""
+        """Ask the network, if a gate lets it see one of the scenes."""
         bodies, factors = step.bodies, filled(step.bodies.cell_size, 1.0)
-        foreign: Values = False
+        foreign: Values = int(Reason.NONE)
         if gate is not None:
             foreign = step.own(gate.foreign(corrector, view.bodies))
             if foreign.all():
                 nothing = filled(step.own(view.snapshot.proposed), 0.0)
-                return cls(bodies, nothing, where(foreign, int(Reason.BODY), 0), factors)
+                return cls(bodies, nothing, foreign, factors)
         asked = step.own(corrector.of_view(view))
         reasons = where(bodies.sound(asked), int(Reason.NONE), int(Reason.NOT_FINITE))
         if gate is not None:
@@ -115,7 +115,7 @@ class Decision:
             reasons = where(unknown, int(Reason.FEATURES), reasons)
             folded = step.own(gate.folded(corrector, view)) & (reasons == 0)
             reasons = where(folded, int(Reason.FOLDED), reasons)
-            reasons = where(foreign, int(Reason.BODY), reasons)
+            reasons = where(foreign > 0, foreign, reasons)
         asked = where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
         return cls(bodies, asked, reasons, factors)
 

@@ -30,7 +30,7 @@ class Reason(IntEnum):
     (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
     body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
     soon after a step that did not (`Gate.pause`).  FOLDED: the network sees a folded body
-    (`Gate.corners`).
+    (`Gate.corners`).  TIME_STEP: it is unlike that of the training (`Gate.step`).
     """
 
     NONE = 0
@@ -42,6 +42,11 @@ class Reason(IntEnum):
     BODY = 6
     PAUSE = 7
     FOLDED = 8
+    TIME_STEP = 9
+
+
+_ROUNDING = 1e-6
+"""Of logarithms of time steps, of which some are in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +73,11 @@ class Measured:
 class Gate(Strict):
     """When a correction is refused; None switches a test off.
 
-    The body at rest is tested first: one that is refused is so in every step, and where all are
-    the network is not asked.  Its inputs are tested before any placement.  Volumes and energy are
-    tested on corrected answers (placement "state") and on those under corrected loads ("force"),
-    against the plain coarse answer of the same step; where only the first iterate is corrected
-    ("guess"), the answer is the coarse solver's anyway.
+    The body at rest is tested first, and the time step: a scene that is refused by them is so in
+    every step, and where all are the network is not asked.  Its inputs are tested before any
+    placement.  Volumes and energy are tested on corrected answers (placement "state") and on those
+    under corrected loads ("force"), against the plain coarse answer of the same step; where only
+    the first iterate is corrected ("guess"), the answer is the coarse solver's anyway.
 
     To save the plain step, an answer under corrected loads is first held against the state
     before the step: if no cell fails by ``volume`` and ``crushing`` beside what it was, and
@@ -86,6 +91,9 @@ class Gate(Strict):
         surface or supports at rest (`pdcorrect.corrector.shapes.shape_measures`) lies farther than
         this outside its range in training.  Most are logarithms: 0.3 is a factor of 1.35.  Ranges
         are separate: what is unlike by a combination of them, or by where a body branches, passes.
+    step
+        Refused in all steps if the logarithm of the time step lies farther than this outside its
+        range in training: 0.1 is a factor of 1.1.
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data, of which
@@ -130,6 +138,7 @@ class Gate(Strict):
     """
 
     body: NonNegative | None = 0.3
+    step: NonNegative | None = 0.1
     margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     average: NonNegative | None = 4.5
@@ -141,10 +150,19 @@ class Gate(Strict):
     pause: Annotated[int, Field(strict=True, ge=0)] = 5
 
     def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
-        """Whether bodies at rest are too unlike those of its training, (B,) bool."""
-        if self.body is None:
-            return torch.zeros_like(bodies.cell_size, dtype=torch.bool)
-        return corrector.shape_excess(bodies) > self.body
+        """Why scenes are refused in all steps, by their bodies at rest or time steps.
+
+        Numbers (B,) of `Reason`, 0 where they are not; that of the body where both are unlike those
+        of the training.
+        """
+        reasons: Values = torch.zeros_like(bodies.cell_size, dtype=torch.int64)
+        if self.step is not None:
+            beyond = corrector.step_excess(bodies) > self.step + _ROUNDING
+            reasons = where(beyond, int(Reason.TIME_STEP), reasons)
+        if self.body is not None:
+            beyond = corrector.shape_excess(bodies) > self.body
+            reasons = where(beyond, int(Reason.BODY), reasons)
+        return reasons
 
     def unknown(self, corrector: Answers, view: View) -> Values:
         """Whether the network's inputs are too far from its training data, (B,) bool, or False."""
@@ -192,7 +210,9 @@ class Gate(Strict):
         left : (B,), optional
             For how many it was to stay shut before the step; by default it was open.
         """
-        again = (reasons != Reason.NONE) & (reasons != Reason.PAUSE) & (reasons != Reason.BODY)
+        again = reasons != Reason.NONE
+        for lasting in (Reason.PAUSE, Reason.BODY, Reason.TIME_STEP):
+            again = again & (reasons != lasting)
         return where(again, self.pause, 0 if left is None else (left - 1).clip(min=0))
 
     @property

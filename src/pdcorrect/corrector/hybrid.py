@@ -159,6 +159,13 @@ class HybridStepper:
         found = self.corrector.normaliser.shape_excess(self.bodies.shapes)[0].tolist()
         return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > _ROUNDING}
 
+    def step_excess(self) -> float:
+        """How far the logarithm of the time step lies outside its range in training, at least 0.
+
+        A gate refuses all steps if it is more than its bound `Gate.step`.
+        """
+        return float(self.corrector.step_excess(self.bodies))
+
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""
         restore = getattr(self.coarse, "restore", None)

@@ -45,7 +45,7 @@ from torch import Tensor  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 
 FORMAT = "pdcorrect-model"
-VERSION = 3
+VERSION = 4
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 BACKWARD_EULER = "backward-euler"
@@ -83,7 +83,7 @@ class _Description(Strict):
     """``model.json`` without its checksum."""
 
     format: Literal["pdcorrect-model"] = "pdcorrect-model"
-    version: Literal[3] = 3
+    version: Literal[4] = 4
     architecture: CorrectorConfig
     parameters: int
     dtype: Literal["float32"] = "float32"

@@ -114,6 +114,9 @@ class Normaliser(nn.Module):
     shape_low, shape_high : (10,) tensors
         Range of the measures of training bodies at rest, see `shape_measures`; not numbers before
         `fit_shapes`.
+    step_low, step_high : (1,) tensors
+        Range of the logarithm of the training data's time step over 1 s; not a number before
+        `fit_steps`.
     fitted : bool
         Whether it has seen data.
     """
@@ -125,6 +128,8 @@ class Normaliser(nn.Module):
     average_deviation: Tensor
     shape_low: Tensor
     shape_high: Tensor
+    step_low: Tensor
+    step_high: Tensor
 
     def __init__(self, nodes: Mapping[str, int], edges: Mapping[str, int]) -> None:
         super().__init__()
@@ -136,13 +141,19 @@ class Normaliser(nn.Module):
         for part in _PARTS:
             unknown = torch.full((sum(nodes.values()),), torch.nan, dtype=torch.float64)
             self.register_buffer(f"average_{part}", unknown)
-        for part in ("low", "high"):
-            unknown = torch.full((len(SHAPE_MEASURES),), torch.nan, dtype=torch.float64)
-            self.register_buffer(f"shape_{part}", unknown)
+        for name, k in (("shape", len(SHAPE_MEASURES)), ("step", 1)):
+            for part in ("low", "high"):
+                unknown = torch.full((k,), torch.nan, dtype=torch.float64)
+                self.register_buffer(f"{name}_{part}", unknown)
 
     @property
     def fitted(self) -> bool:
         return bool(self.output_scale > 0)
+
+    @property
+    def time_steps(self) -> tuple[float, float]:
+        """Least and largest time step of the training data, s."""
+        return float(self.step_low.exp()), float(self.step_high.exp())
 
     def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
         """Take over the moments of features, and of targets (m, 1).
@@ -183,6 +194,11 @@ class Normaliser(nn.Module):
         self.shape_low.copy_(shapes.low)
         self.shape_high.copy_(shapes.high)
 
+    def fit_steps(self, steps: Moments) -> None:
+        """Take over the range of logarithms of time steps (m, 1)."""
+        self.step_low.copy_(steps.low)
+        self.step_high.copy_(steps.high)
+
     def widen(self, features: Mapping[str, Moments]) -> None:
         """Widen the ranges by those of further values; means and deviations do not change."""
         for name in self.names:
@@ -195,6 +211,10 @@ class Normaliser(nn.Module):
     def widen_shapes(self, shapes: Moments) -> None:
         """Widen the range of bodies' measures at rest (m, 10); as of `widen`."""
         self._widen("shape_", shapes)
+
+    def widen_steps(self, steps: Moments) -> None:
+        """Widen the range of logarithms of time steps (m, 1); as of `widen`."""
+        self._widen("step_", steps)
 
     def _widen(self, prefix: str, moments: Moments) -> None:
         for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
@@ -236,8 +256,18 @@ class Normaliser(nn.Module):
 
         Infinite where it is not a number.
         """
-        low, high = self.shape_low.to(shapes), self.shape_high.to(shapes)
-        found = torch.maximum(low - shapes, shapes - high).clamp_min(0.0)
+        return self._beyond("shape_", shapes)
+
+    def step_excess(self, steps: Tensor) -> Tensor:
+        """How far logarithms of time steps (B,) lie outside their range in training, at least 0.
+
+        Infinite where it is not a number.
+        """
+        return self._beyond("step_", steps)
+
+    def _beyond(self, prefix: str, values: Tensor) -> Tensor:
+        low, high = (getattr(self, prefix + part).to(values) for part in ("low", "high"))
+        found = torch.maximum(low - values, values - high).clamp_min(0.0)
         return found.nan_to_num(nan=torch.inf, posinf=torch.inf)
 
     def scale(self, name: str) -> Scale:

@@ -122,6 +122,11 @@ class RecordedCorrector:
         """See `Corrector.shape_excess`."""
         return self._corrector.shape_excess(bodies)
 
+    @torch.no_grad()
+    def step_excess(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.step_excess`."""
+        return self._corrector.step_excess(bodies)
+
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""
         self._forget()

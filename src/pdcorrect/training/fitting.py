@@ -40,6 +40,7 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
     corrector.normaliser.fit_shapes(_shapes(windows))
+    corrector.normaliser.fit_steps(_steps(windows))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
@@ -52,6 +53,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     """
     every = np.arange(len(windows.dataset))
     corrector.normaliser.widen_shapes(_shapes(windows))
+    corrector.normaliser.widen_steps(_steps(windows))
     _widen(corrector, windows, _chosen(every, most, seed))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
@@ -114,6 +116,14 @@ def _shapes(windows: StepWindows) -> Moments:
     for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
         shapes.add(batch.bodies.shapes)
     return shapes
+
+
+def _steps(windows: StepWindows) -> Moments:
+    """Of the logarithms of all files' time steps (m, 1)."""
+    steps = torch.tensor([[h.time_step] for h in windows.dataset.headers], dtype=torch.float64)
+    moments = Moments()
+    moments.add(steps.log())
+    return moments
 
 
 def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:
