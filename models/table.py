@@ -12,6 +12,7 @@ setting: seeds, numbers of bodies, the plain base.
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import statistics
@@ -47,12 +48,15 @@ RESULTS = ROOT / "validation" / "results"
 
 
 def main() -> None:
-    """Print them."""
-    every = (
-        table, splits_table, others_table, bodies_table, steps_table, baselines_table,
-        together_table, trainings_table,
-    )  # fmt: skip
-    print("\n\n".join(make() for make in every))
+    """Print them, each below what it shows."""
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
+    every = {
+        "Models on unseen meshes": table, "Further splits as a whole": splits_table,
+        "First loads": others_table, "Other bodies": bodies_table, "Single steps": steps_table,
+        "Without a network": baselines_table, "One model for three motions": together_table,
+        "Other trainings": trainings_table,
+    }  # fmt: skip
+    print("\n\n".join(f"**{caption}**\n\n{make()}" for caption, make in every.items()))
 
 
 def table() -> str:
