@@ -28,6 +28,16 @@ class Prescribed(Corrector):
         return torch.where(view.bodies.free, found, 0.0)
 
 
+class Watched(Corrector):
+    """Counts how often it is asked."""
+
+    calls = 0
+
+    def of_view(self, view, network=None):
+        self.calls += 1
+        return super().of_view(view, network)
+
+
 def soft_beam(cells=(3, 1, 1), **changes):
     """Small, and it moves a good part of its cells."""
     return beam(cells, material={"young": 5e4}, **changes)

@@ -248,6 +248,19 @@ def test_some_refused_corrections_are_counted_beside_the_label(stiff):
     assert report.table(none)[0][0] == label
 
 
+def test_another_time_step_is_told_beside_that_of_the_training(stiff):
+    pytest.importorskip("torch_geometric")
+    scene = stiff.with_changes(time={"step": 2.0 * stiff.time.step})
+    found = pc.compare(scene, 2, cases=cases_for(scene, [MODEL])[4:])
+    label = f"hybrid {MODEL}"
+    told = report.notes(found)
+    assert f"{label}: 2 of 2 corrections were refused by the gate (2 by time step)." in told
+    assert any(note.startswith(f"{label} is no corrected run") for note in told)
+    assert f"{label}: the time step is 0.02 s, that of the training 0.01 s." in told
+    assert not any("that of the training" in n for n in report.notes(pc.compare(
+        stiff, 1, cases=cases_for(stiff, [MODEL])[4:])))  # fmt: skip
+
+
 def test_every_reason_of_a_gate_has_a_meaning():
     gate = pytest.importorskip("pdcorrect.corrector.gate")
     assert list(run_text._MEANINGS) == list(gate.refusals([]))

@@ -1042,9 +1042,9 @@ def test_a_corrected_step_carries_the_volume_ratios_of_its_own_state():
 
 
 def test_refusals_are_counted_by_reason():
-    assert refusals(np.array([0.0, 1.0, 3.0, 3.0, 0.0])) == {
+    assert refusals(np.array([0.0, 1.0, 3.0, 3.0, 9.0])) == {
         "not finite": 1, "features": 0, "inversion": 2, "energy": 0, "solver": 0, "body": 0,
-        "pause": 0, "folded": 0,
+        "pause": 0, "folded": 0, "time step": 1,
     }  # fmt: skip
 
 

@@ -303,6 +303,8 @@ def with_value(value):
         (put(MEAN, lambda b: b.float()), "strain__mean has type torch.float32"),
         (put(LAST, with_value(torch.nan)), "decoder.2.bias has values that are infinite or not"),
         (put(LAST, with_value(-torch.inf)), "decoder.2.bias has values that are infinite or not"),
+        (drop("normaliser.step_low"), "missing tensor normaliser.step_low"),
+        (put("normaliser.step_high", with_value(torch.nan)), "step_high has values that are inf"),
         (put(MEAN, with_value(torch.nan)), "strain__mean has values that are infinite or not"),
         (put("normaliser.strain__deviation", with_value(0.0)), "deviation .*not positive"),
         (put(SCALE, with_value(0.0)), "has not been fitted"),
@@ -380,12 +382,12 @@ def test_numbers_that_are_not_finite_are_refused(model):
 
 
 def test_other_versions_are_told_from_damage(model):
-    rewrite_json(model, put_json("version", value=4), seal=False)
-    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 4: expected 3.*newer"):
+    rewrite_json(model, put_json("version", value=5), seal=False)
+    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 5: expected 4.*newer"):
         load_model(model)
-    for old in (1, 2):
+    for old in (1, 2, 3):
         rewrite_json(model, put_json("version", value=old))
-        with pytest.raises(FileVersionError, match=f"format version {old}: expected 3"):
+        with pytest.raises(FileVersionError, match=f"version {old}: expected 4: .* docs/files.md"):
             load_model(model)
 
 

@@ -466,6 +466,27 @@ def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folde
     assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
 
 
+def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector, step = samples.fitted(folder, settings), windows.dataset.headers[0].time_step
+    normaliser = corrector.normaliser
+    normaliser.step_low.fill_(torch.nan)
+    fit_normaliser(corrector, windows, 1)
+    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-14)
+    bodies = windows.batch([0]).bodies
+    assert bodies.time_step.tolist() == pytest.approx([step], rel=1e-7)
+    for shift in (np.log(2.0), -np.log(2.0)):  # as of data with another step
+        normaliser.step_low += shift
+        normaliser.step_high += shift
+        assert corrector.step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
+        both = sorted((step, step * np.exp(shift)))
+        widen_ranges(corrector, windows, 1)
+        assert normaliser.time_steps == pytest.approx(both, rel=1e-12)
+        fit_normaliser(corrector, windows, 1)
+        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-14)
+
+
 def test_stored_bodies_have_the_measures_of_those_that_are_drawn():
     """What a training fits to is what `models/fit_shapes.py` fitted to without data."""
     home = Path(__file__).parents[1]
@@ -1274,6 +1295,8 @@ def test_the_ranges_of_a_start_grow_by_the_new_data(short, earlier, tmp_path):
 def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(short, earlier, tmp_path):
     model = load_model(earlier)
     model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
+    model.corrector.normaliser.step_low += 1.0  # and of a longer time step
+    model.corrector.normaliser.step_high += 1.0
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = {}
     for widen in (True, False):
@@ -1286,6 +1309,8 @@ def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(short, e
     for name, known in model.corrector.normaliser.named_buffers():
         assert torch.equal(found[False].normaliser.get_buffer(name), known), name
     assert (found[True].normaliser.shape_high > model.corrector.normaliser.shape_high).all()
+    least, most = model.corrector.normaliser.time_steps
+    assert found[True].normaliser.time_steps == pytest.approx((least / np.e, most))
     assert torch.equal(weights(found[True]), weights(found[False]))
     assert not torch.equal(weights(found[True]), weights(model.corrector))
 

@@ -70,14 +70,15 @@ def test_each_script_has_its_row_in_the_list():
         assert (f"`{path.name}`" in told) == is_program, path.name
 
 
-def as_version_2(folder):
-    """A model as it was before there were ranges of bodies at rest."""
+def as_version(version, folder):
+    """A model as it was before there were ranges of time steps (3), and of bodies at rest (2)."""
     description = json.loads((folder / "model.json").read_text())
+    new = (".shape_", ".step_")[version - 2 :]
     weights = {k: x for k, x in load_file(folder / "weights.safetensors").items()
-               if ".shape_" not in k}  # fmt: skip
+               if not any(part in k for part in new)}  # fmt: skip
     save_file(weights, folder / "weights.safetensors")
     digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
-    changed = {**description, "version": 2, "weights_sha256": digest}
+    changed = {**description, "version": version, "weights_sha256": digest}
     (folder / "model.json").write_text(json.dumps(changed))
 
 
@@ -85,7 +86,7 @@ def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path
     folder, config = tmp_path / "tiny", ROOT / "datasets" / "tiny" / "config.toml"
     shutil.copytree(ROOT / "models" / "tiny", folder)
     before = pc.load_model(folder)
-    as_version_2(folder)
+    as_version(2, folder)
     with pytest.raises(pc.errors.FileVersionError, match="version 2"):
         pc.load_model(folder)
     command = [sys.executable, ROOT / "models" / "fit_shapes.py", folder, config]
@@ -94,7 +95,7 @@ def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path
     values = before.corrector.state_dict()
     for name, tensor in after.corrector.state_dict().items():
         assert torch.equal(tensor, values[name]), name
-    as_version_2(folder)
+    as_version(2, folder)
     (folder / "weights.safetensors").write_bytes(b"")
     damaged = subprocess.run(command, capture_output=True, text=True)
     assert damaged.returncode == 1
@@ -102,6 +103,48 @@ def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path
     told = after.record.training["shapes"]
     assert (told["dataset"], told["meshes"]) == ("tiny", 6)
     assert 0.0 < told["left_out"] < 1.0
+    assert after.record.training["time_steps"] == {"tiny": 0.01}
+
+
+def test_a_model_learns_the_time_steps_of_its_data_and_keeps_its_weights_to_the_last_bit(tmp_path):
+    folder, config = tmp_path / "tiny", ROOT / "datasets" / "tiny" / "config.toml"
+    shutil.copytree(ROOT / "models" / "tiny", folder)
+    new = load_file(folder / "weights.safetensors")
+    as_version(3, folder)
+    old = load_file(folder / "weights.safetensors")
+    assert set(new) - set(old) == {"normaliser.step_low", "normaliser.step_high"}
+    with pytest.raises(pc.errors.FileVersionError, match=r"version 3: expected 4.*docs/files.md"):
+        pc.load_model(folder)
+
+    def fitted(*configs, command="fit_steps.py", **options):
+        command = [sys.executable, ROOT / "models" / command, folder, *configs]
+        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+    assert fitted(config).returncode == 0
+    model = pc.load_model(folder)
+    assert model.record.training["time_steps"] == {"tiny": 0.01}
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.01, 0.01), rel=1e-12)
+    other = tmp_path / "other.toml"
+    changed = config.read_text().replace('name = "tiny"', 'name = "other"')
+    other.write_text(changed.replace("step = 0.01", "step = 0.025"))
+    assert fitted(config, other).returncode == 0  # of version 4: anew
+    model = pc.load_model(folder)
+    assert model.record.training["time_steps"] == {"tiny": 0.01, "other": 0.025}
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.01, 0.025), rel=1e-12)
+    assert fitted(config).returncode == 0
+    found = load_file(folder / "weights.safetensors")
+    assert found.keys() == new.keys()
+    for name, tensor in found.items():
+        assert tensor.numpy().tobytes() == new[name].numpy().tobytes(), name
+    as_version(2, folder)
+    refused = fitted(config)
+    assert refused.returncode == 1
+    assert "format version 2: fit_shapes.py fits this range, too" in refused.stderr
+    as_version(3, folder)
+    (folder / "weights.safetensors").write_bytes(b"")
+    damaged = fitted(config)
+    assert damaged.returncode == 1
+    assert "damaged" in damaged.stderr
 
 
 def test_a_body_left_out_lies_outside_the_others_by_its_distance_from_the_next(monkeypatch):

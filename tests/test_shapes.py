@@ -8,7 +8,7 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on, rotation
-from hybrid_samples import PLACEMENTS, TORSION, fitted, problems, soft_beam
+from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, soft_beam
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import preset
@@ -194,16 +194,6 @@ def test_ranges_are_part_of_a_corrector_s_values():
 # --- the gate ----------------------------------------------------------------------------------
 
 
-class Watched(Corrector):
-    """Counts how often it is asked."""
-
-    calls = 0
-
-    def of_view(self, view, network=None):
-        self.calls += 1
-        return super().of_view(view, network)
-
-
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_foreign_body_keeps_all_its_coarse_steps_and_its_network_is_not_asked(placement):
     known = problems((3, 1, 1))
@@ -290,7 +280,7 @@ def test_a_known_shape_on_unknown_supports_is_refused(kind):
     corrector = ranged(*(pc.discretise(soft_beam((n, 1, 1))) for n in (6, 12)))
     assert max(excess(corrector, pc.discretise(soft_beam((8, 1, 1))))) < 1e-12
     body = BodyGraph.of([unlike_supports()[kind]], 0.01, dtype=torch.float64)
-    assert Gate().foreign(corrector, body).tolist() == [True]
+    assert Gate().foreign(corrector, body).tolist() == [Reason.BODY]
 
 
 def test_how_foreign_a_body_may_be_is_an_argument():

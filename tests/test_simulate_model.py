@@ -216,3 +216,37 @@ def test_a_run_whose_corrections_are_refused_says_so_and_why(
     best = pc.discretise(pc.best_coarse(pc.Scene.load(scene_file)))
     np.testing.assert_array_equal(run.positions, pc.rollout(pc.ProjectiveDynamics(best)).positions)
     assert json.loads(run.attributes["gate"])["body"] == 0.3
+
+
+@pytest.mark.parametrize("step", [0.02, 0.005])
+def test_a_run_of_another_time_step_is_the_base_s_and_says_of_which_the_training_was(
+    program, learned, tmp_path, step
+):
+    scene = pc.Scene.load(SCENE).with_changes(time={"step": step, "frames": 2})
+    (tmp_path / "s.toml").write_text(scene.to_toml(), encoding="utf-8")
+    path = tmp_path / "run.h5"
+    status, out, _ = program("simulate", tmp_path / "s.toml", "-o", path, "--model", MODEL)
+    assert status == 0
+    assert "2 of 2 corrections were refused by the gate (2 by time step)" in out
+    assert "'time step': the time step is unlike that of its training" in out
+    assert f"The time step is {step:g} s, that of the training 0.01 s." in out
+    assert "Outside the range of the training bodies" not in out
+    assert "This is no corrected run" in out
+    run = pc.load_trajectory(path)
+    assert run.attributes["trained_step"] == "0.01 s"
+    best = pc.ProjectiveDynamics(pc.coarse_model(scene, "best"))
+    np.testing.assert_array_equal(run.positions, pc.rollout(best).positions)
+
+
+def test_of_a_model_of_several_time_steps_the_least_and_the_largest_are_told(learned, tmp_path):
+    import torch
+
+    from pdcorrect.corrector.normaliser import Moments
+
+    model, steps = pc.load_model(MODEL), Moments()
+    steps.add(torch.tensor([[0.02], [0.005], [0.01]], dtype=torch.float64).log())
+    model.corrector.normaliser.fit_steps(steps)
+    pc.save_model(model.corrector, tmp_path / "several", record=model.record)
+    hybrid = pc.hybrid_of(pc.Scene.load(SCENE), tmp_path / "several")
+    assert hybrid.origin["trained_step"] == "0.005 to 0.02 s"
+    assert hybrid.step_excess() == 0.0

@@ -22,14 +22,15 @@ SPLITS = ("evaluation", "stronger", "stiffer", "softer", "compressible", "half-s
           "double-step", "long")  # fmt: skip
 GATES: dict[str, dict[str, float | None] | None] = {
     "none": None,
-    "margin 3": {"margin": 3.0, "average": None, "body": None},
-    "margin 1": {"average": None, "body": None},
-    "margin 0.3": {"margin": 0.3, "average": None, "body": None},
-    "average": {"margin": None, "body": None},
-    "body": {"margin": None, "average": None},
+    "margin 3": {"margin": 3.0, "average": None, "body": None, "step": None},
+    "margin 1": {"average": None, "body": None, "step": None},
+    "margin 0.3": {"margin": 0.3, "average": None, "body": None, "step": None},
+    "average": {"margin": None, "body": None, "step": None},
+    "body": {"margin": None, "average": None, "step": None},
+    "step": {"margin": None, "average": None, "body": None},
     "default": {},
 }
-"""Changes of the default gate, in deviations; None: no gate."""
+"""Changes of the default gate; None: no gate."""
 HARM = 1.05
 """Times the coarse model's RMS error: what is more counts as harm."""
 

@@ -1,0 +1,232 @@
+"""`Gate.step`: a gate that knows the time step of the training."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import pdcorrect as pc
+from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, soft_beam
+from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.config import preset
+from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.gate import Gate, Reason, refusals
+from pdcorrect.corrector.hybrid import HybridStepper
+from pdcorrect.corrector.normaliser import Moments, Normaliser
+
+H = 0.01
+"""Time step of the training, s."""
+ONLY_STEPS = Gate(
+    body=None, margin=None, average=None, volume=None, crushing=None, energy=None, pause=0
+)
+
+
+def logarithms(*steps):
+    """Of time steps, s, as a normaliser takes them."""
+    found = Moments()
+    found.add(torch.tensor(steps, dtype=torch.float64).log()[:, None])
+    return found
+
+
+def ranged(*steps):
+    """A corrector that knows some time steps, otherwise without values."""
+    corrector = Corrector(preset("compact", layers=1, width=8))
+    corrector.normaliser.fit_steps(logarithms(*steps))
+    return corrector
+
+
+def graph(*steps, dtype=torch.float64):
+    """A beam for each time step."""
+    bodies = BodyGraph.of([pc.discretise(soft_beam()) for _ in steps], H, dtype=dtype)
+    return replace(bodies, time_step=torch.tensor(steps, dtype=dtype))
+
+
+def stepped(factor, cells=(3, 1, 1)):
+    """The twisted beam with another time step."""
+    return pc.discretise(soft_beam(cells, loads=[TORSION], time={"step": factor * H, "frames": 4}))
+
+
+# --- the range ---------------------------------------------------------------------------------
+
+
+def test_time_steps_lie_outside_their_range_by_the_logarithm_of_a_factor():
+    found = ranged(0.02, 0.005, 0.01).step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
+    expected = [np.log(5 / 4), 0.0, 0.0, 0.0, np.log(3 / 2)]
+    assert found.tolist() == pytest.approx(expected, abs=1e-12)
+
+
+def test_no_time_step_is_known_before_data_were_seen_nor_is_what_is_no_number():
+    corrector = Corrector(preset("compact", layers=1, width=8))
+    assert corrector.step_excess(graph(H)).tolist() == [np.inf]
+    assert Gate(body=None, step=1e6).foreign(corrector, graph(H)).tolist() == [Reason.TIME_STEP]
+    known = ranged(H)
+    assert known.step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
+    assert np.isnan(corrector.normaliser.time_steps).all()
+
+
+def test_time_steps_of_further_data_are_as_known_as_those_of_the_first():
+    corrector = ranged(H)
+    corrector.normaliser.widen_steps(logarithms(0.5 * H))
+    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H, H))
+    corrector.normaliser.widen_steps(logarithms(0.7 * H, 3.0 * H))
+    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H, 3.0 * H))
+    found = corrector.step_excess(graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H))
+    assert found.tolist() == pytest.approx([np.log(2), 0.0, 0.0, np.log(2)], abs=1e-12)
+
+
+def test_a_fit_takes_the_place_of_what_was_known():
+    corrector = ranged(0.1 * H, 10.0 * H)
+    corrector.normaliser.fit_steps(logarithms(H))
+    assert corrector.normaliser.time_steps == pytest.approx((H, H))
+
+
+def test_the_range_is_part_of_a_corrector_s_values():
+    state = ranged(H, 2.0 * H).state_dict()
+    assert state["normaliser.step_low"].tolist() == pytest.approx([np.log(H)])
+    assert state["normaliser.step_high"].tolist() == pytest.approx([np.log(2.0 * H)])
+    empty = Normaliser({"a": 1}, {}).state_dict()
+    assert empty["step_low"].isnan().tolist() == empty["step_high"].isnan().tolist() == [True]
+
+
+# --- the gate ----------------------------------------------------------------------------------
+
+
+def test_the_default_bound_is_a_factor_of_1_1_both_ways():
+    gate, corrector = Gate(body=None), ranged(H)
+    factors = np.array([0.5, 1 / 1.11, 1 / 1.1, 1.0, 1.1, 1.11, 2.0])
+    found = gate.foreign(corrector, graph(*(factors * H)))
+    t = int(Reason.TIME_STEP)
+    assert found.tolist() == [t, t, 0, 0, 0, t, t]
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("step", [0.01, 0.003, 1 / 60, 0.007])
+def test_the_very_time_step_of_the_training_passes_the_narrowest_bound(step, dtype):
+    gate, corrector = Gate(body=None, step=0.0), ranged(step)
+    assert gate.foreign(corrector, graph(*[step] * 9, dtype=dtype)).tolist() == [0] * 9
+    assert gate.foreign(corrector, graph(1.0001 * step, dtype=dtype)).tolist() == [Reason.TIME_STEP]
+
+
+@pytest.mark.parametrize("value", [-0.1, "0.1", float("nan"), True])
+def test_a_bound_that_is_no_number_from_0_on_is_refused(value):
+    with pytest.raises(ValueError, match="step"):
+        Gate(step=value)
+
+
+def test_a_body_counts_before_its_time_step():
+    known, strange = problems((3, 1, 1), (6, 2, 2))
+    bodies = BodyGraph.of([known, known, strange, strange], H, dtype=torch.float64)
+    bodies = replace(bodies, time_step=bodies.time_step * torch.tensor([1.0, 2.0, 1.0, 2.0]))
+    corrector = fitted([known])
+    for body, step, expected in (
+        (0.3, 0.1, [0, Reason.TIME_STEP, Reason.BODY, Reason.BODY]),
+        (None, 0.1, [0, Reason.TIME_STEP, 0, Reason.TIME_STEP]),
+        (0.3, None, [0, 0, Reason.BODY, Reason.BODY]),
+        (None, None, [0, 0, 0, 0]),
+    ):
+        assert Gate(body=body, step=step).foreign(corrector, bodies).tolist() == expected
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(factor, placement):
+    problem = stepped(factor)
+    corrector = fitted(problems((3, 1, 1)), kind=Watched, placement=placement)
+    coarse = pc.ProjectiveDynamics(problem)
+    hybrid = HybridStepper(coarse, corrector, gate=Gate()).prepare()
+    run, plain = pc.rollout(hybrid, 4), pc.rollout(coarse, 4)
+    assert np.array_equal(run.positions, plain.positions)
+    assert np.array_equal(run.velocities, plain.velocities)
+    assert run.stats["gate"].tolist() == [Reason.TIME_STEP] * 4
+    assert run.stats["refused"].tolist() == [1.0] * 4
+    assert not run.stats["correction"].any()
+    assert corrector.calls == 0
+    assert not hybrid(problem.rest_state()).state.memory  # nothing to pause for
+    assert hybrid.step_excess() == pytest.approx(np.log(2.0))
+    counts = refusals(run.stats["gate"])
+    assert counts["time step"] == sum(counts.values()) == 4
+    open_ = HybridStepper(coarse, corrector, gate=ONLY_STEPS.model_copy(update={"step": None}))
+    found = open_(problem.rest_state())
+    assert corrector.calls == 1
+    assert found.stats["gate"] == 0.0 < found.stats["correction"]
+
+
+def test_it_is_the_stepper_s_time_step_that_counts_and_not_the_scene_s():
+    problem = stepped(1.0)
+    corrector = fitted(problems((3, 1, 1)))
+    for step, reason in ((H, 0), (2.0 * H, Reason.TIME_STEP)):
+        coarse = pc.ProjectiveDynamics(problem, time_step=step)
+        hybrid = HybridStepper(coarse, corrector, gate=ONLY_STEPS)
+        assert hybrid(problem.rest_state()).stats["gate"] == reason
+        stepper = pc.BatchStepper([problem], time_step=step)
+        many = BatchHybrid(stepper, corrector, gate=ONLY_STEPS)
+        assert many(stepper.rest_state()).reasons.tolist() == [reason]
+
+
+def test_compiled_answers_refuse_a_foreign_time_step_too():
+    hybrid = HybridStepper(
+        pc.ProjectiveDynamics(stepped(2.0)), fitted(problems((3, 1, 1))), gate=Gate()
+    )
+    assert hybrid.compiled
+    assert hybrid(hybrid.problem.rest_state()).stats["gate"] == Reason.TIME_STEP
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_batch_of_another_time_step_is_refused_as_a_whole_each_scene_by_its_reason(
+    factor, recorded
+):
+    known, strange = stepped(factor), stepped(factor, (6, 1, 1))
+    kind = Corrector if recorded else Watched
+    corrector = fitted(problems((3, 1, 1)), kind=kind)
+    stepper = pc.BatchStepper([known, strange])
+    state = stepper.rest_state()
+    hybrid = BatchHybrid(stepper, corrector, gate=Gate(), recorded=recorded)
+    result, plain = hybrid(state), stepper(state)
+    assert result.reasons.tolist() == [Reason.TIME_STEP, Reason.BODY]
+    assert torch.equal(result.state.positions, plain.state.positions)
+    assert not result.state.memory
+    assert not result.correction.any()
+    assert recorded or corrector.calls == 0
+    gate = ONLY_STEPS.model_copy(update={"body": 0.3, "step": None})
+    result = BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)(state)
+    assert result.reasons.tolist() == [0, Reason.BODY]
+    assert result.correction[: len(known.positions)].any()
+
+
+def test_of_several_time_steps_only_the_foreign_one_is_refused():
+    """Steppers have one for all scenes; graphs of bodies have one each."""
+    scenes = problems((3, 1, 1), (3, 1, 1))
+    corrector = fitted(scenes, kind=Watched)
+    stepper = pc.BatchStepper(scenes)
+    hybrid = BatchHybrid(stepper, corrector, gate=ONLY_STEPS)
+    nodes = hybrid._hybrid.nodes
+    nodes._graph = replace(nodes.graph, time_step=torch.tensor([2.0 * H, H], dtype=torch.float64))
+    result, plain = hybrid(stepper.rest_state()), stepper(stepper.rest_state())
+    assert result.reasons.tolist() == [Reason.TIME_STEP, 0]
+    assert corrector.calls == 1
+    assert torch.equal(result.state.positions[0], plain.state.positions[0])
+    assert not torch.equal(result.state.positions[1], plain.state.positions[1])
+
+
+def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_foreign():
+    scenes = problems((3, 1, 1), (3, 1, 1))
+    corrector = fitted(scenes)
+    corrector.of_view = lambda view: torch.full_like(view.bodies.rest, torch.nan)
+    stepper = pc.BatchStepper(scenes)
+    hybrid = BatchHybrid(stepper, corrector, gate=Gate())
+    nodes = hybrid._hybrid.nodes
+    nodes._graph = replace(nodes.graph, time_step=torch.tensor([H, 2.0 * H], dtype=torch.float64))
+    result = hybrid(stepper.rest_state())
+    assert result.reasons.tolist() == [Reason.NOT_FINITE, Reason.TIME_STEP]
+
+
+# --- released models ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["tiny", "torsion-exact", "all-as-published-total-mass"])
+def test_released_models_know_the_time_step_of_their_data(name):
+    model = pc.load_model(name)
+    assert model.corrector.normaliser.time_steps == pytest.approx((H, H), rel=1e-12)
