@@ -251,18 +251,32 @@ class Fitting(Strict):
         Whether a training that goes on with another model widens that one's ranges of known
         inputs and bodies to what it learns.  They are extremes, so the more there is to learn, the
         less a gate refuses.  Weights do not depend on it.
+    anew
+        Whether a training that goes on with another model takes over its weights only, and fits
+        the normalisation to what it learns itself.  That model may then correct another base:
+        inputs and corrections are alike in units of their own deviations.
     """
 
     windows: PositiveCount = 10_000
     widen: bool = True
+    anew: bool = False
 
     @model_serializer(mode="wrap")
     def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """``widen`` where it is not the default: configurations of before do not have it."""
+        """Choices that are not the default: configurations of before do not have them."""
         found: dict[str, Any] = dump(self)
-        if self.widen:
-            found.pop("widen", None)
+        for name in ("widen", "anew"):
+            if found.get(name) == type(self).model_fields[name].default:
+                found.pop(name)
         return found
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Fitting:
+        if self.anew and not self.widen:
+            raise ValueError(
+                "anew = true fits ranges anew, widen = false keeps them: expected one of both"
+            )
+        return self
 
 
 class TrainingConfig(TomlConfig):

@@ -34,15 +34,18 @@ def load_teachers(config: TrainingConfig, device: torch.device) -> dict[str, Cor
     return found
 
 
-def check_trained_alike(what: str, model: LoadedModel, config: TrainingConfig) -> None:
+def check_trained_alike(
+    what: str, model: LoadedModel, config: TrainingConfig, any_base: bool = False
+) -> None:
     """Refuse a model whose corrections are of another kind than those of a training.
 
     Raises
     ------
     InputError
-        If it corrects another base model, or its corrected states have other velocities.
+        If it corrects another base model, unless ``any_base`` is allowed, or its corrected states
+        have other velocities.
     """
-    for key in ("base", "velocity"):
+    for key in ("velocity",) if any_base else ("base", "velocity"):
         there, here = getattr(model, key), getattr(config, key)
         if there != here:
             raise InputError(f"{what}: its {key} is {there!r}: expected {here!r}, as here.")

@@ -84,8 +84,8 @@ class Training:
         If the folder holds a training and ``resume`` is not set, or it was another one; if
         files of the data sets are missing, or do not have what the configuration wants; if one
         has a validation split and another has none, or their settings or time steps differ; if the
-        model to start from is missing, or of another architecture, base or velocity; if a
-        teacher is.
+        model to start from is missing, or of another architecture, base (unless the normalisation
+        is fitted anew) or velocity; if a teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -294,22 +294,26 @@ class Training:
                 f"start_from = {self.config.start_from!r}: that model has {told}, unlike "
                 "corrector: expected the same there, in corrector.changes."
             )
-        check_trained_alike(f"start_from = {self.config.start_from!r}", model, self.config)
+        check_trained_alike(
+            f"start_from = {self.config.start_from!r}", model, self.config,
+            any_base=self.config.fitting.anew,
+        )  # fmt: skip
         return model
 
     def _new_corrector(self, start: LoadedModel | None, fit: bool) -> Corrector:
         config = self.config
         if start is not None:
             corrector = start.corrector.train()
-            if fit and config.fitting.widen:
-                widen_ranges(corrector, self._windows, config.fitting.windows, config.seed)
-                self.world.same(list(corrector.state_dict().values()))
-            return corrector
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            corrector = Corrector(config.architecture()).to(self.device)
+        else:
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(config.seed)
+                corrector = Corrector(config.architecture()).to(self.device)
         if fit:
-            fit_normaliser(corrector, self._windows, config.fitting.windows, config.seed)
+            windows, seed = config.fitting.windows, config.seed
+            if start is None or config.fitting.anew:
+                fit_normaliser(corrector, self._windows, windows, seed)
+            elif config.fitting.widen:
+                widen_ranges(corrector, self._windows, windows, seed)
             self.world.same(list(corrector.state_dict().values()))
         return corrector
 
