@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from table_rows import (
+    BEFORE,
     BODIES,
     BODY_HEADINGS,
     HARM,
@@ -35,7 +36,6 @@ from table_rows import (
     STEP_HEADINGS,
     TRAINING_HEADINGS,
     TRAININGS,
-    WITH_GATE_ONLY,
     WITHOUT_NETWORK,
     Row,
 )
@@ -72,7 +72,7 @@ def others_table() -> str:
         plans = make_plan(DatasetConfig.load(ROOT / "datasets" / dataset / "config.toml"))
         for split in OTHERS:
             path = RESULTS / "other-scenes" / f"{dataset}-{split}.json"
-            if path.exists():
+            if path.exists() and not (RESULTS / _split_record(dataset, split)).is_dir():
                 frames = next(plan.frames for plan in plans if plan.split == split)
                 record = json.loads(path.read_text(encoding="utf-8"))
                 lines.append(_line(_other_cells(record, dataset, split, frames)))
@@ -182,18 +182,26 @@ def _split_cells(model: str, split: str) -> list[str]:
     runs = _summary(record)["runs"]
     run = next(name for name, found in runs.items() if "gate_rate" in found["measures"])
     found, ratios = runs[run], []
-    for gate in ("", "-no-gate"):
-        if gate and f"{model}-{split}" in WITH_GATE_ONLY:
-            ratios.append("")
-            continue
-        each = _over(f"{record}{gate}", run, found["base"], "rms_error")
+    without = record if _lets_all_pass(found) else f"{record}-no-gate"
+    for one in (record, without):
+        each = _over(one, run, found["base"], "rms_error")
         ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
     omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))
     return [
-        f"`{model}`", split.replace("-", " "), f"{omega['count']}",
+        _weights(model, split), split.replace("-", " "), f"{omega['count']}",
         f"{found['measures']['gate_rate']['mean']:.0f}", _signed(f"{base['mean']:.1f}"),
         _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}"), *ratios,
     ]  # fmt: skip
+
+
+def _lets_all_pass(run: dict[str, Any]) -> bool:
+    """Whether a gate refused no step of any rollout, so that it is the run without one."""
+    return bool(run["measures"]["gate_rate"]["largest"] == 0.0)
+
+
+def _weights(model: str, split: str) -> str:
+    """The model, and whether the record is of other weights than it has now."""
+    return f"`{model}`" + (", weights before" if f"{model}-{split}" in BEFORE else "")
 
 
 def _baseline_cell(record: dict[str, Any], run: str) -> str:
@@ -255,7 +263,7 @@ def _other_cells(record: dict[str, Any], model: str, split: str, frames: int) ->
     omega, harm = record["omega"][model], record["error_over_base"][model]
     refused = sum(len(row["refused"]) for row in each) / (frames * len(each))
     return [
-        f"`{model}`", split.replace("-", " "), f"{len(each)}", f"{100 * refused:.0f}",
+        _weights(model, split), split.replace("-", " "), f"{len(each)}", f"{100 * refused:.0f}",
         _signed(f"{omega['own_base']['mean']:.1f}"),
         _signed(f"{omega['with_gate']['mean']:.1f}, {omega['with_gate']['least']:.1f}"),
         *("{median:.2f}, {largest:.2f}".format(**harm[x]) for x in ("with_gate", "without")),

@@ -54,8 +54,8 @@ OTHERS = (
     "half-refined", "long",
 )  # fmt: skip
 """Splits of the second and the third table, in their order."""
-WITH_GATE_ONLY = ("torsion-exact-other-family",)
-"""Records of the second table that were not computed without a gate, too."""
+BEFORE = ("torsion-exact-double-step", "torsion-exact-half-step")
+"""Records of the second and third table of which a model had other weights than it has now."""
 OTHER_HEADINGS = (
     "model", "split", "simulations", "steps refused, %", "base alone: Ω mean",
     "corrected: Ω mean, worst", "error over the base's: median, largest",
@@ -77,7 +77,7 @@ STEP_HEADINGS = (
 )  # fmt: skip
 
 PUBLISHED = ("impulse-as-published", "stretch-as-published", "torsion-as-published")
-MEASURED = (*PUBLISHED, "impulse-exact", "stretch-exact")
+MEASURED = (*PUBLISHED, "impulse-exact", "stretch-exact", "torsion-exact")
 """Data sets of the sixth table."""
 WITHOUT_NETWORK = {
     "consistent mass": "consistent mass",
@@ -112,13 +112,16 @@ TRAININGS = (
     ("torsion exact", "torsion-many", "best-200/model", "200 bodies, two thirds of the time"),
     ("torsion exact", "torsion-many", "best-100/model", "100 of them"),
     ("torsion exact", "torsion-many", "best-50/model", "50 of them"),
+    ("torsion exact", "torsion-exact-plain", "model", "plain base, from the released weights"),
     ("torsion exact", "torsion-many", "axes-unrolled/model", _AXES),
     ("impulse exact", "impulse-exact-third", "model", "released"),
     ("impulse exact", _IMPULSES, "through-further/model", "before its last part"),
     ("impulse exact", _IMPULSES, "models/impulse-exact", "before its last two"),
-    ("impulse exact", _IMPULSES, "plain/model", "plain base"),
+    ("impulse exact", "impulse-exact-plain", "model", "plain base, from the released weights"),
+    ("impulse exact", _IMPULSES, "plain/model", "plain base, six minutes"),
     ("stretch exact", _STRETCHES, "through-further/model", "released"),
     ("stretch exact", _STRETCHES, "models/stretch-exact", "before it was trained on"),
+    ("stretch exact", "stretch-exact-plain-further", "model", "plain base, 573 bodies, further"),
     ("stretch exact", "stretch-exact-plain", "model", "plain base, 573 bodies, a load each"),
     ("stretch exact", _STRETCHES, "plain/model", "plain base, two minutes"),
 )
