@@ -112,11 +112,11 @@ def test_a_model_learns_the_time_steps_of_its_data_and_keeps_its_weights_to_the_
     new = load_file(folder / "weights.safetensors")
     as_version(3, folder)
     old = load_file(folder / "weights.safetensors")
-    assert set(new) - set(old) == {"normaliser.step_low", "normaliser.step_high"}
+    assert set(new) - set(old) == {"normaliser.time_step_low", "normaliser.time_step_high"}
     with pytest.raises(pc.errors.FileVersionError, match=r"version 3: expected 4.*docs/files.md"):
         pc.load_model(folder)
 
-    def fitted(*configs, command="fit_steps.py", **options):
+    def fitted(*configs, command="fit_time_steps.py", **options):
         command = [sys.executable, ROOT / "models" / command, folder, *configs]
         return subprocess.run(command, capture_output=True, text=True, check=False, **options)
 

@@ -102,11 +102,10 @@ class CompiledCorrector:
         low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
         return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
 
-    def step_excess(self, bodies: BodyGraph) -> Array:
-        """See `Corrector.step_excess`."""
-        normaliser = self._corrector.normaliser
-        low, high = normaliser.step_low.numpy(), normaliser.step_high.numpy()
-        return np.array([largest_excess(np.log(bodies.time_step.numpy()), low, high)])
+    def time_step_excess(self, bodies: BodyGraph) -> Array:
+        """See `Corrector.time_step_excess`."""
+        found: Array = self._corrector.time_step_excess(bodies).numpy()
+        return found
 
     def _follow(self) -> None:
         if self._contents.changed:
