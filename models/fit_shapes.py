@@ -17,6 +17,7 @@ import argparse
 import torch
 from first_steps import scenes_of
 from fit_time_steps import add_configs, configs_of, fit_time_steps, of_any_version, told
+from program import run_script
 
 import pdcorrect as pc
 from pdcorrect.corrector.bodies import BodyGraph

@@ -61,9 +61,8 @@ def test_time_steps_lie_outside_their_range_by_the_logarithm_of_a_factor():
 def test_no_time_step_is_known_before_data_were_seen_nor_is_what_is_no_number():
     corrector = Corrector(preset("compact", layers=1, width=8))
     assert corrector.time_step_excess(graph(H)).tolist() == [np.inf]
-    assert Gate(body=None, time_step=1e6).foreign(corrector, graph(H)).tolist() == [
-        Reason.TIME_STEP
-    ]
+    wide = Gate(body=None, time_step=1e6)
+    assert wide.foreign(corrector, graph(H)).tolist() == [Reason.TIME_STEP]
     known = ranged(H)
     assert known.time_step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
     assert np.isnan(corrector.normaliser.time_steps).all()
@@ -90,11 +89,8 @@ def test_the_range_is_part_of_a_corrector_s_values():
     assert state["normaliser.time_step_low"].tolist() == pytest.approx([np.log(H / C)])
     assert state["normaliser.time_step_high"].tolist() == pytest.approx([np.log(2.0 * H / C)])
     empty = Normaliser({"a": 1}, {}).state_dict()
-    assert (
-        empty["time_step_low"].isnan().tolist()
-        == empty["time_step_high"].isnan().tolist()
-        == [True]
-    )
+    assert empty["time_step_low"].isnan().tolist() == [True]
+    assert empty["time_step_high"].isnan().tolist() == [True]
 
 
 # --- the gate ----------------------------------------------------------------------------------
