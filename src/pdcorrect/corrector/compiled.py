@@ -69,6 +69,7 @@ class CompiledCorrector:
             corrector, self._bodies, self._groups, self.network.x, self.network.e
         )
         self._output_scale = float(corrector.normaliser.output_scale)
+        self._beyond = corrector.time_step_excess(self._bodies)
         self._view: View | None = None
 
     def of_view(self, view: View) -> Tensor:
@@ -104,8 +105,10 @@ class CompiledCorrector:
 
     def time_step_excess(self, bodies: BodyGraph) -> Array:
         """See `Corrector.time_step_excess`."""
-        found: Array = self._corrector.time_step_excess(bodies).numpy()
-        return found
+        self._follow()
+        same = bodies is self._bodies
+        found: Array = (self._beyond if same else self._corrector.time_step_excess(bodies)).numpy()
+        return found.copy()
 
     def _follow(self) -> None:
         if self._contents.changed:
