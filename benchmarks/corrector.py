@@ -90,8 +90,8 @@ def fitted(name: str, view: View) -> Corrector:
     corrector.normaliser.fit_averages(averages)
     shapes.add(view.bodies.shapes)
     corrector.normaliser.fit_shapes(shapes)
-    steps.add(view.bodies.time_step.log()[:, None])
-    corrector.normaliser.fit_steps(steps)
+    steps.add(view.bodies.time_steps[:, None])
+    corrector.normaliser.fit_time_steps(steps)
     return corrector.eval()
 
 

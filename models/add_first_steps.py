@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from first_steps import scenes_of, seen_in_rollouts
+from program import run_script
 
 import pdcorrect as pc
 from pdcorrect.corrector import features
@@ -26,7 +27,7 @@ from pdcorrect.corrector.model_io import LoadedModel, model_folder
 from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.data.config import TRAINING, DatasetConfig
 
-ANSWERS_ONLY = pc.Gate(body=None, step=None, margin=None, average=None)
+ANSWERS_ONLY = pc.Gate(body=None, time_step=None, margin=None, average=None)
 """Refuses no inputs, for it is these that are to be known."""
 
 
@@ -87,4 +88,4 @@ def add_first_steps(
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

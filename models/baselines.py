@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from program import run_script
 from run_record import origin
 from scipy.optimize import minimize_scalar
 from torch import Tensor
@@ -152,4 +153,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

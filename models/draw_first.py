@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from program import run_script
 from run_record import write_record
 
 from pdcorrect.data.config import EVALUATION, DatasetConfig
@@ -79,4 +80,4 @@ def draw(name: str, output: Path, frames: int | None) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

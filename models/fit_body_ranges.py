@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 from first_steps import scenes_of, seen_in_rollouts
+from program import run_script
 
 import pdcorrect as pc
 from pdcorrect.corrector.features import View
@@ -67,4 +68,4 @@ def averages_of(
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

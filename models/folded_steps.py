@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from program import run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -84,4 +85,4 @@ def corrected(model: LoadedModel, coarse: pc.Problem, gate: pc.Gate, frames: int
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from first_steps import scenes_of
+from program import pair_of, run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -35,7 +36,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for pair in options.pairs:
-        name, _, path = pair.partition("=")
+        name, path = pair_of(pair)
         folder, config = model_folder(name), DatasetConfig.load(path)
         corrector = pc.load_model(folder).corrector
         names = (VALIDATION, EVALUATION, *(extra.name for extra in config.extra))
@@ -66,4 +67,4 @@ def counted(corrector: Corrector, config: DatasetConfig, split: str) -> dict[str
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from first_steps import first_steps, scenes_of
+from program import pair_of, run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -43,7 +44,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for pair in options.pairs:
-        name, _, config = pair.partition("=")
+        name, config = pair_of(pair)
         rows.append(
             refused(
                 name, DatasetConfig.load(config), options.split, options.loads, options.reference
@@ -116,4 +117,4 @@ def after_one_step(scene: pc.Scene, refine: int, config: DatasetConfig) -> np.nd
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 from first_steps import scenes_of, seen_in_rollouts
+from program import pair_of, run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -38,7 +39,7 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for pair in options.pairs:
-        name, _, config = pair.partition("=")
+        name, config = pair_of(pair)
         rows.append(strange(name, DatasetConfig.load(config), options.split, options.loads))
         print(rows[-1], flush=True)
         if options.output:
@@ -78,4 +79,4 @@ def strange(name: str, config: DatasetConfig, split: str, loads: int) -> dict[st
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

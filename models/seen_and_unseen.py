@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from program import run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -103,4 +104,4 @@ def _normalisation(model: LoadedModel) -> dict[str, torch.Tensor]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -34,6 +34,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from program import run_script
 from run_record import origin
 from safetensors.torch import save_file
 from torch import Tensor
@@ -408,4 +409,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -20,6 +20,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from program import run_script
 from table_rows import (
     BEFORE,
     BODIES,
@@ -314,4 +315,4 @@ def _line(cells: Iterable[str]) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

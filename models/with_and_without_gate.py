@@ -19,11 +19,13 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from program import run_script
 from run_record import write_record
 
 import pdcorrect as pc
@@ -32,6 +34,7 @@ from pdcorrect.corrector.model_io import LoadedModel, model_folder, weights_dige
 from pdcorrect.data.config import EVALUATION, DatasetConfig, FamilyName, Split
 from pdcorrect.data.families import PUBLISHED, count_bodies
 from pdcorrect.data.plan import MeshPlan, draw_scene, make_plan
+from pdcorrect.errors import InputError
 
 
 def main() -> None:
@@ -71,7 +74,7 @@ def main() -> None:
     }  # fmt: skip
     rows = known_rows(options.output, about)
     for case in options.cases or [f"{number}/0" for number in plans]:
-        mesh, load = map(int, case.split("/"))
+        mesh, load = numbers(case, plans)
         if any((row["mesh"], row["load"]) == (mesh, load) for row in rows):
             continue
         scene = draw_scene(config, plans[mesh], load)
@@ -86,6 +89,20 @@ def main() -> None:
             error_over_base={name: harm(rows, name) for name in models},
             simulations=rows,
         )
+
+
+def numbers(case: str, meshes: Iterable[int]) -> tuple[int, int]:
+    """Mesh and load of a case that was asked for.
+
+    Raises
+    ------
+    InputError
+        If it is none of the split.
+    """
+    mesh, _, load = case.partition("/")
+    if not (mesh.isdecimal() and load.isdecimal() and int(mesh) in set(meshes)):
+        raise InputError(f"case {case!r}: expected MESH/LOAD, two numbers, of a mesh of the split.")
+    return int(mesh), int(load)
 
 
 def of_bodies(config: DatasetConfig, family: FamilyName, nodes: list[int]) -> DatasetConfig:
@@ -176,4 +193,4 @@ def repeated(
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

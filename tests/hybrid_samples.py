@@ -74,8 +74,8 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         shapes.add(nodes.graph.shapes)
     corrector.normaliser.fit_averages(averages)
     corrector.normaliser.fit_shapes(shapes)
-    lengths.add(nodes.graph.time_step.log()[:, None])
-    corrector.normaliser.fit_steps(lengths)
+    lengths.add(nodes.graph.time_steps[:, None])
+    corrector.normaliser.fit_time_steps(lengths)
     return corrector
 
 

@@ -129,8 +129,8 @@ def fit(corrector, view):
     corrector.normaliser.fit_averages(averages)
     shapes.add(view.bodies.shapes)
     corrector.normaliser.fit_shapes(shapes)
-    steps.add(view.bodies.time_step.log()[:, None])
-    corrector.normaliser.fit_steps(steps)
+    steps.add(view.bodies.time_steps[:, None])
+    corrector.normaliser.fit_time_steps(steps)
     return corrector
 
 

@@ -256,7 +256,8 @@ def test_another_time_step_is_told_beside_that_of_the_training(stiff):
     told = report.notes(found)
     assert f"{label}: 2 of 2 corrections were refused by the gate (2 by time step)." in told
     assert any(note.startswith(f"{label} is no corrected run") for note in told)
-    assert f"{label}: the time step is 0.02 s, that of the training 0.01 s." in told
+    expected = "the time step is 0.02 s, that of the training 0.01 s for cells of this size."
+    assert f"{label}: {expected}" in told
     assert not any("that of the training" in n for n in report.notes(pc.compare(
         stiff, 1, cases=cases_for(stiff, [MODEL])[4:])))  # fmt: skip
 

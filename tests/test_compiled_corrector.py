@@ -204,11 +204,11 @@ def test_how_unlike_training_a_time_step_is_is_told_as_by_torch_and_follows_the_
     compiled = CompiledCorrector(made, view.bodies)
     found = []
     for low, high in ((0.0, 0.0), (0.25, 0.5), (-1.0, -0.5), (np.nan, 0.0)):
-        made.normaliser.step_low += low
-        made.normaliser.step_high += high
-        expected = made.step_excess(view.bodies).numpy()
+        made.normaliser.time_step_low += low
+        made.normaliser.time_step_high += high
+        expected = made.time_step_excess(view.bodies).numpy()
         found.append(float(expected[0]))
-        np.testing.assert_allclose(compiled.step_excess(view.bodies), expected, atol=1e-12)
+        np.testing.assert_allclose(compiled.time_step_excess(view.bodies), expected, atol=1e-12)
     assert found == pytest.approx([0.0, 0.25, 0.0, np.inf])
 
 

@@ -722,8 +722,8 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     shapes, steps = Moments(), Moments()
     shapes.add(torch.zeros(1, len(corrector.normaliser.shape_low)))
     corrector.normaliser.fit_shapes(shapes)
-    steps.add(torch.tensor([[0.01]], dtype=torch.float64).log())
-    corrector.normaliser.fit_steps(steps)
+    steps.add(torch.tensor([[0.2]], dtype=torch.float64).log())  # s/m, 0.01 s in cells of 5 cm
+    corrector.normaliser.fit_time_steps(steps)
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()

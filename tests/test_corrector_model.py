@@ -303,8 +303,8 @@ def with_value(value):
         (put(MEAN, lambda b: b.float()), "strain__mean has type torch.float32"),
         (put(LAST, with_value(torch.nan)), "decoder.2.bias has values that are infinite or not"),
         (put(LAST, with_value(-torch.inf)), "decoder.2.bias has values that are infinite or not"),
-        (drop("normaliser.step_low"), "missing tensor normaliser.step_low"),
-        (put("normaliser.step_high", with_value(torch.nan)), "step_high has values that are inf"),
+        (drop("normaliser.time_step_low"), "missing tensor normaliser.time_step_low"),
+        (put("normaliser.time_step_high", with_value(torch.nan)), "time_step_high has values"),
         (put(MEAN, with_value(torch.nan)), "strain__mean has values that are infinite or not"),
         (put("normaliser.strain__deviation", with_value(0.0)), "deviation .*not positive"),
         (put(SCALE, with_value(0.0)), "has not been fitted"),
@@ -382,13 +382,28 @@ def test_numbers_that_are_not_finite_are_refused(model):
 
 
 def test_other_versions_are_told_from_damage(model):
-    rewrite_json(model, put_json("version", value=5), seal=False)
-    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 5: expected 4.*newer"):
+    rewrite_json(model, put_json("version", value=6), seal=False)
+    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 6: expected 5.*newer"):
         load_model(model)
-    for old in (1, 2, 3):
+    for old in (1, 2, 3, 4):
         rewrite_json(model, put_json("version", value=old))
-        with pytest.raises(FileVersionError, match=f"version {old}: expected 4: .* docs/files.md"):
+        with pytest.raises(FileVersionError, match=f"version {old}: expected 5: .* docs/files.md"):
             load_model(model)
+    rewrite_json(model, lambda content: content.pop("version"))
+    with pytest.raises(FileVersionError, match=rf"{JSON}: version is None: expected 5: damaged"):
+        load_model(model)
+
+
+@pytest.mark.parametrize("nothing", ["", "  ", None, 3, b"tiny"])
+def test_what_is_no_name_and_no_path_is_refused(nothing):
+    with pytest.raises(InputError, match="expected the name of a model or the path of its folder"):
+        load_model(nothing)
+
+
+def test_a_folder_here_is_hinted_at(model, monkeypatch):
+    monkeypatch.chdir(model.parent)
+    with pytest.raises(InputError, match=rf"such as ./{model.name}, which is a folder here"):
+        load_model(model.name)
 
 
 def test_a_changed_entry_is_found_by_the_checksum(model):

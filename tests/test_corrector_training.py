@@ -469,22 +469,24 @@ def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folde
 def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
-    corrector, step = samples.fitted(folder, settings), windows.dataset.headers[0].time_step
+    corrector, size = samples.fitted(folder, settings), 0.05
+    step = windows.dataset.headers[0].time_step / size
     normaliser = corrector.normaliser
-    normaliser.step_low.fill_(torch.nan)
+    normaliser.time_step_low.fill_(torch.nan)
     fit_normaliser(corrector, windows, 1)
-    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-14)
+    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
     bodies = windows.batch([0]).bodies
-    assert bodies.time_step.tolist() == pytest.approx([step], rel=1e-7)
+    assert bodies.time_steps.tolist() == pytest.approx([np.log(step)], abs=1e-6)
+    assert corrector.time_step_excess(bodies).tolist() == [0.0]
     for shift in (np.log(2.0), -np.log(2.0)):  # as of data with another step
-        normaliser.step_low += shift
-        normaliser.step_high += shift
-        assert corrector.step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
+        normaliser.time_step_low += shift
+        normaliser.time_step_high += shift
+        assert corrector.time_step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
         both = sorted((step, step * np.exp(shift)))
         widen_ranges(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx(both, rel=1e-12)
+        assert normaliser.time_steps == pytest.approx(both, rel=1e-6)
         fit_normaliser(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-14)
+        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
 
 
 def test_stored_bodies_have_the_measures_of_those_that_are_drawn():
@@ -962,7 +964,7 @@ def test_every_damaged_checkpoint_is_refused_by_name(tmp_path):
     path.write_bytes(whole[:-3])
     with pytest.raises(FileFormatError, match=path.name):
         read_checkpoint(path)
-    path.write_bytes(whole.replace(b'"version":"3"', b'"version":"9"'))
+    path.write_bytes(whole.replace(b'"version":"4"', b'"version":"9"'))
     with pytest.raises(FileVersionError, match="version 9"):
         read_checkpoint(path)
 
@@ -1295,8 +1297,8 @@ def test_the_ranges_of_a_start_grow_by_the_new_data(short, earlier, tmp_path):
 def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(short, earlier, tmp_path):
     model = load_model(earlier)
     model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
-    model.corrector.normaliser.step_low += 1.0  # and of a longer time step
-    model.corrector.normaliser.step_high += 1.0
+    model.corrector.normaliser.time_step_low += 1.0  # and of a longer time step
+    model.corrector.normaliser.time_step_high += 1.0
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = {}
     for widen in (True, False):

@@ -25,8 +25,8 @@ from pdcorrect.solvers.resume import continue_from
 ROOT = Path(__file__).parent.parent
 CELL, STEP = 0.02, 0.01
 NOTHING = {
-    "body": None, "step": None, "margin": None, "average": None, "volume": None, "crushing": None,
-    "energy": None,
+    "body": None, "time_step": None, "margin": None, "average": None, "volume": None,
+    "crushing": None, "energy": None,
 }  # fmt: skip
 """Bounds of a gate that refuses only what is refused without one."""
 

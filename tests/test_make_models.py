@@ -16,6 +16,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "models"))  # as where it runs as a program
 SPEC = importlib.util.spec_from_file_location("make_models", ROOT / "models" / "make_all.py")
 make = importlib.util.module_from_spec(SPEC)
 sys.modules["make_models"] = make

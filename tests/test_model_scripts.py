@@ -3,6 +3,7 @@
 import hashlib
 import importlib.util
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from safetensors.torch import load_file, save_file  # noqa: E402
 import pdcorrect as pc  # noqa: E402
 import pdcorrect.errors  # noqa: E402
 from pdcorrect import metrics  # noqa: E402
+from pdcorrect.corrector import model_io  # noqa: E402
 from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.model_io import save_model  # noqa: E402
@@ -72,81 +74,211 @@ def test_each_script_has_its_row_in_the_list():
         assert (f"`{path.name}`" in told) == is_program, path.name
 
 
+NORMALISER = "normaliser."
+
+
 def as_version(version, folder):
-    """A model as it was before there were ranges of time steps (3), and of bodies at rest (2)."""
+    """A model as older versions had it.
+
+    Time steps without the cell size (4), none at all (3), nor bodies at rest (2).
+    """
     description = json.loads((folder / "model.json").read_text())
-    new = (".shape_", ".step_")[version - 2 :]
-    weights = {k: x for k, x in load_file(folder / "weights.safetensors").items()
-               if not any(part in k for part in new)}  # fmt: skip
+    dropped = ("shape_", "time_step_") if version == 2 else ("time_step_",)
+    added = {"step_low": [np.log(0.01)], "step_high": [np.log(0.01)]} if version == 4 else {}
+    known = {k: x for k, x in description["normalisation"].items() if not k.startswith(dropped)}
+    weights = load_file(folder / "weights.safetensors")
+    gone = tuple(NORMALISER + name for name in dropped)
+    weights = {k: x for k, x in weights.items() if not k.startswith(gone)}
+    weights |= {NORMALISER + k: torch.tensor(x, dtype=torch.float64) for k, x in added.items()}
     save_file(weights, folder / "weights.safetensors")
     digest = hashlib.sha256((folder / "weights.safetensors").read_bytes()).hexdigest()
-    changed = {**description, "version": version, "weights_sha256": digest}
-    (folder / "model.json").write_text(json.dumps(changed))
+    description |= {"version": version, "weights_sha256": digest, "normalisation": known | added}
+    if version == 4:
+        description["record"]["training"]["time_steps"] = {"tiny": 0.01}
+    rewrite(folder, description)
+
+
+def rewrite(folder, description):
+    """Write a description with its checksum."""
+    content = {key: x for key, x in description.items() if key != "checksum"}
+    text = json.dumps({**content, "checksum": model_io._digest(content)})
+    (folder / "model.json").write_text(text)
+
+
+def ran(command, *arguments):
+    """A script's process, when it has ended."""
+    command = [sys.executable, ROOT / "models" / command, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+
+
+def assert_refused(process, words):
+    """It ended with one sentence."""
+    assert process.returncode == 2
+    assert process.stderr.startswith("error: ")
+    assert "Traceback" not in process.stderr
+    assert re.search(words, process.stderr), process.stderr
+
+
+def copied(tmp_path):
+    folder = tmp_path / "tiny"
+    shutil.copytree(ROOT / "models" / "tiny", folder)
+    return folder, ROOT / "datasets" / "tiny" / "config.toml"
 
 
 def test_an_old_model_learns_its_training_bodies_from_the_configuration(tmp_path):
-    folder, config = tmp_path / "tiny", ROOT / "datasets" / "tiny" / "config.toml"
-    shutil.copytree(ROOT / "models" / "tiny", folder)
+    folder, config = copied(tmp_path)
     before = pc.load_model(folder)
     as_version(2, folder)
     with pytest.raises(pc.errors.FileVersionError, match="version 2"):
         pc.load_model(folder)
-    command = [sys.executable, ROOT / "models" / "fit_shapes.py", folder, config]
-    subprocess.run(command, check=True, capture_output=True)
+    assert_refused(ran("fit_shapes.py", folder, config, config), "'tiny' comes twice")
+    run = ran("fit_shapes.py", folder, config)
+    assert run.returncode == 0, run.stderr
+    assert "time step over cell size 0.2 to 0.2 s/m" in run.stdout
     after = pc.load_model(folder)
     values = before.corrector.state_dict()
     for name, tensor in after.corrector.state_dict().items():
         assert torch.equal(tensor, values[name]), name
     as_version(2, folder)
     (folder / "weights.safetensors").write_bytes(b"")
-    damaged = subprocess.run(command, capture_output=True, text=True)
-    assert damaged.returncode == 1
-    assert "damaged" in damaged.stderr
+    assert_refused(ran("fit_shapes.py", folder, config), "damaged")
     told = after.record.training["shapes"]
     assert (told["dataset"], told["meshes"]) == ("tiny", 6)
     assert 0.0 < told["left_out"] < 1.0
-    assert after.record.training["time_steps"] == {"tiny": 0.01}
 
 
-def test_a_model_learns_the_time_steps_of_its_data_and_keeps_its_weights_to_the_last_bit(tmp_path):
-    folder, config = tmp_path / "tiny", ROOT / "datasets" / "tiny" / "config.toml"
-    shutil.copytree(ROOT / "models" / "tiny", folder)
+@pytest.mark.parametrize("version", [3, 4])
+def test_an_old_model_learns_the_time_steps_of_its_data_and_keeps_its_weights_to_the_last_bit(
+    tmp_path, version
+):
+    folder, config = copied(tmp_path)
     new = load_file(folder / "weights.safetensors")
-    as_version(3, folder)
+    record = pc.load_model(folder).record
+    as_version(version, folder)
     old = load_file(folder / "weights.safetensors")
-    assert set(new) - set(old) == {"normaliser.step_low", "normaliser.step_high"}
-    with pytest.raises(pc.errors.FileVersionError, match=r"version 3: expected 4.*docs/files.md"):
+    assert set(new) - set(old) == {"normaliser.time_step_low", "normaliser.time_step_high"}
+    told = rf"version {version}: expected 5.*docs/files.md"
+    with pytest.raises(pc.errors.FileVersionError, match=told):
         pc.load_model(folder)
-
-    def fitted(*configs, command="fit_steps.py", **options):
-        command = [sys.executable, ROOT / "models" / command, folder, *configs]
-        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
-
-    assert fitted(config).returncode == 0
-    model = pc.load_model(folder)
-    assert model.record.training["time_steps"] == {"tiny": 0.01}
-    assert model.corrector.normaliser.time_steps == pytest.approx((0.01, 0.01), rel=1e-12)
-    other = tmp_path / "other.toml"
-    changed = config.read_text().replace('name = "tiny"', 'name = "other"')
-    other.write_text(changed.replace("step = 0.01", "step = 0.025"))
-    assert fitted(config, other).returncode == 0  # of version 4: anew
-    model = pc.load_model(folder)
-    assert model.record.training["time_steps"] == {"tiny": 0.01, "other": 0.025}
-    assert model.corrector.normaliser.time_steps == pytest.approx((0.01, 0.025), rel=1e-12)
-    assert fitted(config).returncode == 0
+    run = ran("fit_time_steps.py", folder, config)
+    assert run.returncode == 0, run.stderr
+    assert "time step over cell size 0.2 to 0.2 s/m" in run.stdout
+    assert pc.load_model(folder).record == record
     found = load_file(folder / "weights.safetensors")
     assert found.keys() == new.keys()
     for name, tensor in found.items():
         assert tensor.numpy().tobytes() == new[name].numpy().tobytes(), name
+
+
+def test_time_steps_are_fitted_anew_to_the_data_sets_that_are_asked_for(tmp_path):
+    folder, config = copied(tmp_path)
+    other = tmp_path / "other.toml"
+    changed = config.read_text().replace('name = "tiny"', 'name = "other"')
+    changed = changed.replace("cell_size = 0.05", "cell_size = 0.1")
+    other.write_text(changed.replace("step = 0.01", "step = 0.025"))
+    before = (folder / "model.json").read_bytes()
+    expected = "configurations of tiny, other: expected those of tiny"
+    assert_refused(ran("fit_time_steps.py", folder, config, other), expected)
+    assert_refused(ran("fit_time_steps.py", folder, other), "of other: expected those of tiny")
+    twice = ran("fit_time_steps.py", folder, config, config, "--other")
+    assert_refused(twice, "'tiny' comes twice")
+    assert (folder / "model.json").read_bytes() == before
+    assert ran("fit_time_steps.py", folder, config, other, "--other").returncode == 0
+    model = pc.load_model(folder)
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.25), rel=1e-12)
+    assert ran("fit_time_steps.py", folder, config).returncode == 0
+    assert (folder / "model.json").read_bytes() == before
+
+
+def test_old_models_that_are_damaged_are_refused(tmp_path):
+    folder, config = copied(tmp_path)
     as_version(2, folder)
-    refused = fitted(config)
-    assert refused.returncode == 1
-    assert "format version 2: fit_shapes.py fits this range, too" in refused.stderr
-    as_version(3, folder)
-    (folder / "weights.safetensors").write_bytes(b"")
-    damaged = fitted(config)
-    assert damaged.returncode == 1
-    assert "damaged" in damaged.stderr
+    told = "of format version 2: fit_shapes.py fits this range, too"
+    assert_refused(ran("fit_time_steps.py", folder, config), told)
+    description = json.loads((folder / "model.json").read_text())
+    rewrite(folder, {key: x for key, x in description.items() if key != "version"})
+    expected = "version is None: expected 2 or 3 or 4 or 5"
+    assert_refused(ran("fit_time_steps.py", folder, config), expected)
+    rewrite(folder, {**description, "version": 3})  # whose tensors are those of version 2
+    assert_refused(ran("fit_time_steps.py", folder, config), "not the tensors of its architecture")
+    (folder / "model.json").write_text(json.dumps({**description, "parameters": 1}))
+    assert_refused(ran("fit_time_steps.py", folder, config), "its checksum is not that")
+
+
+def test_a_network_takes_the_ranges_of_another_model_of_the_same_normalisation(tmp_path):
+    folder, _ = copied(tmp_path)
+    wider = pc.load_model(folder)
+    normaliser = wider.corrector.normaliser
+    for name, values in normaliser.named_buffers():
+        if name.endswith(("_low", "_high")):
+            values += -1.0 if name.endswith("_low") else 1.0
+    with torch.no_grad():
+        wider.corrector.network.decoder[-1].bias += 1.0
+    save_model(wider.corrector, tmp_path / "wider", record=wider.record)
+    run = ran("take_ranges.py", folder, tmp_path / "wider", "-o", tmp_path / "both")
+    assert run.returncode == 0, run.stderr
+    found = pc.load_model(tmp_path / "both")
+    own, theirs = (load_file(path / "weights.safetensors") for path in (folder, tmp_path / "wider"))
+    for name, values in found.corrector.state_dict().items():
+        of = theirs if name.endswith(("_low", "_high")) else own
+        assert torch.equal(values, of[name]), name
+    digest = model_io.weights_digest(tmp_path / "wider")
+    assert found.record.training["ranges_of"] == digest
+    normaliser.average_mean += 0.1
+    save_model(wider.corrector, tmp_path / "wider", record=wider.record)
+    refused = ran("take_ranges.py", folder, tmp_path / "wider", "-o", tmp_path / "none")
+    assert_refused(refused, "normalisation differs in average_mean: expected the same means and")
+    refused = ran("take_ranges.py", folder, "torsion-exact", "-o", tmp_path / "none")
+    assert_refused(refused, "of unlike architectures")
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["fit_shapes.py", "docs", "x.toml"], "model 'docs': not in .*such as ./docs, which is a"),
+        (["add_first_steps.py", "tiny", "x.toml"], "x.toml: cannot be read"),
+        (["fit_body_ranges.py", "", "x.toml"], "model '': expected the name of a model"),
+        (["rollout_strangeness.py", "tiny"], "'tiny': expected MODEL=CONFIG"),
+        (["plot_histories.py", "no.csv", "no.png"], "no.csv: cannot be read"),
+        (["plot_histories.py", "README.md", "no.png"], "README.md: expected the history.csv"),
+    ],
+)
+def test_scripts_tell_what_is_wrong_in_a_sentence(arguments, words):
+    assert_refused(ran(*arguments), words)
+
+
+def test_every_script_ends_by_the_same_rules():
+    for path in (ROOT / "models").glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if 'if __name__ == "__main__":' in text:
+            assert text.endswith('if __name__ == "__main__":\n    run_script(main)\n'), path.name
+
+
+def raising(error):
+    """A script that does."""
+
+    def main():
+        raise error
+
+    return main
+
+
+def test_a_script_s_errors_are_told_by_their_kind(capsys):
+    program = script("program")
+    for error, status in (
+        (pc.errors.InputError("wrong"), 2), (SystemExit("wrong"), 2),
+        (pc.errors.ConvergenceError("wrong"), 1), (pc.errors.OutputError("wrong"), 1),
+    ):  # fmt: skip
+        with pytest.raises(SystemExit) as stop:
+            program.run_script(raising(error))
+        assert stop.value.code == status
+        assert capsys.readouterr().err == "error: wrong\n"
+    with pytest.raises(SystemExit) as stop:
+        program.run_script(raising(SystemExit(0)))
+    assert stop.value.code == 0
+    with pytest.raises(KeyError):  # a mistake of the script's own
+        program.run_script(raising(KeyError("wrong")))
 
 
 def test_a_body_left_out_lies_outside_the_others_by_its_distance_from_the_next(monkeypatch):

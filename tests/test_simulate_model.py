@@ -228,8 +228,8 @@ def test_a_run_of_another_time_step_is_the_base_s_and_says_of_which_the_training
     status, out, _ = program("simulate", tmp_path / "s.toml", "-o", path, "--model", MODEL)
     assert status == 0
     assert "2 of 2 corrections were refused by the gate (2 by time step)" in out
-    assert "'time step': the time step is unlike that of its training" in out
-    assert f"The time step is {step:g} s, that of the training 0.01 s." in out
+    assert "'time step': the time step over the cell size is unlike that of its training" in out
+    assert f"The time step is {step:g} s, that of the training 0.01 s for cells" in out
     assert "Outside the range of the training bodies" not in out
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)
@@ -244,9 +244,11 @@ def test_of_a_model_of_several_time_steps_the_least_and_the_largest_are_told(lea
     from pdcorrect.corrector.normaliser import Moments
 
     model, steps = pc.load_model(MODEL), Moments()
-    steps.add(torch.tensor([[0.02], [0.005], [0.01]], dtype=torch.float64).log())
-    model.corrector.normaliser.fit_steps(steps)
+    steps.add(torch.tensor([[0.4], [0.1], [0.2]], dtype=torch.float64).log())  # s/m
+    model.corrector.normaliser.fit_time_steps(steps)
     pc.save_model(model.corrector, tmp_path / "several", record=model.record)
-    hybrid = pc.hybrid_of(pc.Scene.load(SCENE), tmp_path / "several")
-    assert hybrid.origin["trained_step"] == "0.005 to 0.02 s"
-    assert hybrid.step_excess() == 0.0
+    scene = pc.Scene.load(SCENE)
+    assert scene.body.cell_size == 0.05
+    hybrid = pc.hybrid_of(scene, tmp_path / "several")
+    assert hybrid.trained_step == hybrid.describe()["trained_step"] == "0.005 to 0.02 s"
+    assert hybrid.time_step_excess() == 0.0

@@ -78,7 +78,8 @@ class Comparison:
     cases : tuple of Case
     models : dict of str to dict
         Of correctors, by label: model, base, the data set that it was trained on, that one's
-        time integrator, digest of its weights.
+        time integrator, digest of its weights and, of those that came to their end, the
+        training's time step for cells of this size, see `HybridStepper.trained_step`.
     reference : str
         Label of the case that errors are measured against.
     solver_error : float or None
@@ -214,7 +215,7 @@ def compare(
         )
     return Comparison(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
-        _models(cases), failures,
+        _models(cases, runs), failures,
         None if any(case.base == "best" for case in cases) else without_best(scene),
     )  # fmt: skip
 
@@ -225,13 +226,16 @@ def _coarse_to_fine(case: Case) -> tuple[int, bool, int, bool]:
     return case.refine, more_nodes, BASES.index(case.base), case.solver != "pd"
 
 
-def _models(cases: Sequence[Case]) -> dict[str, dict[str, str]]:
+def _models(cases: Sequence[Case], runs: Mapping[str, Trajectory]) -> dict[str, dict[str, str]]:
     """Which models the correctors are, by label."""
     if not any(case.model for case in cases):
         return {}
     from pdcorrect.corrector.released import about_model
 
-    return {case.label: about_model(case.model) for case in cases if case.model}
+    found = {case.label: about_model(case.model) for case in cases if case.model}
+    for label in found.keys() & runs.keys():
+        found[label]["trained_step"] = runs[label].attributes["trained_step"]
+    return found
 
 
 def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float], None] | None:

@@ -18,7 +18,7 @@ _MEANINGS = {
     "body": "the body at rest is unlike those of its training",
     "pause": "it would have passed, too soon after one that did not",
     "folded": "a cell is folded at a corner",
-    "time step": "the time step is unlike that of its training",
+    "time step": "the time step over the cell size is unlike that of its training",
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
 
@@ -82,13 +82,14 @@ def refused_step(stats: Mapping[str, Any], step: float, trained: str) -> str | N
     step : float
         s.
     trained : str
-        The range of the training, with its unit.
+        That of the training for the body's cell size, with its unit, see
+        `HybridStepper.trained_step`.
     """
     from pdcorrect.corrector.gate import Reason
 
     if not (np.asarray(stats["gate"]) == Reason.TIME_STEP).any():
         return None
-    return f"The time step is {step:g} s, that of the training {trained}."
+    return f"The time step is {step:g} s, that of the training {trained} for cells of this size."
 
 
 def foreign_integrator(found: str, trained: str, name: str) -> str | None:

@@ -210,8 +210,8 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
 
 def _described(stepper: Stepper) -> dict[str, str]:
     """What a stepper says of itself, but for the model, which is told before the run."""
-    origin = getattr(stepper, "origin", {})
-    told = {name: text for name, text in stepper.describe().items() if name not in origin}
+    elsewhere = {*getattr(stepper, "origin", {}), "trained_step"}
+    told = {name: text for name, text in stepper.describe().items() if name not in elsewhere}
     if told.get("gate", "none") != "none":
         told["gate"] = "default"  # the program has no other
     return told
@@ -231,8 +231,7 @@ def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     if isinstance(stepper, HybridStepper):
         if (stats["gate"] == Reason.BODY).any():
             say(_refused_measures(stepper))
-        step, trained = stepper.problem.time_step, stepper.origin["trained_step"]
-        say(refused_step(stats, step, trained) or "")
+        say(refused_step(stats, stepper.problem.time_step, stepper.trained_step) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
 

@@ -47,7 +47,7 @@ class TomlConfig(Strict):
         try:
             return cls(**data)
         except ValidationError as error:
-            raise InputError(f"{source}: {_explain(error)}") from None
+            raise InputError(f"{source}: {explained(error)}") from None
 
     def to_toml(self) -> str:
         """The configuration as TOML, with every default written out."""
@@ -67,7 +67,8 @@ def as_toml(value: object) -> str:
     return str(value)
 
 
-def _explain(error: ValidationError) -> str:
+def explained(error: ValidationError) -> str:
+    """Of each wrong key its value and what was expected, in sentences."""
     return " ".join(map(_sentence, error.errors()))
 
 

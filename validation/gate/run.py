@@ -22,11 +22,11 @@ SPLITS = ("evaluation", "stronger", "stiffer", "softer", "compressible", "half-s
           "double-step", "long")  # fmt: skip
 GATES: dict[str, dict[str, float | None] | None] = {
     "none": None,
-    "margin 3": {"margin": 3.0, "average": None, "body": None, "step": None},
-    "margin 1": {"average": None, "body": None, "step": None},
-    "margin 0.3": {"margin": 0.3, "average": None, "body": None, "step": None},
-    "average": {"margin": None, "body": None, "step": None},
-    "body": {"margin": None, "average": None, "step": None},
+    "margin 3": {"margin": 3.0, "average": None, "body": None, "time_step": None},
+    "margin 1": {"average": None, "body": None, "time_step": None},
+    "margin 0.3": {"margin": 0.3, "average": None, "body": None, "time_step": None},
+    "average": {"margin": None, "body": None, "time_step": None},
+    "body": {"margin": None, "average": None, "time_step": None},
     "step": {"margin": None, "average": None, "body": None},
     "default": {},
 }

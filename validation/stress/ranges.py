@@ -3,11 +3,12 @@
 python validation/stress/ranges.py BEFORE RECORD.json
 
 BEFORE is a folder with another `torsion-exact`; the one of before it was trained on with more
-bodies is in this repository's history (commit 4d4a67a).  All four pairs of network and ranges, with
-the default gate: the share of corrections applied, the distance from rest at the end, in cells, the
-least det F at a corner there, and how far a node still moves in a step, in cells, over the last 50;
-and how many steps are refused of bodies that should be known: first loads of `torsion-exact`'s
-evaluation split.
+bodies is in this repository's history (commit 4d4a67a).  Models of an older version of the format
+are brought up to date first, by `models/fit_time_steps.py`.  All four pairs of network and ranges,
+with the default gate: the share of corrections applied, the distance from rest at the end, in
+cells, the least det F at a corner there, and how far a node still moves in a step, in cells, over
+the last 50; and how many steps are refused of bodies that should be known: first loads of
+`torsion-exact`'s evaluation split.
 """
 
 from __future__ import annotations

@@ -110,6 +110,14 @@ class BodyGraph:
         """B."""
         return len(self.cell_size)
 
+    @property
+    def time_steps(self) -> Tensor:
+        """Logarithm of each body's time step over its cell size, s/m, (B,), float64.
+
+        All that a network sees of either, for its inputs and answers are without units.
+        """
+        return (self.time_step.double() / self.cell_size.double()).log()
+
     @cached_property
     def node_counts(self) -> Tensor:
         """Nodes of each body, (B,), in the type of ``rest``."""

@@ -69,6 +69,7 @@ class CompiledCorrector:
             corrector, self._bodies, self._groups, self.network.x, self.network.e
         )
         self._output_scale = float(corrector.normaliser.output_scale)
+        self._beyond = corrector.time_step_excess(self._bodies)
         self._view: View | None = None
 
     def of_view(self, view: View) -> Tensor:
@@ -102,11 +103,12 @@ class CompiledCorrector:
         low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
         return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
 
-    def step_excess(self, bodies: BodyGraph) -> Array:
-        """See `Corrector.step_excess`."""
-        normaliser = self._corrector.normaliser
-        low, high = normaliser.step_low.numpy(), normaliser.step_high.numpy()
-        return np.array([largest_excess(np.log(bodies.time_step.numpy()), low, high)])
+    def time_step_excess(self, bodies: BodyGraph) -> Array:
+        """See `Corrector.time_step_excess`."""
+        self._follow()
+        same = bodies is self._bodies
+        found: Array = (self._beyond if same else self._corrector.time_step_excess(bodies)).numpy()
+        return found.copy()
 
     def _follow(self) -> None:
         if self._contents.changed:

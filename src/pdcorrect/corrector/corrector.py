@@ -46,8 +46,8 @@ class Answers(Protocol):
     def shape_excess(self, bodies: BodyGraph) -> Values:
         """How far measures of each body at rest lie outside their range in training, (B,)."""
 
-    def step_excess(self, bodies: BodyGraph) -> Values:
-        """How far the logarithm of each time step lies outside its range in training, (B,)."""
+    def time_step_excess(self, bodies: BodyGraph) -> Values:
+        """How far each time step over cell size lies outside its range in training, (B,)."""
 
 
 class Corrector(nn.Module):
@@ -137,9 +137,12 @@ class Corrector(nn.Module):
         """
         return self.normaliser.shape_excess(bodies.shapes).amax(dim=1)
 
-    def step_excess(self, bodies: BodyGraph) -> Tensor:
-        """How far the logarithm of each body's time step lies outside its range, (B,)."""
-        return self.normaliser.step_excess(bodies.time_step.log())
+    def time_step_excess(self, bodies: BodyGraph) -> Tensor:
+        """How far each time step over cell size lies outside its range in training, (B,).
+
+        Of its logarithm, dimensionless, see `Normaliser.time_step_excess`.
+        """
+        return self.normaliser.time_step_excess(bodies.time_steps)
 
     def in_metres(self, view: View, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
@@ -20,6 +20,7 @@ from pdcorrect.corrector.features import View
 from pdcorrect.corrector.values import Values, where
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import NonNegative, Number, Strict
+from pdcorrect.toml_config import explained
 
 
 class Reason(IntEnum):
@@ -30,7 +31,7 @@ class Reason(IntEnum):
     (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
     body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
     soon after a step that did not (`Gate.pause`).  FOLDED: the network sees a folded body
-    (`Gate.corners`).  TIME_STEP: it is unlike that of the training (`Gate.step`).
+    (`Gate.corners`).  TIME_STEP: it is unlike that of the training (`Gate.time_step`).
     """
 
     NONE = 0
@@ -43,10 +44,6 @@ class Reason(IntEnum):
     PAUSE = 7
     FOLDED = 8
     TIME_STEP = 9
-
-
-_ROUNDING = 1e-6
-"""Of logarithms of time steps, of which some are in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,9 +88,11 @@ class Gate(Strict):
         surface or supports at rest (`pdcorrect.corrector.shapes.shape_measures`) lies farther than
         this outside its range in training.  Most are logarithms: 0.3 is a factor of 1.35.  Ranges
         are separate: what is unlike by a combination of them, or by where a body branches, passes.
-    step
-        Refused in all steps if the logarithm of the time step lies farther than this outside its
-        range in training: 0.1 is a factor of 1.1.
+    time_step
+        Refused in all steps if the logarithm of the time step over the cell size, h/c in s/m, lies
+        farther than this outside its range in training: 0.1 is a factor of 1.1.  The network sees
+        lengths over c and times over h, so that of one material a body of half the cell size is to
+        it a body of twice the time step; scaled alike in both, it is the same body.
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data, of which
@@ -135,10 +134,15 @@ class Gate(Strict):
         would have passed: what was applied before is one half of a motion of which the gate does
         not know the other.  The count is kept in `State.memory` while it lasts.  Zero: each step
         is judged for itself.
+
+    Raises
+    ------
+    InputError
+        If a value is not what is expected, or there is no such test.
     """
 
     body: NonNegative | None = 0.3
-    step: NonNegative | None = 0.1
+    time_step: NonNegative | None = 0.1
     margin: NonNegative | None = 1.0
     share: Annotated[float, Field(strict=True, ge=0, lt=1)] = 0.05
     average: NonNegative | None = 4.5
@@ -149,15 +153,28 @@ class Gate(Strict):
     limit: bool = False
     pause: Annotated[int, Field(strict=True, ge=0)] = 5
 
+    def __init__(self, /, **values: Any) -> None:
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise InputError(f"gate: {explained(error)}") from None
+
     def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Why scenes are refused in all steps, by their bodies at rest or time steps.
 
         Numbers (B,) of `Reason`, 0 where they are not; that of the body where both are unlike those
         of the training.
+
+        Parameters
+        ----------
+        corrector : Answers
+            Which knows the ranges of its training.
+        bodies : BodyGraph
+            B, one for each scene.
         """
         reasons: Values = torch.zeros_like(bodies.cell_size, dtype=torch.int64)
-        if self.step is not None:
-            beyond = corrector.step_excess(bodies) > self.step + _ROUNDING
+        if self.time_step is not None:
+            beyond = corrector.time_step_excess(bodies) > self.time_step
             reasons = where(beyond, int(Reason.TIME_STEP), reasons)
         if self.body is not None:
             beyond = corrector.shape_excess(bodies) > self.body

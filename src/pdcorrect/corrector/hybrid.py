@@ -137,7 +137,7 @@ class HybridStepper:
         return self
 
     def describe(self) -> dict[str, str]:
-        """The coarse stepper's description, the network's with a digest, the gate, the origin."""
+        """The coarse stepper's description, that of network, gate and training, the origin."""
         config = self.corrector.config
         return {
             **self.coarse.describe(),
@@ -147,6 +147,7 @@ class HybridStepper:
             "placement": self.placement,
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
+            "trained_step": self.trained_step,
             **self.origin,
         }
 
@@ -159,12 +160,20 @@ class HybridStepper:
         found = self.corrector.normaliser.shape_excess(self.bodies.shapes)[0].tolist()
         return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > _ROUNDING}
 
-    def step_excess(self) -> float:
-        """How far the logarithm of the time step lies outside its range in training, at least 0.
+    def time_step_excess(self) -> float:
+        """How far the time step over the cell size lies outside its range in training, at least 0.
 
-        A gate refuses all steps if it is more than its bound `Gate.step`.
+        Of its logarithm, dimensionless; infinite if it is not known.  A gate refuses all steps if
+        it is more than its bound `Gate.time_step`.
         """
-        return float(self.corrector.step_excess(self.bodies))
+        return float(self.corrector.time_step_excess(self.bodies))
+
+    @property
+    def trained_step(self) -> str:
+        """The time step of the training for cells of this body's size, or its range, s."""
+        size = self.problem.cell_size
+        steps = dict.fromkeys(f"{size * x:.4g}" for x in self.corrector.normaliser.time_steps)
+        return f"{' to '.join(steps)} s"
 
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""

@@ -45,7 +45,7 @@ from torch import Tensor  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 
 FORMAT = "pdcorrect-model"
-VERSION = 4
+VERSION = 5
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 BACKWARD_EULER = "backward-euler"
@@ -79,11 +79,11 @@ class ModelRecord(Strict):
     code_digest: str = Field(default_factory=code_digest)
 
 
-class _Description(Strict):
-    """``model.json`` without its checksum."""
+class Description(Strict):
+    """``model.json`` without its checksum; all versions of the format since 2 have these keys."""
 
     format: Literal["pdcorrect-model"] = "pdcorrect-model"
-    version: Literal[4] = 4
+    version: int = VERSION
     architecture: CorrectorConfig
     parameters: int
     dtype: Literal["float32"] = "float32"
@@ -175,7 +175,7 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
     _check_layout(f"model for {folder}", corrector, state)
     _check_values(f"model for {folder}", state, InputError)
     weights = safetensors.save(state)
-    description = _Description(
+    description = Description(
         architecture=corrector.config, parameters=parameters(corrector.config),
         normalisation=_normalisation(state), record=record,
         weights_sha256=hashlib.sha256(weights).hexdigest(),
@@ -250,14 +250,8 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     """
     folder = model_folder(path_or_name)
     path = folder / WEIGHTS
-    found = _read_description(folder / DESCRIPTION)
-    data = _read(path)
-    if hashlib.sha256(data).hexdigest() != found.weights_sha256:
-        raise FileFormatError(
-            f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "
-            "the program that replaced the model was ended half-way; copy or save it again."
-        )
-    state = _tensors(path, data)
+    found = read_description(folder)
+    state = read_weights(folder, found)
     corrector = _empty(path, found.architecture, state)
     _check_tensors(path, state, corrector.state_dict())
     _check_values(str(path), state, FileFormatError)
@@ -275,8 +269,12 @@ def model_folder(path_or_name: str | Path) -> Path:
     Raises
     ------
     InputError
-        If there is none.
+        If there is none, or it is no path or name.
     """
+    if not isinstance(path_or_name, (str, os.PathLike)) or not str(path_or_name).strip():
+        raise InputError(
+            f"model {path_or_name!r}: expected the name of a model or the path of its folder."
+        )
     named = isinstance(path_or_name, str) and path_or_name.strip(".") != ""
     named = named and not set(str(path_or_name)) & {"/", os.sep}
     folder = models_folder() / path_or_name if named else Path(path_or_name)
@@ -285,9 +283,10 @@ def model_folder(path_or_name: str | Path) -> Path:
     if not named:
         raise InputError(f"{folder}: expected a folder with a model, there is none.")
     known = sorted(path.parent.name for path in models_folder().glob(f"*/{DESCRIPTION}"))
+    here = ", which is a folder here" if Path(path_or_name).is_dir() else ""
     raise InputError(
         f"model {path_or_name!r}: not in {models_folder()}: expected one of "
-        f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}."
+        f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}{here}."
     )
 
 
@@ -314,7 +313,23 @@ def _read(path: Path) -> bytes:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
 
 
-def _read_description(path: Path) -> _Description:
+def read_description(folder: Path, versions: Sequence[int] = (VERSION,)) -> Description:
+    """What ``model.json`` in a folder says, if it is whole.
+
+    Parameters
+    ----------
+    folder : Path
+    versions : sequence of int
+        Of the format, which may be older ones.
+
+    Raises
+    ------
+    FileFormatError
+        If it is damaged.
+    FileVersionError
+        If it was written in another version of the format.
+    """
+    path = folder / DESCRIPTION
     data = _read(path)
     try:
         content = json.loads(data.decode("utf-8"))
@@ -324,23 +339,46 @@ def _read_description(path: Path) -> _Description:
         raise FileFormatError(f"{path}: damaged: not JSON of a model ({reason}).") from None
     if content.get("format") != FORMAT:
         raise FileFormatError(f"{path}: expected format {FORMAT!r}: damaged or something else.")
-    version = content.get("version")
-    if version != VERSION:
-        newer = isinstance(version, int) and version > VERSION
-        advice = "written by an older pdcorrect: docs/files.md says how to bring it up to date."
-        if newer:
-            advice = "written by a newer pdcorrect: update it."
-        raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {advice}")
+    _check_version(path, content.get("version"), versions)
     if content.pop(_CHECKSUM, None) != digest:
         raise FileFormatError(
             f"{path}: damaged: its checksum is not that of its content; copy or save it again."
         )
     try:
-        return _Description.model_validate(content)
+        return Description.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         raise FileFormatError(f"{path}: {place}: {first['msg']}.") from None
+
+
+def _check_version(path: Path, version: object, versions: Sequence[int]) -> None:
+    expected = " or ".join(map(str, versions))
+    if not isinstance(version, int):
+        raise FileVersionError(f"{path}: version is {version!r}: expected {expected}: damaged.")
+    if version not in versions:
+        advice = "written by an older pdcorrect: docs/files.md says how to bring it up to date."
+        if version > VERSION:
+            advice = "written by a newer pdcorrect: update it."
+        raise FileVersionError(f"{path}: format version {version}: expected {expected}: {advice}")
+
+
+def read_weights(folder: Path, description: Description) -> dict[str, Tensor]:
+    """The tensors in a folder, if they are those that its description is of.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged or another one.
+    """
+    path = folder / WEIGHTS
+    data = _read(path)
+    if hashlib.sha256(data).hexdigest() != description.weights_sha256:
+        raise FileFormatError(
+            f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "
+            "the program that replaced the model was ended half-way; copy or save it again."
+        )
+    return _tensors(path, data)
 
 
 def _tensors(path: Path, data: bytes) -> dict[str, Tensor]:

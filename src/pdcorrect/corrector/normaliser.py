@@ -26,6 +26,12 @@ _LEAST_SPREAD = 0.1
 Means that symmetry makes vanish in all training bodies would make any other look strange.
 """
 
+_ROUNDING = 1e-5
+"""Of logarithms of time steps over cell sizes.
+
+Cell sizes come from positions, of which some are in single precision.
+"""
+
 _PARTS = ("mean", "deviation", "low", "high")
 """What is known of each feature, by the names of the buffers."""
 
@@ -114,9 +120,9 @@ class Normaliser(nn.Module):
     shape_low, shape_high : (10,) tensors
         Range of the measures of training bodies at rest, see `shape_measures`; not numbers before
         `fit_shapes`.
-    step_low, step_high : (1,) tensors
-        Range of the logarithm of the training data's time step over 1 s; not a number before
-        `fit_steps`.
+    time_step_low, time_step_high : (1,) tensors
+        Range of the logarithm of the training data's time step over cell size, s/m, see
+        `BodyGraph.time_steps`; not a number before `fit_time_steps`.
     fitted : bool
         Whether it has seen data.
     """
@@ -128,8 +134,8 @@ class Normaliser(nn.Module):
     average_deviation: Tensor
     shape_low: Tensor
     shape_high: Tensor
-    step_low: Tensor
-    step_high: Tensor
+    time_step_low: Tensor
+    time_step_high: Tensor
 
     def __init__(self, nodes: Mapping[str, int], edges: Mapping[str, int]) -> None:
         super().__init__()
@@ -141,7 +147,7 @@ class Normaliser(nn.Module):
         for part in _PARTS:
             unknown = torch.full((sum(nodes.values()),), torch.nan, dtype=torch.float64)
             self.register_buffer(f"average_{part}", unknown)
-        for name, k in (("shape", len(SHAPE_MEASURES)), ("step", 1)):
+        for name, k in (("shape", len(SHAPE_MEASURES)), ("time_step", 1)):
             for part in ("low", "high"):
                 unknown = torch.full((k,), torch.nan, dtype=torch.float64)
                 self.register_buffer(f"{name}_{part}", unknown)
@@ -152,8 +158,11 @@ class Normaliser(nn.Module):
 
     @property
     def time_steps(self) -> tuple[float, float]:
-        """Least and largest time step of the training data, s."""
-        return float(self.step_low.exp()), float(self.step_high.exp())
+        """Least and largest time step over cell size of the training data, s/m.
+
+        Not numbers before `fit_time_steps`.
+        """
+        return float(self.time_step_low.exp()), float(self.time_step_high.exp())
 
     def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
         """Take over the moments of features, and of targets (m, 1).
@@ -184,20 +193,21 @@ class Normaliser(nn.Module):
 
     def fit_averages(self, averages: Moments) -> None:
         """Take over range, mean and deviation of bodies' mean inputs (m, a), see `joined`."""
-        self.average_low.copy_(averages.low)
-        self.average_high.copy_(averages.high)
+        self._fit_range("average_", averages)
         self.average_mean.copy_(averages.mean)
         self.average_deviation.copy_(averages.deviation.clamp_min(_LEAST_SPREAD))
 
     def fit_shapes(self, shapes: Moments) -> None:
         """Take over the range of bodies' measures at rest (m, 10)."""
-        self.shape_low.copy_(shapes.low)
-        self.shape_high.copy_(shapes.high)
+        self._fit_range("shape_", shapes)
 
-    def fit_steps(self, steps: Moments) -> None:
-        """Take over the range of logarithms of time steps (m, 1)."""
-        self.step_low.copy_(steps.low)
-        self.step_high.copy_(steps.high)
+    def fit_time_steps(self, steps: Moments) -> None:
+        """Take over the range of logarithms of time steps over cell sizes, s/m, (m, 1)."""
+        self._fit_range("time_step_", steps)
+
+    def _fit_range(self, prefix: str, moments: Moments) -> None:
+        for part in ("low", "high"):
+            getattr(self, prefix + part).copy_(getattr(moments, part))
 
     def widen(self, features: Mapping[str, Moments]) -> None:
         """Widen the ranges by those of further values; means and deviations do not change."""
@@ -212,9 +222,9 @@ class Normaliser(nn.Module):
         """Widen the range of bodies' measures at rest (m, 10); as of `widen`."""
         self._widen("shape_", shapes)
 
-    def widen_steps(self, steps: Moments) -> None:
-        """Widen the range of logarithms of time steps (m, 1); as of `widen`."""
-        self._widen("step_", steps)
+    def widen_time_steps(self, steps: Moments) -> None:
+        """Widen the range of logarithms of time steps over cell sizes (m, 1); as of `widen`."""
+        self._widen("time_step_", steps)
 
     def _widen(self, prefix: str, moments: Moments) -> None:
         for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
@@ -258,12 +268,14 @@ class Normaliser(nn.Module):
         """
         return self._beyond("shape_", shapes)
 
-    def step_excess(self, steps: Tensor) -> Tensor:
-        """How far logarithms of time steps (B,) lie outside their range in training, at least 0.
+    def time_step_excess(self, steps: Tensor) -> Tensor:
+        """How far logarithms of time steps over cell sizes (B,), s/m, lie outside their range.
 
+        At least 0, in double precision; what rounding alone may make of them counts as 0.
         Infinite where it is not a number.
         """
-        return self._beyond("step_", steps)
+        found = self._beyond("time_step_", steps.double())
+        return torch.where(found > _ROUNDING, found, 0.0)
 
     def _beyond(self, prefix: str, values: Tensor) -> Tensor:
         low, high = (getattr(self, prefix + part).to(values) for part in ("low", "high"))

@@ -123,9 +123,9 @@ class RecordedCorrector:
         return self._corrector.shape_excess(bodies)
 
     @torch.no_grad()
-    def step_excess(self, bodies: BodyGraph) -> Tensor:
-        """See `Corrector.step_excess`."""
-        return self._corrector.step_excess(bodies)
+    def time_step_excess(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.time_step_excess`."""
+        return self._corrector.time_step_excess(bodies)
 
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""

@@ -62,13 +62,15 @@ def hybrid_of(
 
 
 def about_model(model: str | Path) -> dict[str, str]:
-    """Which model that is: name, base, data set, integrator and time step, digest of weights."""
+    """Which model that is.
+
+    Keys are ``model``, its name, ``base``, ``dataset``, ``trained_integrator`` and
+    ``weights_sha256``.  Time steps are known by a body's cells: `HybridStepper.trained_step`.
+    """
     loaded, folder = load_model(model), model_folder(model)
-    steps = dict.fromkeys(f"{h:g}" for h in loaded.corrector.normaliser.time_steps)
     return {
         "model": folder.name, "base": loaded.base, "dataset": loaded.record.dataset,
-        "trained_integrator": loaded.integrator, "trained_step": f"{' to '.join(steps)} s",
-        "weights_sha256": weights_digest(folder),
+        "trained_integrator": loaded.integrator, "weights_sha256": weights_digest(folder),
     }  # fmt: skip
 
 

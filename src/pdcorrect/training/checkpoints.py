@@ -22,7 +22,7 @@ from safetensors import torch as safetensors  # noqa: E402
 from torch import Tensor  # noqa: E402
 
 FORMAT = "pdcorrect-checkpoint"
-VERSION = 3
+VERSION = 4
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:

@@ -39,8 +39,9 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
     chosen = _chosen(every, most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
-    corrector.normaliser.fit_shapes(_shapes(windows))
-    corrector.normaliser.fit_steps(_steps(windows))
+    shapes, steps = _at_rest(windows)
+    corrector.normaliser.fit_shapes(shapes)
+    corrector.normaliser.fit_time_steps(steps)
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
 
@@ -52,8 +53,9 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
     every = np.arange(len(windows.dataset))
-    corrector.normaliser.widen_shapes(_shapes(windows))
-    corrector.normaliser.widen_steps(_steps(windows))
+    shapes, steps = _at_rest(windows)
+    corrector.normaliser.widen_shapes(shapes)
+    corrector.normaliser.widen_time_steps(steps)
     _widen(corrector, windows, _chosen(every, most, seed))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
 
@@ -109,21 +111,14 @@ def _averages(
     return averages
 
 
-def _shapes(windows: StepWindows) -> Moments:
-    """Of the measures of all bodies at rest (m, 10)."""
+def _at_rest(windows: StepWindows) -> tuple[Moments, Moments]:
+    """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
     meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
-    shapes = Moments()
+    shapes, steps = Moments(), Moments()
     for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
         shapes.add(batch.bodies.shapes)
-    return shapes
-
-
-def _steps(windows: StepWindows) -> Moments:
-    """Of the logarithms of all files' time steps (m, 1)."""
-    steps = torch.tensor([[h.time_step] for h in windows.dataset.headers], dtype=torch.float64)
-    moments = Moments()
-    moments.add(steps.log())
-    return moments
+        steps.add(batch.bodies.time_steps[:, None])
+    return shapes, steps
 
 
 def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:

@@ -1,4 +1,4 @@
-"""`Gate.step`: a gate that knows the time step of the training."""
+"""`Gate.time_step`: a gate that knows the time step over the cell size of the training."""
 
 from dataclasses import replace
 
@@ -15,25 +15,26 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate, Reason, refusals
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.normaliser import Moments, Normaliser
+from pdcorrect.errors import InputError
 
-H = 0.01
-"""Time step of the training, s."""
+H, C = 0.01, 0.02
+"""Time step and cell size of the training, s and m."""
 ONLY_STEPS = Gate(
     body=None, margin=None, average=None, volume=None, crushing=None, energy=None, pause=0
 )
 
 
 def logarithms(*steps):
-    """Of time steps, s, as a normaliser takes them."""
+    """Of time steps, s, over the cell size, as a normaliser takes them."""
     found = Moments()
-    found.add(torch.tensor(steps, dtype=torch.float64).log()[:, None])
+    found.add((torch.tensor(steps, dtype=torch.float64) / C).log()[:, None])
     return found
 
 
 def ranged(*steps):
-    """A corrector that knows some time steps, otherwise without values."""
+    """A corrector that knows some time steps, s, otherwise without values."""
     corrector = Corrector(preset("compact", layers=1, width=8))
-    corrector.normaliser.fit_steps(logarithms(*steps))
+    corrector.normaliser.fit_time_steps(logarithms(*steps))
     return corrector
 
 
@@ -52,42 +53,44 @@ def stepped(factor, cells=(3, 1, 1)):
 
 
 def test_time_steps_lie_outside_their_range_by_the_logarithm_of_a_factor():
-    found = ranged(0.02, 0.005, 0.01).step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
+    found = ranged(0.02, 0.005, 0.01).time_step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
     expected = [np.log(5 / 4), 0.0, 0.0, 0.0, np.log(3 / 2)]
     assert found.tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_no_time_step_is_known_before_data_were_seen_nor_is_what_is_no_number():
     corrector = Corrector(preset("compact", layers=1, width=8))
-    assert corrector.step_excess(graph(H)).tolist() == [np.inf]
-    assert Gate(body=None, step=1e6).foreign(corrector, graph(H)).tolist() == [Reason.TIME_STEP]
+    assert corrector.time_step_excess(graph(H)).tolist() == [np.inf]
+    wide = Gate(body=None, time_step=1e6)
+    assert wide.foreign(corrector, graph(H)).tolist() == [Reason.TIME_STEP]
     known = ranged(H)
-    assert known.step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
+    assert known.time_step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
     assert np.isnan(corrector.normaliser.time_steps).all()
 
 
 def test_time_steps_of_further_data_are_as_known_as_those_of_the_first():
     corrector = ranged(H)
-    corrector.normaliser.widen_steps(logarithms(0.5 * H))
-    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H, H))
-    corrector.normaliser.widen_steps(logarithms(0.7 * H, 3.0 * H))
-    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H, 3.0 * H))
-    found = corrector.step_excess(graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H))
+    corrector.normaliser.widen_time_steps(logarithms(0.5 * H))
+    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, H / C))
+    corrector.normaliser.widen_time_steps(logarithms(0.7 * H, 3.0 * H))
+    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, 3.0 * H / C))
+    found = corrector.time_step_excess(graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H))
     assert found.tolist() == pytest.approx([np.log(2), 0.0, 0.0, np.log(2)], abs=1e-12)
 
 
 def test_a_fit_takes_the_place_of_what_was_known():
     corrector = ranged(0.1 * H, 10.0 * H)
-    corrector.normaliser.fit_steps(logarithms(H))
-    assert corrector.normaliser.time_steps == pytest.approx((H, H))
+    corrector.normaliser.fit_time_steps(logarithms(H))
+    assert corrector.normaliser.time_steps == pytest.approx((H / C, H / C))
 
 
 def test_the_range_is_part_of_a_corrector_s_values():
     state = ranged(H, 2.0 * H).state_dict()
-    assert state["normaliser.step_low"].tolist() == pytest.approx([np.log(H)])
-    assert state["normaliser.step_high"].tolist() == pytest.approx([np.log(2.0 * H)])
+    assert state["normaliser.time_step_low"].tolist() == pytest.approx([np.log(H / C)])
+    assert state["normaliser.time_step_high"].tolist() == pytest.approx([np.log(2.0 * H / C)])
     empty = Normaliser({"a": 1}, {}).state_dict()
-    assert empty["step_low"].isnan().tolist() == empty["step_high"].isnan().tolist() == [True]
+    assert empty["time_step_low"].isnan().tolist() == [True]
+    assert empty["time_step_high"].isnan().tolist() == [True]
 
 
 # --- the gate ----------------------------------------------------------------------------------
@@ -104,15 +107,20 @@ def test_the_default_bound_is_a_factor_of_1_1_both_ways():
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("step", [0.01, 0.003, 1 / 60, 0.007])
 def test_the_very_time_step_of_the_training_passes_the_narrowest_bound(step, dtype):
-    gate, corrector = Gate(body=None, step=0.0), ranged(step)
+    gate, corrector = Gate(body=None, time_step=0.0), ranged(step)
     assert gate.foreign(corrector, graph(*[step] * 9, dtype=dtype)).tolist() == [0] * 9
     assert gate.foreign(corrector, graph(1.0001 * step, dtype=dtype)).tolist() == [Reason.TIME_STEP]
 
 
 @pytest.mark.parametrize("value", [-0.1, "0.1", float("nan"), True])
 def test_a_bound_that_is_no_number_from_0_on_is_refused(value):
-    with pytest.raises(ValueError, match="step"):
-        Gate(step=value)
+    with pytest.raises(InputError, match=r"gate: time_step = .*: expected|finite"):
+        Gate(time_step=value)
+
+
+def test_a_test_that_gates_do_not_have_is_refused():
+    with pytest.raises(InputError, match="gate: step: unknown key"):
+        Gate(step=0.1)
 
 
 def test_a_body_counts_before_its_time_step():
@@ -126,7 +134,7 @@ def test_a_body_counts_before_its_time_step():
         (0.3, None, [0, 0, Reason.BODY, Reason.BODY]),
         (None, None, [0, 0, 0, 0]),
     ):
-        assert Gate(body=body, step=step).foreign(corrector, bodies).tolist() == expected
+        assert Gate(body=body, time_step=step).foreign(corrector, bodies).tolist() == expected
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -144,10 +152,10 @@ def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(
     assert not run.stats["correction"].any()
     assert corrector.calls == 0
     assert not hybrid(problem.rest_state()).state.memory  # nothing to pause for
-    assert hybrid.step_excess() == pytest.approx(np.log(2.0))
+    assert hybrid.time_step_excess() == pytest.approx(np.log(2.0))
     counts = refusals(run.stats["gate"])
     assert counts["time step"] == sum(counts.values()) == 4
-    open_ = HybridStepper(coarse, corrector, gate=ONLY_STEPS.model_copy(update={"step": None}))
+    open_ = HybridStepper(coarse, corrector, gate=ONLY_STEPS.model_copy(update={"time_step": None}))
     found = open_(problem.rest_state())
     assert corrector.calls == 1
     assert found.stats["gate"] == 0.0 < found.stats["correction"]
@@ -163,6 +171,42 @@ def test_it_is_the_stepper_s_time_step_that_counts_and_not_the_scene_s():
         stepper = pc.BatchStepper([problem], time_step=step)
         many = BatchHybrid(stepper, corrector, gate=ONLY_STEPS)
         assert many(stepper.rest_state()).reasons.tolist() == [reason]
+
+
+SCALED = [(0.5, 1.0, Reason.TIME_STEP), (1.0, 2.0, Reason.TIME_STEP), (0.5, 0.5, 0), (3.0, 3.0, 0)]
+"""Factors on all lengths and on the time step, and what a gate says."""
+
+
+@pytest.mark.parametrize(("lengths", "times", "reason"), SCALED)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_half_the_lengths_are_refused_as_twice_the_step_is_and_both_alike_pass(
+    lengths, times, reason, dtype
+):
+    """Of one material, waves cross as many cells in a step wherever h/c is the same."""
+    body = {"shape": "beam", "cells": [3, 1, 1], "cell_size": lengths * C}
+    scene = soft_beam().with_changes(body=body, time={"step": times * H})
+    problem = pc.discretise(scene)
+    corrector = fitted(problems((3, 1, 1)))
+    gate = Gate(time_step=0.0)  # the narrowest; of bodies at rest, as by default
+    bodies = BodyGraph.of([problem], dtype=dtype)
+    assert gate.foreign(corrector, bodies).tolist() == [reason]
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+    assert hybrid.compiled
+    excess = np.log(2.0) if reason else 0.0
+    assert hybrid.time_step_excess() == pytest.approx(excess, rel=1e-6)
+    assert hybrid.trained_step == f"{lengths * H:g} s"
+    assert (hybrid(problem.rest_state()).stats["gate"] == Reason.TIME_STEP) == (reason != 0)
+
+
+def test_a_body_s_excess_is_the_same_to_compiled_answers_and_in_a_batch():
+    problem = stepped(1.7)
+    corrector = fitted(problems((3, 1, 1)))
+    single = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    many = BatchHybrid(pc.BatchStepper([problem, problem]), corrector)._hybrid.nodes.graph
+    expected = corrector.time_step_excess(many)
+    assert single.compiled
+    assert single._answers.time_step_excess(single.bodies).tolist() == expected.tolist()[:1]
+    assert expected.tolist() == pytest.approx([np.log(1.7)] * 2, rel=1e-12)
 
 
 def test_compiled_answers_refuse_a_foreign_time_step_too():
@@ -190,7 +234,7 @@ def test_a_batch_of_another_time_step_is_refused_as_a_whole_each_scene_by_its_re
     assert not result.state.memory
     assert not result.correction.any()
     assert recorded or corrector.calls == 0
-    gate = ONLY_STEPS.model_copy(update={"body": 0.3, "step": None})
+    gate = ONLY_STEPS.model_copy(update={"body": 0.3, "time_step": None})
     result = BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)(state)
     assert result.reasons.tolist() == [0, Reason.BODY]
     assert result.correction[: len(known.positions)].any()
@@ -227,6 +271,6 @@ def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_f
 
 
 @pytest.mark.parametrize("name", ["tiny", "torsion-exact", "all-as-published-total-mass"])
-def test_released_models_know_the_time_step_of_their_data(name):
+def test_released_models_know_the_time_step_and_cell_size_of_their_data(name):
     model = pc.load_model(name)
-    assert model.corrector.normaliser.time_steps == pytest.approx((H, H), rel=1e-12)
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=1e-12)
