@@ -102,7 +102,7 @@ class Alone:
             tuple(t + stepper.time_step for t in state.times),
         )  # fmt: skip
         scenes = len(positions)
-        none = torch.zeros(scenes, dtype=torch.bool, device=positions.device)
+        none = torch.zeros(scenes, dtype=torch.int64, device=positions.device)
         return AloneResult(after, correction, Unasked([Status.CONVERGED] * scenes), none)
 
 
@@ -120,7 +120,7 @@ class AloneResult:
     state: BatchState
     correction: Tensor
     coarse: Unasked
-    refused: Tensor
+    reasons: Tensor
 
 
 class AloneWindows(StepWindows):

@@ -62,6 +62,20 @@ def test_the_page_of_results_has_the_tables_of_the_records():
         assert len(found.splitlines()) == 2 + len(records) > 5  # each has its row
 
 
+def test_tables_are_printed_below_the_headings_of_the_page(monkeypatch, capsys):
+    page, tables = (ROOT / "docs" / "results.md").read_text(encoding="utf-8"), script("table")
+    monkeypatch.setattr(sys, "argv", ["table.py"])
+    tables.main()
+    told = capsys.readouterr().out
+    assert len(tables.tables()) == 8
+    for heading, text in tables.tables().items():
+        assert f"**{heading}**\n\n{text}\n" in told
+        before = page[: page.index(text)].splitlines()
+        last = next(line for line in reversed(before) if line.startswith("#"))
+        assert last.lstrip("# ") == heading
+    assert told.count("**\n\n| ") == 8
+
+
 def test_each_script_has_its_row_in_the_list():
     lines = (ROOT / "models" / "README.md").read_text(encoding="utf-8").splitlines()
     told = " ".join(line.split("|")[1] for line in lines if line.startswith("| `"))

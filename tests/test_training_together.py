@@ -246,10 +246,22 @@ def test_such_a_model_knows_each_of_its_data_sets(folders, trained):
     for name, config_hash in (("tiny", known[0]), ("other", known[-1])):
         (told,) = found.warnings(name, config_hash, "evaluation")
         assert "may be among the training meshes of the other sets" in told
-    assert "of another configuration" in found.warnings("other", "1" * 64, "evaluation")[0]
-    assert "of another configuration" in found.warnings("other", known[0], "evaluation")[0]
-    assert "not on 'third'" in found.warnings("third", known[0], "evaluation")[0]
+        assert f"trained on 'tiny+other', among them '{name}' of this configuration" in told
+    for config_hash in ("1" * 64, known[0]):
+        (told,) = found.warnings("other", config_hash, "evaluation")
+        assert "'tiny+other', of which 'other' was of another configuration than here" in told
+        assert "not on" not in told
+    (told,) = found.warnings("third", known[0], "evaluation")
+    assert "trained on 'tiny+other', not on 'third': " in told
     assert "not unseen" in found.warnings("other", known[-1], "training")[0]
+
+
+def test_of_a_data_set_whose_configuration_is_not_recorded_that_is_told(trained):
+    (found,) = saved_candidates([trained])
+    sets = found.model.record.training["data_sets"]
+    sets[1] = {**sets[1], "config_hash": None}
+    (told,) = found.warnings("other", "1" * 64, "evaluation")
+    assert "among them 'other' of an unrecorded configuration: meshes of this split" in told
 
 
 def test_the_command_takes_several_data_sets_and_judges_each(folders, program, tmp_path):

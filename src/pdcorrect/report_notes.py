@@ -253,9 +253,21 @@ def _of_the_models(comparison: Comparison) -> list[str]:
                 f"those of the coarse model that it would correct ({base!r}), to the last bit, "
                 "and take longer."
             )
-        step = refused_step(stats, comparison.scene.time.step, about["trained_step"])
+        step = _refused_step(comparison, row)
         found += [f"{row.label}: {one[0].lower()}{one[1:]}" for one in (meaning, step) if one]
     return found
+
+
+def _refused_step(comparison: Comparison, row: Row) -> str | None:
+    """How the time step differs from that of a model's training, if its gate refuses it."""
+    from pdcorrect.corrector.gate import Gate
+    from pdcorrect.corrector.model_io import load_model
+
+    case = next(case for case in comparison.cases if case.label == row.label)
+    if case.model is None or not case.gate:
+        return None
+    trained = load_model(case.model).corrector.normaliser.time_steps
+    return refused_step(Gate(), comparison.scene.time.step, trained)
 
 
 def _of_the_cells(comparison: Comparison) -> list[str]:

@@ -231,8 +231,8 @@ def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     if isinstance(stepper, HybridStepper):
         if (stats["gate"] == Reason.BODY).any():
             say(_refused_measures(stepper))
-        step, trained = stepper.problem.time_step, stepper.origin["trained_step"]
-        say(refused_step(stats, step, trained) or "")
+        trained = stepper.corrector.normaliser.time_steps
+        say(refused_step(stepper.gate, stepper.problem.time_step, trained) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
 

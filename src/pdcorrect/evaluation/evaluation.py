@@ -81,6 +81,10 @@ class EvaluatedRun:
         missing = {name: every - len(self.values(name)[0]) for name in names}
         return {name: count for name, count in missing.items() if 0 < count < every}
 
+    def refused_by(self) -> list[int]:
+        """Of each trajectory, the `Measured.refused_by`."""
+        return [t.refused_by for t in self.trajectories]
+
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""
         return [t.measures for t in self.trajectories if t.measures.failed is not None]
@@ -278,7 +282,7 @@ def _outcomes(
         yield (
             candidate.name,
             [
-                Outcome(run.positions, one, base, run.refused, run.failed)
+                Outcome(run.positions, one, base, run.reasons, run.failed)
                 for run, one in zip(runs, steps, strict=True)
             ],
         )

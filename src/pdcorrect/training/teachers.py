@@ -1,13 +1,15 @@
-"""Models that a training learns from, in place of the reference."""
+"""Models that a training goes on with, or learns from in place of the reference."""
 
 from __future__ import annotations
 
 import torch
 
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.model_io import LoadedModel, load_model
 from pdcorrect.errors import InputError
 from pdcorrect.training.config import TrainingConfig
+from pdcorrect.training.windows import StepWindows
 
 
 def load_teachers(config: TrainingConfig, device: torch.device) -> dict[str, Corrector]:
@@ -49,3 +51,23 @@ def check_trained_alike(
         there, here = getattr(model, key), getattr(config, key)
         if there != here:
             raise InputError(f"{what}: its {key} is {there!r}: expected {here!r}, as here.")
+
+
+def check_known_step(what: str, corrector: Corrector, windows: StepWindows) -> None:
+    """Refuse data whose time step a default gate refuses, by the ranges of a corrector that stay.
+
+    Raises
+    ------
+    InputError
+        If they have such a time step: the gate would refuse every step of what is learned.
+    """
+    bodies = windows.batch([0], last=False).bodies
+    if not Gate(body=None).foreign(corrector, bodies).any():
+        return
+    here = windows.dataset.headers[0].time_step
+    there = " to ".join(dict.fromkeys(f"{h:g}" for h in corrector.normaliser.time_steps))
+    raise InputError(
+        f"{what} with fitting.widen = false: the data's time step is {here:g} s, that of the "
+        f"ranges that stay {there} s, so a gate would refuse every step of what is learned: "
+        "expected data of that time step, widen = true, or anew = true."
+    )

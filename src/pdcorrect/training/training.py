@@ -41,7 +41,7 @@ from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
-from pdcorrect.training.teachers import check_trained_alike, load_teachers
+from pdcorrect.training.teachers import check_known_step, check_trained_alike, load_teachers
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 from pdcorrect.training.world import World
@@ -85,7 +85,8 @@ class Training:
         files of the data sets are missing, or do not have what the configuration wants; if one
         has a validation split and another has none, or their settings or time steps differ; if the
         model to start from is missing, or of another architecture, base (unless the normalisation
-        is fitted anew) or velocity; if a teacher is.
+        is fitted anew) or velocity, or its ranges stay and the data have another time step; if a
+        teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -314,6 +315,9 @@ class Training:
                 fit_normaliser(corrector, self._windows, windows, seed)
             elif config.fitting.widen:
                 widen_ranges(corrector, self._windows, windows, seed)
+            else:
+                what = f"start_from = {config.start_from!r}"
+                check_known_step(what, corrector, self._windows)
             self.world.same(list(corrector.state_dict().values()))
         return corrector
 
