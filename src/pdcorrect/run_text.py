@@ -126,9 +126,9 @@ def refused_step(gate: Gate | None, step: float, trained: tuple[float, float]) -
     known = " to ".join(dict.fromkeys(f"{h:g}" for h in trained))
     return (
         f"The time step is {step:g} s, that of the training {known} s: farther than the gate's "
-        f"bound {bound:g} of its logarithm, a factor of {math.exp(bound):.2g}. Expected a time step "
-        "as in the training; or, at your own risk, a gate without this bound, Gate(step=None), or "
-        "none (--no-gate)."
+        f"bound {bound:g} of its logarithm, a factor of {math.exp(bound):.2g}. Expected a time "
+        "step as in the training; or, at your own risk, a gate without this bound, "
+        "Gate(step=None), or none (--no-gate)."
     )
 
 
