@@ -1,6 +1,7 @@
 """`Gate.step`: a gate that knows the time step of the training."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,7 +227,11 @@ def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_f
 # --- released models ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["tiny", "torsion-exact", "all-as-published-total-mass"])
+MODELS = Path(__file__).parents[1] / "models"
+RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
+
+
+@pytest.mark.parametrize("name", RELEASED)
 def test_released_models_know_the_time_step_of_their_data(name):
     model = pc.load_model(name)
     assert model.corrector.normaliser.time_steps == pytest.approx((H, H), rel=1e-12)
