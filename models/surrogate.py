@@ -103,7 +103,7 @@ class Alone:
             tuple(t + stepper.time_step for t in state.times),
         )  # fmt: skip
         scenes = len(positions)
-        none = torch.zeros(scenes, dtype=torch.bool, device=positions.device)
+        none = torch.zeros(scenes, dtype=torch.int64, device=positions.device)
         return AloneResult(after, correction, Unasked([Status.CONVERGED] * scenes), none)
 
 
@@ -121,7 +121,7 @@ class AloneResult:
     state: BatchState
     correction: Tensor
     coarse: Unasked
-    refused: Tensor
+    reasons: Tensor
 
 
 class AloneWindows(StepWindows):

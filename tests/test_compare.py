@@ -256,10 +256,34 @@ def test_another_time_step_is_told_beside_that_of_the_training(stiff):
     told = report.notes(found)
     assert f"{label}: 2 of 2 corrections were refused by the gate (2 by time step)." in told
     assert any(note.startswith(f"{label} is no corrected run") for note in told)
-    expected = "the time step is 0.02 s, that of the training 0.01 s for cells of this size."
-    assert f"{label}: {expected}" in told
+    (step,) = [note for note in told if note.startswith(f"{label}: the time step is")]
+    assert "0.02 s, that of the training 0.01 s for cells of this size: farther than the" in step
+    assert "Expected a time step as in the training; or, at your own risk, a gate without" in step
     assert not any("that of the training" in n for n in report.notes(pc.compare(
         stiff, 1, cases=cases_for(stiff, [MODEL])[4:])))  # fmt: skip
+
+
+def test_another_time_step_is_told_of_a_foreign_body_too(thick):
+    pytest.importorskip("torch_geometric")
+    scene = thick.with_changes(time={"step": 0.02})
+    for gate, count in ((True, 1), (False, 0)):
+        cases = pc.evaluate.cases_with([MODEL], gate=gate)[-1:]
+        found = pc.compare(scene, 2, cases=cases)
+        told = report.notes(found)
+        label = cases[0].label
+        body = f"{label}: 2 of 2 corrections were refused by the gate (2 by body)."
+        assert told.count(body) == count
+        assert sum(note.startswith(f"{label}: the time step is 0.02 s") for note in told) == count
+
+
+def test_of_time_steps_that_a_gate_lets_pass_nothing_is_told():
+    gate = pytest.importorskip("pdcorrect.corrector.gate").Gate()
+    for step in (0.0046, 0.005, 0.01, 0.02, 0.0219):
+        assert run_text.refused_step(gate, step, 0.05, (0.1, 0.4)) is None
+    for step in (0.0045, 0.0222):
+        told = run_text.refused_step(gate, step, 0.05, (0.1, 0.4))
+        assert f"The time step is {step:g} s, that of the training 0.005 to 0.02 s for " in told
+        assert run_text.refused_step(None, step, 0.05, (0.1, 0.4)) is None
 
 
 def test_every_reason_of_a_gate_has_a_meaning():

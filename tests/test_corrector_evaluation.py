@@ -21,7 +21,7 @@ from pdcorrect.batch.states import BatchState  # noqa: E402
 from pdcorrect.cli import app  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
-from pdcorrect.corrector.gate import Gate  # noqa: E402
+from pdcorrect.corrector.gate import Gate, Reason  # noqa: E402
 from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
 from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
@@ -55,8 +55,9 @@ FRAMES, STEP = 5, 0.01
 class Fake:
     """A hybrid whose next positions of a scene are `answer(case, frame, positions)`."""
 
-    def __init__(self, stepper, cases, answer, refused=()):
-        self.stepper, self.answer, self.refused = stepper, answer, refused
+    def __init__(self, stepper, cases, answer, refused=(), reason=Reason.FEATURES):
+        self.stepper, self.answer = stepper, answer
+        self.reasons = dict.fromkeys(refused, int(reason))
         known = {case.problems["plain"].scene.name: case for case in cases}
         self.cases = [known[p.scene.name] for p in stepper.problems]
 
@@ -72,7 +73,7 @@ class Fake:
             state=after,
             correction=torch.zeros(n, 3, dtype=torch.float64),
             coarse=SimpleNamespace(statuses=[Status.CONVERGED] * count),
-            refused=torch.tensor([round(s[2] / h) in self.refused for s in found]),
+            reasons=torch.tensor([self.reasons.get(round(s[2] / h), 0) for s in found]),
         )
 
     def state(self, found):
@@ -172,6 +173,19 @@ def test_the_gates_rate_is_the_share_of_refused_steps(evaluation):
     assert values == [10.0] * 4
     assert sorted(meshes) == [0, 1, 2, 2]
     assert evaluation.runs["like plain"].values("gate_rate")[0] == [0.0] * 4
+
+
+def test_of_rollouts_that_a_gate_refuses_as_a_whole_the_reason_is_kept(cases):
+    options = {"refused": range(1, 21)}
+    candidates = [
+        fake(cases, perfect, reason.name, reason=reason, **options)
+        for reason in (Reason.BODY, Reason.TIME_STEP, Reason.FEATURES)
+    ]
+    found = evaluate([*candidates, fake(cases, perfect, "open")], TINY, batch=3).runs
+    for name, reason in (("BODY", 6), ("TIME_STEP", 9), ("FEATURES", 0), ("open", 0)):
+        assert found[name].refused_by() == [reason] * 4
+        assert found[name].values("gate_rate")[0] == [0.0 if name == "open" else 100.0] * 4
+    assert found["plain"].refused_by() == [0] * 4
 
 
 def test_names_of_models_must_be_unlike(cases):
@@ -712,7 +726,7 @@ def test_the_command_says_what_was_missing(unfinished):
     assert "1 of 3 files of the split are missing" in done.output
 
 
-def untrained(folder, base="plain", seed=0, dataset="tiny"):
+def untrained(folder, base="plain", seed=0, dataset="tiny", step=STEP):
     """A saved model whose correction is zero."""
     corrector = Corrector(preset("compact", layers=1, width=8))
     corrector.normaliser.output_scale.fill_(1e-3)
@@ -722,7 +736,7 @@ def untrained(folder, base="plain", seed=0, dataset="tiny"):
     shapes, steps = Moments(), Moments()
     shapes.add(torch.zeros(1, len(corrector.normaliser.shape_low)))
     corrector.normaliser.fit_shapes(shapes)
-    steps.add(torch.tensor([[0.2]], dtype=torch.float64).log())  # s/m, 0.01 s in cells of 5 cm
+    steps.add(torch.tensor([[step / 0.05]], dtype=torch.float64).log())  # of cells of 5 cm
     corrector.normaliser.fit_time_steps(steps)
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
@@ -747,7 +761,7 @@ def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_see
     assert found[0].warnings("tiny", "x", "evaluation") == []
     assert "trained on 'tiny', not on 'large'" in found[0].warnings("large", "x", "evaluation")[0]
     (told,) = found[0].warnings("tiny", "y", "evaluation")
-    assert "trained on 'tiny' of another configuration" in told
+    assert "trained on 'tiny' of another configuration than here: bodies, loads" in told
     assert "trained on this split" in found[0].warnings("tiny", "x", "training")[0]
     assert "chosen by this split" in found[0].warnings("tiny", "x", "validation")[0]
     with pytest.raises(InputError, match="comes twice"):
@@ -798,12 +812,33 @@ def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged):
     assert {path.name for path in output.iterdir()} == names
     content = json.loads((output / "summary.json").read_text())
     assert content["models"]["zero"]["weights_sha256"]
-    assert len(content["notes"]) == 2
+    assert len(content["notes"]) == 3
+    (told,) = (note for note in content["notes"] if note.startswith("zero: "))
+    assert "2 of 2 rollouts were refused in all steps by the gate (2 by body)" in told
+    assert told.endswith("'body': the body at rest is unlike those of its training.")
     assert content["environment"]["device"] == "cpu"
     found = content["runs"]["zero"]["measures"]
     assert abs(found["omega"]["mean"]) < 0.01  # solved again, to the data set's tolerance
     assert abs(found["step_omega"]["mean"]) < 0.1
     assert found["omega"]["interval"] is None  # one mesh
+
+
+def test_the_command_says_by_what_whole_rollouts_are_refused(tmp_path, monkeypatch):
+    model = untrained(tmp_path / "zero", step=0.5 * STEP)
+    counted = "- zero: 4 of 4 rollouts were refused in all steps by the gate (4 by {})"
+    step = f"- zero: the time step is {STEP:g} s, that of the training {0.5 * STEP:g} s for cells"
+    told = run_command(model, TINY).stdout  # its bodies are foreign, too
+    assert counted.format("body") in told
+    assert step in told
+    for gate, reason in ((Gate(body=None), "time step"), (Gate(body=None, margin=0.0), None)):
+        if reason is None:
+            model = untrained(tmp_path / "zero")
+        monkeypatch.setattr("pdcorrect.evaluation.candidates.DEFAULT_GATE", gate)
+        told = run_command(model, TINY).stdout
+        assert (counted.format(reason) in told) == (step in told) == (reason is not None)
+        assert "100.00" in told  # refused, per cent, by whatever
+    told = run_command(model, TINY, "--no-gate").stdout
+    assert "refused in all steps" not in told
 
 
 def test_bad_input_is_told_in_a_sentence(tmp_path, capsys, monkeypatch):
@@ -837,7 +872,7 @@ class Uncorrected:
         n, count = sum(self.stepper.node_counts), len(result.statuses)
         return SimpleNamespace(
             state=result.state, correction=torch.zeros(n, 3), coarse=result,
-            refused=torch.zeros(count, dtype=torch.bool),
+            reasons=torch.zeros(count, dtype=torch.int64),
         )  # fmt: skip
 
 

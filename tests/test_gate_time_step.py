@@ -1,6 +1,7 @@
 """`Gate.time_step`: a gate that knows the time step over the cell size of the training."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -270,7 +271,11 @@ def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_f
 # --- released models ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["tiny", "torsion-exact", "all-as-published-total-mass"])
+MODELS = Path(__file__).parents[1] / "models"
+RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
+
+
+@pytest.mark.parametrize("name", RELEASED)
 def test_released_models_know_the_time_step_and_cell_size_of_their_data(name):
     model = pc.load_model(name)
     assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=1e-12)

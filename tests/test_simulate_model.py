@@ -211,11 +211,30 @@ def test_a_run_whose_corrections_are_refused_says_so_and_why(
     assert sizes == sorted(sizes, reverse=True)
     assert min(sizes) >= 0.3
     assert "at most" not in out
+    assert "The time step is 0.01 s, that of the training 0.004 s for cells of this size" in out
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)
     best = pc.discretise(pc.best_coarse(pc.Scene.load(scene_file)))
     np.testing.assert_array_equal(run.positions, pc.rollout(pc.ProjectiveDynamics(best)).positions)
     assert json.loads(run.attributes["gate"])["body"] == 0.3
+
+
+def test_of_a_foreign_body_it_is_also_told_whether_the_time_step_is_foreign(
+    program, learned, scene_file, tmp_path
+):
+    for step in (0.02, 0.004):  # the training's for cells of 2 cm is 0.004 s
+        scene = pc.Scene.load(scene_file).with_changes(time={"step": step, "frames": 2})
+        (tmp_path / "s.toml").write_text(scene.to_toml(), encoding="utf-8")
+        command = ("simulate", tmp_path / "s.toml", "--model", MODEL, "--overwrite", "-o")
+        status, out, _ = program(*command, tmp_path / "run.h5")
+        assert status == 0
+        assert "2 of 2 corrections were refused by the gate (2 by body)" in out
+        assert "by more than the bound 0.3 (dimensionless): nodes " in out
+        assert ("The time step is 0.02 s, that of the training 0.004 s" in out) == (step == 0.02)
+        assert ("The time step is" in out) == (step == 0.02)
+        status, out, _ = program(*command, tmp_path / "open.h5", "--no-gate")
+        assert status == 0
+        assert "The time step is" not in out
 
 
 @pytest.mark.parametrize("step", [0.02, 0.005])
@@ -229,7 +248,8 @@ def test_a_run_of_another_time_step_is_the_base_s_and_says_of_which_the_training
     assert status == 0
     assert "2 of 2 corrections were refused by the gate (2 by time step)" in out
     assert "'time step': the time step over the cell size is unlike that of its training" in out
-    assert f"The time step is {step:g} s, that of the training 0.01 s for cells" in out
+    assert f"The time step is {step:g} s, that of the training 0.01 s for cells of this" in out
+    assert "the gate's bound 0.1 of its logarithm, a factor of 1.1. Expected a time step as" in out
     assert "Outside the range of the training bodies" not in out
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)

@@ -1,5 +1,7 @@
 """How the stress battery judges a run: distances from what has to be reached, and verdicts."""
 
+import importlib
+import json
 import sys
 from dataclasses import replace
 
@@ -257,3 +259,25 @@ def test_where_runs_part_the_better_answer_has_less_of_the_objective():
     assert mine < its
     assert curvature > 0.0
     assert BATTERY.parting(scenario, found, found) is None
+
+
+@pytest.mark.parametrize(("script", "scenes"), [("corners", "CROSSES"), ("periods", "PERIODS")])
+def test_records_beside_the_battery_name_the_weights_of_their_hybrids(
+    script, scenes, monkeypatch, tmp_path
+):
+    pytest.importorskip("torch")
+    from pdcorrect.corrector.model_io import weights_digest
+
+    monkeypatch.syspath_prepend(CASE.folder)
+    module, path = importlib.import_module(script), tmp_path / "record.json"
+    for name in (script, "run"):  # other cases have a module of the second name
+        del sys.modules[name]
+    monkeypatch.setattr(module, "rows", lambda scene: iter([{"solver": "PD best"}]))
+    monkeypatch.setattr(sys, "argv", [f"{script}.py", str(path)])
+    module.main()
+    found = json.loads(path.read_text(encoding="utf-8"))
+    assert found["weights_sha256"] == {
+        name: weights_digest(MODELS[name]) for name in ("hybrid torsion", "hybrid compact")
+    }
+    assert len(found["rows"]) == len(getattr(module, scenes))
+    assert found["command"].startswith(f"python validation/stress/{script}.py ")

@@ -72,7 +72,7 @@ def evaluate(
             workers=workers, skip_damaged=skip_damaged, incomplete=incomplete,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
-    notes = _notes(saved, found)
+    notes = _notes(saved, found, refuses)
     _print(found, notes, seed)
     if output:
         record = _record(saved, folder, device, batch, refuses, notes)
@@ -81,7 +81,7 @@ def evaluate(
             typer.echo(f"wrote {path}")
 
 
-def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
+def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) -> list[str]:
     """What a reader of the numbers has to know."""
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
@@ -92,6 +92,7 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
         )
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
+        notes += _refused(one, found, gate)
     for name, run in found.runs.items():
         notes += [
             f"{name}: {count} of {len(run.trajectories)} trajectories have no {measure}; its mean "
@@ -107,6 +108,18 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
                 "from there on, and counted so."
             )
     return notes
+
+
+def _refused(one: SavedCandidate, found: Evaluation, gate: Gate | None) -> list[str]:
+    """Of a model, how many rollouts its gate refused in all steps, and why."""
+    from pdcorrect.run_text import refused_rollouts, refused_step
+
+    name, trained = one.candidate.name, one.model.corrector.normaliser.time_steps
+    told = (
+        refused_rollouts(found.runs[name].refused_by()),
+        refused_step(gate, found.time_step, found.cell_size, trained),
+    )
+    return [f"{name}: {text[0].lower()}{text[1:]}" for text in told if text]
 
 
 def _print(found: Evaluation, notes: list[str], seed: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pdcorrect.evaluate import Comparison, Row
+from pdcorrect.fem.problem import discretise
 from pdcorrect.metrics import energy_balance, largest_displacement
 from pdcorrect.run_text import (
     foreign_integrator,
@@ -253,9 +254,22 @@ def _of_the_models(comparison: Comparison) -> list[str]:
                 f"those of the coarse model that it would correct ({base!r}), to the last bit, "
                 "and take longer."
             )
-        step = refused_step(stats, comparison.scene.time.step, about["trained_step"])
+        step = _refused_step(comparison, row)
         found += [f"{row.label}: {one[0].lower()}{one[1:]}" for one in (meaning, step) if one]
     return found
+
+
+def _refused_step(comparison: Comparison, row: Row) -> str | None:
+    """How the time step differs from that of a model's training, if its gate refuses it."""
+    from pdcorrect.corrector.gate import Gate
+    from pdcorrect.corrector.model_io import load_model
+
+    case = next(case for case in comparison.cases if case.label == row.label)
+    if case.model is None or not case.gate:
+        return None
+    trained = load_model(case.model).corrector.normaliser.time_steps
+    problem = discretise(comparison.scene)
+    return refused_step(Gate(), problem.time_step, problem.cell_size, trained)
 
 
 def _of_the_cells(comparison: Comparison) -> list[str]:

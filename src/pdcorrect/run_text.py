@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pdcorrect.state import Status
+
+if TYPE_CHECKING:
+    from pdcorrect.corrector.gate import Gate
 
 _MEANINGS = {
     "not finite": "the network's answer is not a number",
@@ -21,6 +25,9 @@ _MEANINGS = {
     "time step": "the time step over the cell size is unlike that of its training",
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
+
+_ROUNDING = 1e-5
+"""Of logarithms of time steps."""
 
 
 def three_digits(value: float) -> str:
@@ -58,38 +65,77 @@ def refused_corrections(stats: Mapping[str, Any]) -> list[str]:
     stats : mapping of str to (T,) arrays
         With ``refused`` and ``gate``.
     """
-    from pdcorrect.corrector.gate import refusals
-
-    counts = {reason: n for reason, n in refusals(stats["gate"]).items() if n}
-    if not counts:
+    refused, reasons, meaning = _counted(stats["gate"])
+    if not refused:
         return []
-    reasons = ", ".join(f"{n} by {reason}" for reason, n in counts.items())
-    meaning = "; ".join(f"'{reason}': {_MEANINGS[reason]}" for reason in counts)
-    refused, frames = sum(counts.values()), len(stats["gate"])
     return [
-        f"{refused} of {frames} corrections were refused by the gate ({reasons}).",
+        f"{refused} of {len(stats['gate'])} corrections were refused by the gate ({reasons}).",
         f"Of its refusals, {meaning}.",
     ]
 
 
-def refused_step(stats: Mapping[str, Any], step: float, trained: str) -> str | None:
-    """How a time step that a hybrid's gate refused differs from its training's; None if it was not.
+def refused_rollouts(reasons: Iterable[float]) -> str | None:
+    """How many rollouts a gate refused in all steps, and why; None if it did so in none.
 
     Parameters
     ----------
-    stats : mapping of str to (T,) arrays
-        With ``gate``.
+    reasons : iterable of numbers of `Reason`
+        Of each rollout, see `pdcorrect.evaluation.measures.Measured.refused_by`.
+    """
+    every = list(reasons)
+    refused, counts, meaning = _counted(every)
+    if not refused:
+        return None
+    return (
+        f"{refused} of {len(every)} rollouts were refused in all steps by the gate ({counts}), "
+        f"and are those of the coarse model; {meaning}."
+    )
+
+
+def _counted(reasons: Iterable[float]) -> tuple[int, str, str]:
+    """How many refusals there are, how many by each reason, and what these reasons mean."""
+    from pdcorrect.corrector.gate import refusals
+
+    counts = {reason: n for reason, n in refusals(reasons).items() if n}
+    return (
+        sum(counts.values()),
+        ", ".join(f"{n} by {reason}" for reason, n in counts.items()),
+        "; ".join(f"'{reason}': {_MEANINGS[reason]}" for reason in counts),
+    )
+
+
+def refused_step(
+    gate: Gate | None, step: float, cell_size: float, trained: tuple[float, float]
+) -> str | None:
+    """How a time step that a gate refuses differs from its training's; None if it does not.
+
+    Said also where the body at rest is refused, which is the reason then that steps record.
+
+    Parameters
+    ----------
+    gate : Gate or None
     step : float
         s.
-    trained : str
-        That of the training for the body's cell size, with its unit, see
-        `HybridStepper.trained_step`.
+    cell_size : float
+        m.
+    trained : (2,) floats
+        Least and largest time step over cell size of the training, s/m, see
+        `pdcorrect.corrector.normaliser.Normaliser.time_steps`.
     """
-    from pdcorrect.corrector.gate import Reason
-
-    if not (np.asarray(stats["gate"]) == Reason.TIME_STEP).any():
+    bound = None if gate is None else gate.time_step
+    if bound is None:
         return None
-    return f"The time step is {step:g} s, that of the training {trained} for cells of this size."
+    ratio = step / cell_size
+    excess = max(math.log(trained[0] / ratio), math.log(ratio / trained[1]))
+    if excess <= bound + _ROUNDING:
+        return None
+    known = " to ".join(dict.fromkeys(f"{cell_size * x:.4g}" for x in trained))
+    return (
+        f"The time step is {step:g} s, that of the training {known} s for cells of this size: "
+        f"farther than the gate's bound {bound:g} of its logarithm, a factor of "
+        f"{math.exp(bound):.2g}. Expected a time step as in the training; or, at your own risk, a "
+        "gate without this bound, Gate(time_step=None), or none (--no-gate)."
+    )
 
 
 def foreign_integrator(found: str, trained: str, name: str) -> str | None:

@@ -231,7 +231,8 @@ def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     if isinstance(stepper, HybridStepper):
         if (stats["gate"] == Reason.BODY).any():
             say(_refused_measures(stepper))
-        say(refused_step(stats, stepper.problem.time_step, stepper.trained_step) or "")
+        problem, trained = stepper.problem, stepper.corrector.normaliser.time_steps
+        say(refused_step(stepper.gate, problem.time_step, problem.cell_size, trained) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
 

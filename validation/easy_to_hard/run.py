@@ -35,7 +35,7 @@ class Subject:
     models : tuple of str
         Released; simulations are ranked by the first one's Omega.
     record, run : str
-        Folder in `common.RESULTS` with its evaluation, and its name there.
+        Folder in `common.RESULTS` with its evaluation by the weights released, and its name there.
     """
 
     models: tuple[str, ...]
@@ -46,7 +46,9 @@ class Subject:
 SUBJECTS = {
     "impulse": Subject(("impulse-exact",), "impulse-exact-third", "model"),
     "stretch": Subject(("stretch-exact",), "stretch-exact-second", "through-further/model"),
-    "torsion": Subject(("torsion-exact", "torsion-exact-compact"), "torsion-exact-sixth", "model"),
+    "torsion": Subject(
+        ("torsion-exact", "torsion-exact-compact"), "torsion-exact-seventh", "model"
+    ),
 }
 
 

@@ -27,6 +27,7 @@ from solvers import MODELS, Run, finer, run, steps_of
 
 import pdcorrect as pc
 
+HYBRIDS = ("hybrid torsion", "hybrid compact")
 GATES = {"default": pc.Gate(), "corners": pc.Gate(corners=0.0)}
 
 
@@ -35,7 +36,7 @@ def rows(scenario: Scenario) -> Iterator[dict[str, Any]]:
     truth = finer(scenario) if scenario.finer else None
     best = run(scenario, "PD best")
     yield {"scene": scenario.name, "solver": "PD best", **figures(scenario, best, truth)}
-    for name in ("hybrid torsion", "hybrid compact"):
+    for name in HYBRIDS:
         model = pc.load_model(MODELS[name])
         for label, gate in GATES.items():
             coarse = pc.ProjectiveDynamics(best.problem)
@@ -64,7 +65,8 @@ def main() -> None:
         for row in rows(scenario):
             found.append(row)
             print(row, flush=True)
-    record.write(output, rows=found)
+    digests = record.digests({name: MODELS[name] for name in HYBRIDS})
+    record.write(output, weights_sha256=digests, rows=found)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from solvers import MODELS, finer, run, steps_of
 
 import pdcorrect as pc
 
+HYBRIDS = ("hybrid torsion", "hybrid compact")
 PERIODS = (1, 2, 3, 4, 6, 8, 10, 13)
 """Steps between two turns."""
 PAUSES = (0, 1, 2, 3, 4, 5)
@@ -47,7 +48,7 @@ def rows(period: int) -> Iterator[dict[str, Any]]:
     truth, best = finer(scenario), run(scenario, "PD best")
     common = {"period": period, "moved_cells": moved(truth) / truth.problem.cell_size}
     yield {**common, "solver": "PD best", "error": error(best, truth)}
-    for name in ("hybrid torsion", "hybrid compact"):
+    for name in HYBRIDS:
         model = pc.load_model(MODELS[name])
         for gate in (None, *(pc.Gate(pause=pause) for pause in PAUSES)):
             coarse = pc.ProjectiveDynamics(best.problem)
@@ -69,7 +70,8 @@ def main() -> None:
         for row in rows(period):
             found.append(row)
             print(row, flush=True)
-    record.write(output, rows=found)
+    digests = record.digests({name: MODELS[name] for name in HYBRIDS})
+    record.write(output, weights_sha256=digests, rows=found)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from solvers import MODELS, problem_of, steps_of
 
 import pdcorrect as pc
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_io import LoadedModel, model_folder, weights_digest
+from pdcorrect.corrector.model_io import LoadedModel
 from pdcorrect.data.config import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.fem.coarse_models import Base
@@ -88,13 +88,7 @@ def main() -> None:
         found = row(models[network], models[ranges])
         rows.append({"network": network, "ranges": ranges, **found})
         print(rows[-1], flush=True)
-    record.write(
-        output,
-        weights_sha256={
-            name: weights_digest(model_folder(folder)) for name, folder in folders.items()
-        },
-        rows=rows,
-    )
+    record.write(output, weights_sha256=record.digests(folders), rows=rows)
 
 
 if __name__ == "__main__":

@@ -63,18 +63,23 @@ class SavedCandidate:
         """What speaks against taking its errors for those on unseen meshes of its own data."""
         record, name = self.model.record, self.candidate.name
         known = [x for own, x in self.model.data_sets if own == dataset]
-        if not {config_hash, None}.intersection(known):
-            other = " of another configuration" if known else ""
-            return [
-                f"{name} was trained on {record.dataset!r}{other}, not on {dataset!r}: bodies, "
-                "loads, materials and the coarse model's setting may be others than it knows, and "
-                "its training meshes may be among these."
-            ]
         several = len({own for own, _ in self.model.data_sets}) > 1
-        if split not in (TRAINING, VALIDATION) and several:
+        if not {config_hash, None}.intersection(known):
+            other = f", not on {dataset!r}"
+            if known:
+                own = f", of which {dataset!r} was" if several else ""
+                other = f"{own} of another configuration than here"
             return [
-                f"{name} was trained on {record.dataset!r}: meshes of this split may be among the "
-                "training meshes of the other sets."
+                f"{name} was trained on {record.dataset!r}{other}: bodies, loads, materials and "
+                "the coarse model's setting may be others than it knows, and its training meshes "
+                "may be among these."
+            ]
+        if split not in (TRAINING, VALIDATION) and several:
+            same = "this" if config_hash in known else "an unrecorded"
+            return [
+                f"{name} was trained on {record.dataset!r}, among them {dataset!r} of {same} "
+                "configuration: meshes of this split may be among the training meshes of the other "
+                "sets."
             ]
         if split == TRAINING:
             return [f"{name} was trained on this split: these are not unseen meshes."]

@@ -66,6 +66,11 @@ class Case:
         """In s."""
         return self.problems[PLAIN].time_step
 
+    @property
+    def cell_size(self) -> float:
+        """Of the coarse mesh, m."""
+        return self.problems[PLAIN].cell_size
+
 
 @dataclass(frozen=True, eq=False)
 class SplitCases:

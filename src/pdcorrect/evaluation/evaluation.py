@@ -81,6 +81,10 @@ class EvaluatedRun:
         missing = {name: every - len(self.values(name)[0]) for name in names}
         return {name: count for name, count in missing.items() if 0 < count < every}
 
+    def refused_by(self) -> list[int]:
+        """Of each trajectory, the `Measured.refused_by`."""
+        return [t.refused_by for t in self.trajectories]
+
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""
         return [t.measures for t in self.trajectories if t.measures.failed is not None]
@@ -93,8 +97,8 @@ class Evaluation:
     Attributes
     ----------
     dataset, split, setting, config_hash : str
-    time_step : float
-        s.
+    time_step, cell_size : float
+        s; m.
     runs : mapping of str to EvaluatedRun
         Candidates, then stored runs, "reference" last: of the latter only energies are of
         interest.
@@ -111,6 +115,7 @@ class Evaluation:
     setting: str
     config_hash: str
     time_step: float
+    cell_size: float
     runs: Mapping[str, EvaluatedRun]
     shards: Mapping[str, str]
     damaged: Damage = field(default_factory=dict)
@@ -216,7 +221,7 @@ def evaluate(
     about = found.attributes
     return Evaluation(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
-        float(about["time_step"]), runs, found.shards, found.damaged,
+        float(about["time_step"]), found.cases[0].cell_size, runs, found.shards, found.damaged,
         missing,
     )  # fmt: skip
 
@@ -278,7 +283,7 @@ def _outcomes(
         yield (
             candidate.name,
             [
-                Outcome(run.positions, one, base, run.refused, run.failed)
+                Outcome(run.positions, one, base, run.reasons, run.failed)
                 for run, one in zip(runs, steps, strict=True)
             ],
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import CONVERGED, PLAIN
 from pdcorrect.errors import ConvergenceError
@@ -37,8 +38,8 @@ class Outcome:
         Single steps from the reference's frames, m.
     base : str or None
         Coarse model that was stepped, with a corrector or without; None for other models.
-    refused : (T,) bool or None
-        Steps of the rollout that a gate left uncorrected.
+    reasons : (T,) int64 or None
+        Why a gate left steps of the rollout uncorrected, numbers of `Reason`; 0 where it did not.
     failed : int or None
         First step of the rollout that failed; the body is held from there on.
     """
@@ -46,7 +47,7 @@ class Outcome:
     positions: Array | None = None
     predictions: Array | None = None
     base: str | None = None
-    refused: NDArray[np.bool_] | None = None
+    reasons: NDArray[np.int64] | None = None
     failed: int | None = None
 
 
@@ -118,10 +119,21 @@ class TrajectoryMeasures:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Measures of a trajectory, and its RMS distance from the reference over time, (T+1,), m."""
+    """What was measured of a trajectory.
+
+    Attributes
+    ----------
+    measures : TrajectoryMeasures
+    errors : (T+1,)
+        RMS distance from the reference over time, m.
+    refused_by : int
+        Number of the `Reason` by which a gate refused the whole of it: the body at rest or the time
+        step; 0 if it did not.
+    """
 
     measures: TrajectoryMeasures
     errors: Array = field(default_factory=lambda: np.zeros(0))
+    refused_by: int = 0
 
 
 def measure(case: Case, outcome: Outcome) -> Measured:
@@ -140,8 +152,8 @@ def measure(case: Case, outcome: Outcome) -> Measured:
         errors = error_over_time(outcome.positions, case.reference)
         found |= _of_rollout(case, outcome.positions, outcome.base, errors)
         found |= _of_physics(case, outcome.positions, outcome.base)
-    if outcome.refused is not None:
-        found["gate_rate"] = 100.0 * float(outcome.refused.mean())
+    if outcome.reasons is not None:
+        found["gate_rate"] = 100.0 * float((outcome.reasons > 0).mean())
     numbers = {name: x for name, x in found.items() if x is not None}
     wild = next((name for name, x in numbers.items() if not np.isfinite(x)), None)
     if wild is not None:
@@ -150,7 +162,16 @@ def measure(case: Case, outcome: Outcome) -> Measured:
             "a run whose errors can be measured."
         )
     measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
-    return Measured(measures, errors)
+    return Measured(measures, errors, _refused_by(outcome.reasons))
+
+
+def _refused_by(reasons: NDArray[np.int64] | None) -> int:
+    """The reason of a whole rollout; scenes that are refused by one of these are so in all steps.
+
+    Only a failure ends that, so the first step tells.
+    """
+    first = 0 if reasons is None or not len(reasons) else int(reasons[0])
+    return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
 
 
 def omega(positions: Array, coarse: Array | None, reference: Array) -> float | None:

@@ -38,8 +38,8 @@ class HybridResult(Protocol):
         """The coarse solver's step."""
 
     @property
-    def refused(self) -> Tensor:
-        """Scenes (B,) that were left uncorrected."""
+    def reasons(self) -> Tensor:
+        """Why scenes (B,) were left uncorrected: numbers of `Reason`, 0 where they were not."""
 
 
 class Hybrid(Protocol):
@@ -57,16 +57,22 @@ class Rollout:
     ----------
     positions : (T+1, N, 3)
         m.
-    refused : (T,) bool
-        Steps without correction; never after a failure.
+    reasons : (T,) int64
+        Why steps are without correction, numbers of `Reason`; 0 where they have one, and after a
+        failure.
     failed : int or None
         First step that did not converge, or gave numbers that are not finite or a node that is
         `LOST`.  The body is held where it was before.
     """
 
     positions: Array
-    refused: NDArray[np.bool_]
+    reasons: NDArray[np.int64]
     failed: int | None
+
+    @property
+    def refused(self) -> NDArray[np.bool_]:
+        """Steps without correction, (T,)."""
+        return self.reasons > 0
 
 
 def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> list[Rollout]:
@@ -77,7 +83,7 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
     """
     rest = stepper.rest_state()
     state, previous = rest, None
-    frames, refusals = [rest.positions], []
+    frames, reasons = [rest.positions], []
     failed: list[int | None] = [None] * len(steps)
     for number in range(1, max(steps) + 1):
         result = hybrid(state, previous)
@@ -87,7 +93,7 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
                 failed[i] = number
         alive = torch.tensor([f is None for f in failed], device=fine.device) & fine
         frames.append(_where(alive, result.state.positions, frames[-1]))
-        refusals.append(result.refused & alive)
+        reasons.append(torch.where(alive, result.reasons, 0))
         state = BatchState(
             _where(alive, result.state.positions, rest.positions),
             _where(alive, result.state.velocities, rest.velocities),
@@ -96,9 +102,9 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
         )
         previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()
-    refused = torch.stack(refusals).cpu().numpy()
+    told = torch.stack(reasons).cpu().numpy()
     return [
-        Rollout(positions[: count + 1, i, : stepper.node_counts[i]], refused[:count, i], failed[i])
+        Rollout(positions[: count + 1, i, : stepper.node_counts[i]], told[:count, i], failed[i])
         for i, count in enumerate(steps)
     ]
 

@@ -24,6 +24,7 @@ from pdcorrect.toml_config import TomlConfig
 _FILE = re.compile(rf"({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
+Flag = Annotated[bool, Field(strict=True)]
 
 
 def _several(steps: Any) -> Any:
@@ -116,7 +117,7 @@ class Noise(Strict):
     """
 
     tau: NonNegative = 0.0
-    relative: bool = True
+    relative: Flag = True
 
 
 class Rate(Strict):
@@ -192,7 +193,7 @@ class Stage(Strict):
     kind: Literal["one-step", "unrolled"]
     begin: Literal["best", "last"] = "best"
     steps: Horizon = (1,)
-    through_solver: bool = False
+    through_solver: Flag = False
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
     at_rest: Share = 0.0
@@ -250,7 +251,8 @@ class Fitting(Strict):
     widen
         Whether a training that goes on with another model widens that one's ranges of known
         inputs and bodies to what it learns.  They are extremes, so the more there is to learn, the
-        less a gate refuses.  Weights do not depend on it.
+        less a gate refuses.  Weights do not depend on it.  If not, the data's time step has to be
+        one that the other model's gate lets pass.
     anew
         Whether a training that goes on with another model takes over its weights only, and fits
         the normalisation to what it learns itself.  That model may then correct another base:
@@ -258,8 +260,8 @@ class Fitting(Strict):
     """
 
     windows: PositiveCount = 10_000
-    widen: bool = True
-    anew: bool = False
+    widen: Flag = True
+    anew: Flag = False
 
     @model_serializer(mode="wrap")
     def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -286,8 +288,9 @@ class TrainingConfig(TomlConfig):
     ----------
     start_from
         Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
-        training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
-        architecture.  A folder's path starts where the program does.
+        training begins with, in place of drawn and fitted ones (weights alone if ``fitting.anew``);
+        ``corrector`` must describe its architecture.  A folder's path starts where the program
+        does.
     without
         Files of the data set that are left out, such as "training/mesh-0042": of bodies that
         another set keeps for its evaluation, say.  For one data set.
@@ -340,6 +343,16 @@ class TrainingConfig(TomlConfig):
                 raise ValueError(
                     f"stages.{k}: a first guess does not change a step's result: expected kind = "
                     "'one-step'"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _goes_on(self) -> TrainingConfig:
+        told = {"widen = false": not self.fitting.widen, "anew = true": self.fitting.anew}
+        for choice, given in told.items():
+            if given and self.start_from is None:
+                raise ValueError(
+                    f"fitting.{choice} is about a model that is gone on with: expected start_from"
                 )
         return self
 

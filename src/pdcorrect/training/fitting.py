@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
+from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.errors import InputError
 from pdcorrect.training.windows import StepBatch, StepWindows
 
 _AT_ONCE = 32
@@ -58,6 +60,29 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     corrector.normaliser.widen_time_steps(steps)
     _widen(corrector, windows, _chosen(every, most, seed))
     _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
+
+
+def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> None:
+    """Refuse data whose time step a default gate refuses, by the ranges of a corrector that stay.
+
+    Raises
+    ------
+    InputError
+        If they have such a time step: the gate would refuse every step of what is learned.
+    """
+    _, found = _at_rest(windows)
+    steps, bound = torch.cat([found.low, found.high]), Gate().time_step
+    if bound is None or not (corrector.normaliser.time_step_excess(steps) > bound).any():
+        return
+    here, there = (
+        " to ".join(dict.fromkeys(f"{x:.4g}" for x in each))
+        for each in (steps.exp().tolist(), corrector.normaliser.time_steps)
+    )
+    raise InputError(
+        f"{what} with fitting.widen = false: the data's time step over the cell size is {here} "
+        f"s/m, that of the ranges that stay {there} s/m, so a gate would refuse every step of what "
+        "is learned: expected data of that time step, widen = true, or anew = true."
+    )
 
 
 def _widen(

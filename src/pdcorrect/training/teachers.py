@@ -1,4 +1,4 @@
-"""Models that a training learns from, in place of the reference."""
+"""Models that a training goes on with, or learns from in place of the reference."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.toml_config import as_toml
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.config import Stage, TrainingConfig
-from pdcorrect.training.fitting import fit_normaliser, widen_ranges
+from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
 from pdcorrect.training.history import History
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
@@ -85,7 +85,8 @@ class Training:
         files of the data sets are missing, or do not have what the configuration wants; if one
         has a validation split and another has none, or their settings or time steps differ; if the
         model to start from is missing, or of another architecture, base (unless the normalisation
-        is fitted anew) or velocity; if a teacher is.
+        is fitted anew) or velocity, or its ranges stay and the data have another time step; if a
+        teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -314,6 +315,9 @@ class Training:
                 fit_normaliser(corrector, self._windows, windows, seed)
             elif config.fitting.widen:
                 widen_ranges(corrector, self._windows, windows, seed)
+            else:
+                what = f"start_from = {config.start_from!r}"
+                check_time_steps(what, corrector, self._windows)
             self.world.same(list(corrector.state_dict().values()))
         return corrector
 
