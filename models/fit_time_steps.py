@@ -117,6 +117,8 @@ def fit_time_steps(model: LoadedModel, configs: Sequence[DatasetConfig]) -> None
     moments.add(torch.tensor(ratios, dtype=torch.float64).log()[:, None])
     model.corrector.normaliser.fit_time_steps(moments)
     model.record.training.pop("time_steps", None)  # of version 4, in s
+    names = [config.name for config in configs]
+    model.record.training["time_steps_over_cell_sizes"] = dict(zip(names, ratios, strict=True))
 
 
 def told(model: LoadedModel) -> str:

@@ -278,12 +278,12 @@ def test_another_time_step_is_told_of_a_foreign_body_too(thick):
 
 def test_of_time_steps_that_a_gate_lets_pass_nothing_is_told():
     gate = pytest.importorskip("pdcorrect.corrector.gate").Gate()
-    for step in (0.0046, 0.005, 0.01, 0.02, 0.0219):
-        assert run_text.refused_step(gate, step, 0.05, (0.1, 0.4)) is None
-    for step in (0.0045, 0.0222):
-        told = run_text.refused_step(gate, step, 0.05, (0.1, 0.4))
-        assert f"The time step is {step:g} s, that of the training 0.005 to 0.02 s for " in told
-        assert run_text.refused_step(None, step, 0.05, (0.1, 0.4)) is None
+    for excess in (0.0, 0.1):
+        assert run_text.refused_step(gate, 0.01, excess, "0.01 s") is None
+    for excess in (np.nextafter(0.1, 1.0), np.inf):
+        told = run_text.refused_step(gate, 0.02, excess, "0.005 to 0.01 s")
+        assert "The time step is 0.02 s, that of the training 0.005 to 0.01 s for cells" in told
+        assert run_text.refused_step(None, 0.02, excess, "0.01 s") is None
 
 
 def test_every_reason_of_a_gate_has_a_meaning():

@@ -174,6 +174,46 @@ def test_it_is_the_stepper_s_time_step_that_counts_and_not_the_scene_s():
         assert many(stepper.rest_state()).reasons.tolist() == [reason]
 
 
+def test_a_stiffer_body_with_a_shorter_step_is_refused_though_the_network_sees_a_known_one():
+    known = soft_beam(loads=[TORSION])
+    half = known.with_changes(
+        time={"step": 0.5 * H},
+        material={"young": 4.0 * known.material.young},
+        loads=[{**TORSION, "strength": 4.0 * TORSION["strength"]}],
+    )
+    corrector, found = fitted(problems((3, 1, 1))), []
+    for scene, reason in ((known, 0), (half, Reason.TIME_STEP)):
+        problem = pc.discretise(scene)
+        for gate in (None, ONLY_STEPS):
+            hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+            result = hybrid(problem.rest_state())
+            found += [result] if gate is None else []
+        assert result.stats["gate"] == reason
+    one, two = (result.state.positions for result in found)
+    np.testing.assert_allclose(one, two, atol=1e-9)
+    assert found[0].stats["correction"] == pytest.approx(found[1].stats["correction"], rel=1e-4)
+    assert found[0].stats["correction"] > 0.0
+
+
+def test_of_a_refined_body_its_own_cells_count():
+    corrector = fitted(problems((3, 1, 1)))
+    for refine, step, reason in ((2, H, Reason.TIME_STEP), (2, 0.5 * H, 0)):
+        scene = soft_beam(loads=[TORSION], time={"step": step, "frames": 4})
+        problem = pc.discretise(scene, refine=refine)
+        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=ONLY_STEPS)
+        assert hybrid(problem.rest_state()).stats["gate"] == reason
+        assert hybrid.trained_step == f"{0.5 * H:g} s"
+
+
+def test_of_an_unknown_range_it_is_said_that_it_is_not_known():
+    corrector = fitted(problems((3, 1, 1)))
+    corrector.normaliser.time_step_low.fill_(np.nan)
+    corrector.normaliser.time_step_high.fill_(np.nan)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(stepped(1.0)), corrector, gate=ONLY_STEPS)
+    assert hybrid.trained_step == "not known"
+    assert hybrid.time_step_excess() == np.inf
+
+
 SCALED = [(0.5, 1.0, Reason.TIME_STEP), (1.0, 2.0, Reason.TIME_STEP), (0.5, 0.5, 0), (3.0, 3.0, 0)]
 """Factors on all lengths and on the time step, and what a gate says."""
 

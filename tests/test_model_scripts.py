@@ -1,5 +1,6 @@
 """The scripts in `models` that print tables, fit and widen ranges, and draw."""
 
+import csv
 import hashlib
 import importlib.util
 import json
@@ -79,6 +80,38 @@ def test_tables_are_printed_below_the_headings_of_the_page(monkeypatch, capsys):
         last = next(line for line in reversed(before) if line.startswith("#"))
         assert last.lstrip("# ") == heading
     assert told.count("**\n\n| ") == 8
+
+
+def test_the_page_of_results_counts_what_the_gate_of_today_does_on_further_splits():
+    tables = script("table")
+    corrected, refused, harmed = [], 0, []
+    for folder in sorted((tables.RESULTS / "other-splits").iterdir()):
+        if folder.name.endswith(("no-gate", "double-step")):
+            continue  # without a gate, and refused as a whole today
+        runs = json.loads((folder / "summary.json").read_text())["runs"]
+        (run,) = [name for name, found in runs.items() if "gate_rate" in found["measures"]]
+        ratios = tables._over(f"other-splits/{folder.name}", run, runs[run]["base"], "rms_error")
+        with (folder / "trajectories.csv").open(newline="") as file:
+            for line in csv.DictReader(file):
+                if line["run"] != run:
+                    continue
+                if float(line["gate_rate"]) == 100.0:
+                    refused += 1
+                    continue
+                corrected.append(float(line["omega"]))
+                ratio = ratios[line["mesh"], line["simulation"]]
+                harmed += [ratio] if ratio > 1.05 else []
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    assert len(harmed) == 6
+    assert (
+        f"six of the {len(corrected)} in which any correction is applied; the other {refused} "
+        in page
+    )
+    least, second, *_ = sorted(corrected)
+    assert (
+        f"none of the {len(corrected)} is worse: the least Ω is {least:.0f}, the next {second:.0f}"
+        in page
+    )
 
 
 def test_each_script_has_its_row_in_the_list():

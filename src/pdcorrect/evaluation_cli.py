@@ -112,12 +112,16 @@ def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) ->
 
 def _refused(one: SavedCandidate, found: Evaluation, gate: Gate | None) -> list[str]:
     """Of a model, how many rollouts its gate refused in all steps, and why."""
+    import torch
+
     from pdcorrect.run_text import refused_rollouts, refused_step
 
-    name, trained = one.candidate.name, one.model.corrector.normaliser.time_steps
+    name, normaliser = one.candidate.name, one.model.corrector.normaliser
+    ratio = torch.tensor([found.time_step / found.cell_size], dtype=torch.float64)
+    excess = float(normaliser.time_step_excess(ratio.log()))
     told = (
         refused_rollouts(found.runs[name].refused_by()),
-        refused_step(gate, found.time_step, found.cell_size, trained),
+        refused_step(gate, found.time_step, excess, normaliser.trained_step(found.cell_size)),
     )
     return [f"{name}: {text[0].lower()}{text[1:]}" for text in told if text]
 

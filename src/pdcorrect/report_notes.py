@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from pdcorrect.evaluate import Comparison, Row
-from pdcorrect.fem.problem import discretise
 from pdcorrect.metrics import energy_balance, largest_displacement
 from pdcorrect.run_text import (
     foreign_integrator,
@@ -262,14 +261,11 @@ def _of_the_models(comparison: Comparison) -> list[str]:
 def _refused_step(comparison: Comparison, row: Row) -> str | None:
     """How the time step differs from that of a model's training, if its gate refuses it."""
     from pdcorrect.corrector.gate import Gate
-    from pdcorrect.corrector.model_io import load_model
 
-    case = next(case for case in comparison.cases if case.label == row.label)
-    if case.model is None or not case.gate:
-        return None
-    trained = load_model(case.model).corrector.normaliser.time_steps
-    problem = discretise(comparison.scene)
-    return refused_step(Gate(), problem.time_step, problem.cell_size, trained)
+    about = comparison.runs[row.label].attributes
+    gate = None if about["gate"] == "none" else Gate.model_validate_json(about["gate"])
+    step, excess = comparison.scene.time.step, float(about["time_step_excess"])
+    return refused_step(gate, step, excess, about["trained_step"])
 
 
 def _of_the_cells(comparison: Comparison) -> list[str]:

@@ -26,9 +26,6 @@ _MEANINGS = {
 }
 """Of the reasons that `pdcorrect.corrector.gate.refusals` names."""
 
-_ROUNDING = 1e-5
-"""Of logarithms of time steps."""
-
 
 def three_digits(value: float) -> str:
     """A number with three significant digits and without powers of ten where it is large."""
@@ -104,9 +101,7 @@ def _counted(reasons: Iterable[float]) -> tuple[int, str, str]:
     )
 
 
-def refused_step(
-    gate: Gate | None, step: float, cell_size: float, trained: tuple[float, float]
-) -> str | None:
+def refused_step(gate: Gate | None, step: float, excess: float, trained: str) -> str | None:
     """How a time step that a gate refuses differs from its training's; None if it does not.
 
     Said also where the body at rest is refused, which is the reason then that steps record.
@@ -116,22 +111,16 @@ def refused_step(
     gate : Gate or None
     step : float
         s.
-    cell_size : float
-        m.
-    trained : (2,) floats
-        Least and largest time step over cell size of the training, s/m, see
-        `pdcorrect.corrector.normaliser.Normaliser.time_steps`.
+    excess : float
+        See `HybridStepper.time_step_excess`.
+    trained : str
+        See `HybridStepper.trained_step`.
     """
     bound = None if gate is None else gate.time_step
-    if bound is None:
+    if bound is None or excess <= bound:
         return None
-    ratio = step / cell_size
-    excess = max(math.log(trained[0] / ratio), math.log(ratio / trained[1]))
-    if excess <= bound + _ROUNDING:
-        return None
-    known = " to ".join(dict.fromkeys(f"{cell_size * x:.4g}" for x in trained))
     return (
-        f"The time step is {step:g} s, that of the training {known} s for cells of this size: "
+        f"The time step is {step:g} s, that of the training {trained} for cells of this size: "
         f"farther than the gate's bound {bound:g} of its logarithm, a factor of "
         f"{math.exp(bound):.2g}. Expected a time step as in the training; or, at your own risk, a "
         "gate without this bound, Gate(time_step=None), or none (--no-gate)."

@@ -210,7 +210,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
 
 def _described(stepper: Stepper) -> dict[str, str]:
     """What a stepper says of itself, but for the model, which is told before the run."""
-    elsewhere = {*getattr(stepper, "origin", {}), "trained_step"}
+    elsewhere = {*getattr(stepper, "origin", {}), "trained_step", "time_step_excess"}
     told = {name: text for name, text in stepper.describe().items() if name not in elsewhere}
     if told.get("gate", "none") != "none":
         told["gate"] = "default"  # the program has no other
@@ -231,8 +231,8 @@ def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
     if isinstance(stepper, HybridStepper):
         if (stats["gate"] == Reason.BODY).any():
             say(_refused_measures(stepper))
-        problem, trained = stepper.problem, stepper.corrector.normaliser.time_steps
-        say(refused_step(stepper.gate, problem.time_step, problem.cell_size, trained) or "")
+        step, excess = stepper.problem.time_step, stepper.time_step_excess()
+        say(refused_step(stepper.gate, step, excess, stepper.trained_step) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
 

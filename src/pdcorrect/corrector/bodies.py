@@ -89,7 +89,7 @@ class BodyGraph:
             edge_index=tensor(np.concatenate([b["edge_index"] + o for b, o in offset], axis=1)),
             cells=tensor(np.concatenate([b["cells"] + o for b, o in offset])),
             graph=tensor(np.repeat(np.arange(len(bodies)), counts)),
-            cell_size=tensor(np.array([p.cell_size for p in problems])),
+            cell_size=tensor(np.array([p.cell_size / p.refine for p in problems])),
             time_step=tensor(np.full(len(problems), step)),
         )
 
@@ -114,7 +114,8 @@ class BodyGraph:
     def time_steps(self) -> Tensor:
         """Logarithm of each body's time step over its cell size, s/m, (B,), float64.
 
-        All that a network sees of either, for its inputs and answers are without units.
+        Networks of frame features see E h²/(rho c²) and loads as f h²/(m c): of one material and
+        loads to match only this ratio counts.
         """
         return (self.time_step.double() / self.cell_size.double()).log()
 

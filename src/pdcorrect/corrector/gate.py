@@ -90,9 +90,12 @@ class Gate(Strict):
         are separate: what is unlike by a combination of them, or by where a body branches, passes.
     time_step
         Refused in all steps if the logarithm of the time step over the cell size, h/c in s/m, lies
-        farther than this outside its range in training: 0.1 is a factor of 1.1.  The network sees
-        lengths over c and times over h, so that of one material a body of half the cell size is to
-        it a body of twice the time step; scaled alike in both, it is the same body.
+        farther than this outside its range in training: 0.1 is a factor of 1.1.  Networks of frame
+        features see stiffness as E h²/(rho c²) and loads as f h²/(m c), so that of one material a
+        body of half the cell size is to them one of twice the time step, and scaled alike in both
+        the same body.  A stiffer material with a shorter step may be a known body to them and is
+        refused here all the same.  Quasi-static steps, which are increments of loads, are held to
+        those of the training, too.
     margin, share
         Refused if more than this share of a body's nodes has inputs, or an edge with inputs,
         that lie more than ``margin`` deviations outside the range of the training data, of which

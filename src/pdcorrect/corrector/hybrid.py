@@ -148,6 +148,7 @@ class HybridStepper:
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
             "trained_step": self.trained_step,
+            "time_step_excess": f"{self.time_step_excess():.6g}",
             **self.origin,
         }
 
@@ -171,9 +172,7 @@ class HybridStepper:
     @property
     def trained_step(self) -> str:
         """The time step of the training for cells of this body's size, or its range, s."""
-        size = self.problem.cell_size
-        steps = dict.fromkeys(f"{size * x:.4g}" for x in self.corrector.normaliser.time_steps)
-        return f"{' to '.join(steps)} s"
+        return self.corrector.normaliser.trained_step(float(self.bodies.cell_size))
 
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""

@@ -164,6 +164,13 @@ class Normaliser(nn.Module):
         """
         return float(self.time_step_low.exp()), float(self.time_step_high.exp())
 
+    def trained_step(self, cell_size: float) -> str:
+        """The time step of the training, or its range, for cells of this size (m); with unit."""
+        if self.time_step_low.isnan().any():
+            return "not known"
+        steps = dict.fromkeys(f"{cell_size * x:.4g}" for x in self.time_steps)
+        return f"{' to '.join(steps)} s"
+
     def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
         """Take over the moments of features, and of targets (m, 1).
 

@@ -68,7 +68,7 @@ def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> N
     Raises
     ------
     InputError
-        If they have such a time step: the gate would refuse every step of what is learned.
+        If some have such a time step: the gate would refuse every step of these bodies.
     """
     _, found = _at_rest(windows)
     steps, bound = torch.cat([found.low, found.high]), Gate().time_step
@@ -80,8 +80,8 @@ def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> N
     )
     raise InputError(
         f"{what} with fitting.widen = false: the data's time step over the cell size is {here} "
-        f"s/m, that of the ranges that stay {there} s/m, so a gate would refuse every step of what "
-        "is learned: expected data of that time step, widen = true, or anew = true."
+        f"s/m, that of the ranges that stay {there} s/m, so a gate would refuse every step of "
+        "bodies that are learned: expected data of that time step, widen = true, or anew = true."
     )
 
 
