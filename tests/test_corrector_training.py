@@ -977,6 +977,60 @@ def test_other_settings_are_refused_by_their_key():
         check_same(one, other, "file")
 
 
+def refused_change(before, now):
+    """What is told of two configurations that differ."""
+    one, other = ({"config": each.model_dump(mode="json")} for each in (before, now))
+    check_same(one, json.loads(json.dumps(one)), "file")
+    with pytest.raises(InputError) as refusal:
+        check_same(one, other, "file")
+    told = str(refusal.value)
+    assert told.startswith("file: was begun ")
+    assert told.endswith(": expected the same; begin another one in another folder.")
+    return told.removeprefix("file: was begun ").partition(": expected the same")[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "value", "default"),
+    [
+        ({"fitting": {"anew": True}}, "fitting.anew", "true", "false"),
+        ({"fitting": {"widen": False}}, "fitting.widen", "false", "true"),
+        ({"without": ["training/mesh-0042"]}, "without", '["training/mesh-0042"]', "[]"),
+    ],
+)
+def test_a_setting_that_is_not_written_is_told_as_its_default(changes, key, value, default):
+    plain = samples.config(samples.one_step(), start_from="tiny")
+    changed = samples.config(samples.one_step(), start_from="tiny", **changes)
+    assert refused_change(changed, plain) == (
+        f"with config.{key} = {value}, and is now to go on with {default} (the default)"
+    )
+    assert refused_change(plain, changed) == (
+        f"with config.{key} = {default} (the default), and is now to go on with {value}"
+    )
+
+
+def test_a_setting_without_a_default_is_told_as_not_there():
+    preset = samples.config(samples.one_step(), corrector={"preset": "compact"})
+    changed = samples.config(
+        samples.one_step(), corrector={"preset": "compact", "changes": {"width": 8}}
+    )
+    key = "config.corrector.changes.width"
+    assert refused_change(changed, preset) == f"with {key} = 8, and is now to go on without it"
+    assert refused_change(preset, changed) == f"without {key}, and is now to go on with 8"
+    unclipped = samples.config(samples.one_step(clip=None))
+    assert refused_change(samples.config(samples.one_step()), unclipped) == (
+        "with config.stages.0.clip = 1.0, and is now to go on with none"
+    )
+    with pytest.raises(InputError, match='begun without start, and is now to go on with "a":'):
+        check_same({}, {"start": "a"}, "file")
+    old = samples.config(samples.one_step()).model_dump(mode="json")
+    del old["seed"]  # as of an earlier version of the code, which had no such key
+    with pytest.raises(InputError, match="begun without config.seed, and is now to go on with 0:"):
+        check_same({"config": old}, {"config": {**old, "seed": 0}}, "file")
+    del old["fitting"]
+    with pytest.raises(InputError, match="was begun without config.fitting, and is"):
+        check_same({"config": old}, {"config": {**old, "fitting": {"windows": 3}}}, "file")
+
+
 # --- whole trainings ---------------------------------------------------------------------
 
 MIXED = (

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pdcorrect.errors import InputError
-from pdcorrect.training.config import Every
+from pdcorrect.scene.regions import Strict
+from pdcorrect.toml_config import as_toml
+from pdcorrect.training.config import Every, TrainingConfig
 
 
 @dataclass
@@ -83,18 +85,56 @@ class Progress:
 def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
     """Refuse to go on with other settings, naming the first that differs.
 
+    A key that is not there counts as one of None; where the configuration leaves a key out that
+    has its default, the message tells that value.
+
     Raises
     ------
     InputError
     """
     if isinstance(found, dict) and isinstance(expected, dict):
         for name in sorted(found.keys() | expected.keys()):
-            check_same(found.get(name), expected.get(name), where, f"{key}.{name}".lstrip("."))
+            one, other = (each.get(name, _ABSENT) for each in (found, expected))
+            check_same(one, other, where, f"{key}.{name}".lstrip("."))
     elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         for k, (one, other) in enumerate(zip(found, expected, strict=True)):
             check_same(one, other, where, f"{key}.{k}")
-    elif found != expected:
+    elif _or_none(found) != _or_none(expected):
+        before, now = _in_words(found, expected, key), _in_words(expected, found, key)
+        begun = f"without {key}" if before is None else f"with {key} = {before}"
         raise InputError(
-            f"{where}: was begun with {key} = {found!r:.80}, and is now to go on with "
-            f"{expected!r:.80}: expected the same; begin another one in another folder."
+            f"{where}: was begun {begun}, and is now to go on "
+            f"{'without it' if now is None else f'with {now}'}: expected the same; begin another "
+            "one in another folder."
         )
+
+
+_ABSENT = object()
+"""In place of the value of a key that is not there."""
+
+
+def _or_none(value: Any) -> Any:
+    return None if value is _ABSENT else value
+
+
+def _in_words(value: Any, other: Any, key: str) -> str | None:
+    """A value as in TOML; None if there is none, nor a default that differs from the other one."""
+    if value is not _ABSENT:
+        return _as_text(value)
+    default = _default(key)
+    return None if default in (_ABSENT, other) else f"{_as_text(default)} (the default)"
+
+
+def _as_text(value: Any) -> str:
+    return "none" if value is None else f"{as_toml(value):.80}"
+
+
+def _default(key: str) -> Any:
+    """Of a key of the configuration, such as "config.fitting.widen", if it is known."""
+    first, *names = key.split(".")
+    value: Any = TrainingConfig.model_construct() if first == "config" else _ABSENT
+    for name in names:
+        value = getattr(value, name, _ABSENT) if isinstance(value, Strict) else _ABSENT
+    if isinstance(value, Strict):
+        return _ABSENT
+    return list(value) if isinstance(value, tuple) else value
