@@ -845,7 +845,7 @@ def test_bad_input_is_told_in_a_sentence(tmp_path, capsys, monkeypatch):
     from pdcorrect import cli
 
     for arguments, message in (
-        ((str(tmp_path / "none"), str(TINY)), "expected a folder with a model"),
+        ((str(tmp_path / "none"), str(TINY)), "none: not there: expected a folder with model.json"),
         ((str(tmp_path),), "no data set"),
         ((str(TINY), "--split", "test"), "no split 'test'"),
     ):

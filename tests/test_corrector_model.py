@@ -66,7 +66,7 @@ def rewrite_json(folder, change, seal=True):
     content = json.loads((folder / JSON).read_text())
     checksum = content.pop("checksum")
     change(content)
-    checksum = model_io._digest(content) if seal else checksum
+    checksum = model_io.content_digest(content) if seal else checksum
     (folder / JSON).write_text(json.dumps({**content, "checksum": checksum}))
 
 
@@ -145,8 +145,41 @@ def test_a_bare_name_is_looked_up_in_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path / "models")
     assert load_model("./small").record == RECORD
     assert load_model(Path("small")).record == RECORD
-    with pytest.raises(InputError, match=r"none.* there is none"):
+    with pytest.raises(InputError, match=r"^none: not there: .* a released model: small\.$"):
         load_model(Path("none"))
+
+
+def told(path):
+    """Why a model is refused."""
+    with pytest.raises(InputError) as refusal:
+        load_model(path)
+    return str(refusal.value)
+
+
+def test_a_place_without_a_model_is_told_from_one_that_is_not_there(tmp_path, monkeypatch):
+    expected = f"expected a folder with {JSON} and {WEIGHTS}"
+    home = tmp_path / "home"
+    for name in ("small", "large"):
+        saved(home / "models" / name)
+    (home / "models" / "recipes").mkdir()
+    monkeypatch.setenv("PDCORRECT_HOME", str(home))
+    empty, missing, file = (tmp_path / name for name in ("empty", "missing", "file"))
+    empty.mkdir()
+    file.write_text("")
+    names = "or the name of a released model: large, small."
+    assert told(empty) == f"{empty}: holds no model: {expected}."
+    assert told(missing) == f"{missing}: not there: {expected}, {names}"
+    assert told(file) == f"{file}: a file: {expected}, {names}"
+    models = home / "models"
+    assert told(models) == f"{models}: holds no model: {expected}, such as {models / 'large'}."
+    with monkeypatch.context() as patch:
+        patch.chdir(models)
+        assert told(".").endswith(", such as ./large.")  # with a slash, for it is no name
+    assert "'recipes': not in" in told("recipes")
+    assert ": expected one of large, small, or a path such as ./recipes." in told("recipes")
+    monkeypatch.delenv("PDCORRECT_HOME")
+    monkeypatch.setattr(pc, "__file__", str(tmp_path / "lib" / "pdcorrect" / "__init__.py"))
+    assert told(missing) == f"{missing}: not there: {expected}."  # no names where there are none
 
 
 def test_without_a_home_folder_names_are_those_of_the_checkout(monkeypatch):
@@ -381,17 +414,61 @@ def test_numbers_that_are_not_finite_are_refused(model):
             load_model(model)
 
 
-def test_other_versions_are_told_from_damage(model):
-    rewrite_json(model, put_json("version", value=6), seal=False)
-    with pytest.raises(FileVersionError, match=rf"{JSON}: format version 6: expected 5.*newer"):
+def refused_version(model, **changes):
+    """What is told of a model of another version."""
+    rewrite_json(model, lambda content: content.update(changes))
+    with pytest.raises(FileVersionError) as refusal:
         load_model(model)
-    for old in (1, 2, 3, 4):
-        rewrite_json(model, put_json("version", value=old))
-        with pytest.raises(FileVersionError, match=f"version {old}: expected 5: .* docs/files.md"):
-            load_model(model)
+    return str(refusal.value).removeprefix(f"{model / JSON}: ")
+
+
+def test_other_versions_are_told_from_damage(model):
+    assert refused_version(model, version=6) == (
+        "format version 6: expected 5: written by a newer pdcorrect: update pdcorrect."
+    )
+    rewrite_json(model, put_json("version", value=7), seal=False)
+    with pytest.raises(FileVersionError) as refusal:  # by its own checksum, or altered
+        load_model(model)
+    assert str(refusal.value) == (
+        f"{model / JSON}: format version 7: expected 5: its checksum is not that of its content, "
+        "as this pdcorrect computes it: written by a newer one or damaged: update pdcorrect, or "
+        "copy the model again."
+    )
     rewrite_json(model, lambda content: content.pop("version"))
     with pytest.raises(FileVersionError, match=rf"{JSON}: version is None: expected 5: damaged"):
         load_model(model)
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_an_older_version_is_told_with_the_script_that_brings_it_up_to_date(model, version):
+    script = "fit_shapes.py" if version == 2 else "fit_time_steps.py"
+    assert (Path(__file__).parents[1] / "models" / script).is_file()
+    assert refused_version(model, version=version) == (
+        f"format version {version}: expected 5: written by an older pdcorrect: bring it up to date "
+        f"by `python models/{script} {model} DATASET/config.toml ...` with the configurations that "
+        "docs/files.md tells of, or train it anew if its data sets have none."
+    )
+
+
+def test_the_first_version_is_told_to_be_trained_anew(model):
+    assert refused_version(model, version=1) == (
+        "format version 1: expected 5: written by an older pdcorrect: nothing brings it up to "
+        "date: train the model anew."
+    )
+
+
+@pytest.mark.parametrize("version", [1, 4, 0, -1, "6", 6.0, True, None])
+def test_an_altered_version_is_told_as_damage_and_not_as_another_version(model, version):
+    rewrite_json(model, put_json("version", value=version), seal=False)
+    with pytest.raises(FileFormatError, match=rf"{JSON}: damaged: its checksum") as refusal:
+        load_model(model)
+    assert not isinstance(refusal.value, FileVersionError)
+
+
+@pytest.mark.parametrize("version", [0, -1, "6", 5.0, True])
+def test_what_is_no_version_is_refused(model, version):
+    told = refused_version(model, version=version)
+    assert told == f"version is {version!r}: expected 5: damaged."
 
 
 @pytest.mark.parametrize("nothing", ["", "  ", None, 3, b"tiny"])

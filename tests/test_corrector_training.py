@@ -1382,7 +1382,7 @@ def test_a_start_of_another_architecture_is_refused_with_the_difference(short, e
     with pytest.raises(InputError, match=r"that model has layers = 1, unlike corrector"):
         Training(settings, short, tmp_path / "out")
     settings = samples.config(samples.one_step(), start_from=str(tmp_path / "nothing"))
-    with pytest.raises(InputError, match="expected a folder with a model"):
+    with pytest.raises(InputError, match="not there: expected a folder with model.json and"):
         Training(settings, short, tmp_path / "out")
 
 

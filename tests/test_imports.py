@@ -186,6 +186,8 @@ ORDER = [
     "corrector.compiled_features",
     "corrector.compiled",
     "corrector.cost",
+    "corrector.model_description",
+    "corrector.model_names",
     "corrector.model_io",
     "corrector.placements",
     "corrector.gate",

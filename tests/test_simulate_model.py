@@ -107,7 +107,7 @@ def test_a_hybrid_is_not_continued_as_something_else(program, learned, tmp_path,
         (("--no-gate",), "--no-gate without --model"),
         (("--model", ""), "--model '': an empty name"),
         (("--model", "nothing"), "model 'nothing': not in"),
-        (("--model", "./nothing"), "expected a folder with a model"),
+        (("--model", "./nothing"), "nothing: not there: expected a folder with model.json"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_before_the_work(

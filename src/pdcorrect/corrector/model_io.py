@@ -11,29 +11,25 @@ refused.  Nothing is ever unpickled.
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field, JsonValue, ValidationError
-
-from pdcorrect import __version__
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.cost import parameters
-from pdcorrect.environment import code_digest
-from pdcorrect.errors import (
-    FileFormatError,
-    FileVersionError,
-    InputError,
-    OutputError,
-    require_extra,
+from pdcorrect.corrector.model_description import (
+    DESCRIPTION,
+    VERSION,
+    WEIGHTS,
+    Description,
+    ModelRecord,
+    content_digest,
+    read_description,
+    read_file,
 )
-from pdcorrect.home import home_folder
+from pdcorrect.corrector.model_names import model_folder, models_folder, unlike_ends
+from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
 from pdcorrect.replacement import make_folder, part_of_process, replacing
-from pdcorrect.scene.regions import Strict
 
 require_extra("safetensors", "learn")
 
@@ -44,9 +40,11 @@ from torch import Tensor  # noqa: E402
 
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 
-FORMAT = "pdcorrect-model"
-VERSION = 5
-WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
+__all__ = [
+    "DESCRIPTION", "JOINT", "VERSION", "WEIGHTS", "LoadedModel", "ModelRecord", "content_digest",
+    "load_model", "model_folder", "models_folder", "read_description", "read_weights",
+    "save_model", "unlike_ends", "weights_digest",
+]  # fmt: skip
 
 BACKWARD_EULER = "backward-euler"
 """What all data sets have, also those of models that do not record it."""
@@ -54,42 +52,6 @@ BACKWARD_EULER = "backward-euler"
 JOINT = "+"
 """Between the names of data sets that a model was trained on, together or one after another."""
 _NORMALISER = "normaliser."
-_CHECKSUM = "checksum"
-
-
-class ModelRecord(Strict):
-    """Where a model comes from.
-
-    Attributes
-    ----------
-    dataset, dataset_hash
-        Name of the data set, or names of several with a plus sign between them; and the hash of
-        the configuration or content of what its last training learned.
-    training, metrics
-        Settings of the training, and what the model achieved; any JSON with finite numbers.
-    code_version, code_digest
-        Of the code that made it, see `pdcorrect.environment.code_digest`.
-    """
-
-    dataset: str
-    dataset_hash: str
-    training: dict[str, JsonValue] = Field(default_factory=dict)
-    metrics: dict[str, JsonValue] = Field(default_factory=dict)
-    code_version: str = __version__
-    code_digest: str = Field(default_factory=code_digest)
-
-
-class Description(Strict):
-    """``model.json`` without its checksum; all versions of the format since 2 have these keys."""
-
-    format: Literal["pdcorrect-model"] = "pdcorrect-model"
-    version: int = VERSION
-    architecture: CorrectorConfig
-    parameters: int
-    dtype: Literal["float32"] = "float32"
-    normalisation: dict[str, list[float] | float]
-    record: ModelRecord
-    weights_sha256: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,28 +90,21 @@ class LoadedModel:
         return [(self.record.dataset, training.get("config_hash"))]
 
     @property
+    def fitted_to(self) -> list[str]:
+        """Names of the data sets that its training fitted or widened its ranges to.
+
+        Those are what a gate knows of bodies at rest and of time steps, among others.  All that it
+        was trained on if not recorded.
+        """
+        training: dict[str, Any] = self.record.training
+        if "fitted_to" in training:
+            return list(training["fitted_to"])
+        return list(dict.fromkeys(one for name, _ in self.data_sets for one in name.split(JOINT)))
+
+    @property
     def velocity(self) -> Any:
         """What becomes of velocities, see `HybridStepper`."""
         return self.configuration.get("velocity", "recomputed")
-
-
-def unlike_ends(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of paths that are all unlike, such as "seed-1/model".
-
-    Raises
-    ------
-    InputError
-        If a folder comes twice.
-    """
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise InputError(f"{folder} comes twice: expected each one once.")
-    longest = max((len(folder.parts) for folder in folders), default=0)
-    for length in range(1, longest + 1):
-        names = ["/".join(folder.parts[-length:]) for folder in folders]
-        if len(set(names)) == len(names):
-            return names
-    return []
 
 
 # --- writing -----------------------------------------------------------------------------
@@ -181,8 +136,7 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
         weights_sha256=hashlib.sha256(weights).hexdigest(),
     )  # fmt: skip
     try:
-        content = description.model_dump(mode="json")
-        text = json.dumps({**content, _CHECKSUM: _digest(content)}, indent=1, allow_nan=False)
+        text = description.to_json()
     except ValueError as error:
         raise InputError(f"record of the model for {folder}: {error}.") from None
     make_folder(folder)
@@ -193,7 +147,7 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
             replacing(paths[0], part_of_process(paths[0])) as first,
         ):
             first.write_bytes(weights)
-            last.write_text(text + "\n", encoding="utf-8")
+            last.write_text(text, encoding="utf-8")
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written ({error.strerror or error}).") from None
     return folder
@@ -218,12 +172,6 @@ def _normalisation(state: dict[str, Tensor]) -> dict[str, Any]:
         for name, tensor in sorted(state.items())
         if name.startswith(_NORMALISER)
     }
-
-
-def _digest(content: dict[str, Any]) -> str:
-    """SHA-256 of JSON content, however it is laid out."""
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 # --- reading -----------------------------------------------------------------------------
@@ -263,104 +211,9 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     return LoadedModel(corrector.eval(), found.record)
 
 
-def model_folder(path_or_name: str | Path) -> Path:
-    """Where a model given by path or name is.
-
-    Raises
-    ------
-    InputError
-        If there is none, or it is no path or name.
-    """
-    if not isinstance(path_or_name, (str, os.PathLike)) or not str(path_or_name).strip():
-        raise InputError(
-            f"model {path_or_name!r}: expected the name of a model or the path of its folder."
-        )
-    named = isinstance(path_or_name, str) and path_or_name.strip(".") != ""
-    named = named and not set(str(path_or_name)) & {"/", os.sep}
-    folder = models_folder() / path_or_name if named else Path(path_or_name)
-    if folder.is_dir():
-        return folder
-    if not named:
-        raise InputError(f"{folder}: expected a folder with a model, there is none.")
-    known = sorted(path.parent.name for path in models_folder().glob(f"*/{DESCRIPTION}"))
-    here = ", which is a folder here" if Path(path_or_name).is_dir() else ""
-    raise InputError(
-        f"model {path_or_name!r}: not in {models_folder()}: expected one of "
-        f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}{here}."
-    )
-
-
 def weights_digest(path_or_name: str | Path) -> str:
     """SHA-256 of a model's file of weights."""
-    return hashlib.sha256(_read(model_folder(path_or_name) / WEIGHTS)).hexdigest()
-
-
-def models_folder() -> Path:
-    """Where models are looked up by name.
-
-    Raises
-    ------
-    InputError
-        If the environment does not say, and the code is not in its checkout.
-    """
-    return home_folder("models", ", or the path of a model")
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
-
-
-def read_description(folder: Path, versions: Sequence[int] = (VERSION,)) -> Description:
-    """What ``model.json`` in a folder says, if it is whole.
-
-    Parameters
-    ----------
-    folder : Path
-    versions : sequence of int
-        Of the format, which may be older ones.
-
-    Raises
-    ------
-    FileFormatError
-        If it is damaged.
-    FileVersionError
-        If it was written in another version of the format.
-    """
-    path = folder / DESCRIPTION
-    data = _read(path)
-    try:
-        content = json.loads(data.decode("utf-8"))
-        digest = _digest({k: v for k, v in content.items() if k != _CHECKSUM})
-    except (ValueError, AttributeError, RecursionError) as error:
-        reason = "expected keys and values" if isinstance(error, AttributeError) else error
-        raise FileFormatError(f"{path}: damaged: not JSON of a model ({reason}).") from None
-    if content.get("format") != FORMAT:
-        raise FileFormatError(f"{path}: expected format {FORMAT!r}: damaged or something else.")
-    _check_version(path, content.get("version"), versions)
-    if content.pop(_CHECKSUM, None) != digest:
-        raise FileFormatError(
-            f"{path}: damaged: its checksum is not that of its content; copy or save it again."
-        )
-    try:
-        return Description.model_validate(content)
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"]))
-        raise FileFormatError(f"{path}: {place}: {first['msg']}.") from None
-
-
-def _check_version(path: Path, version: object, versions: Sequence[int]) -> None:
-    expected = " or ".join(map(str, versions))
-    if not isinstance(version, int):
-        raise FileVersionError(f"{path}: version is {version!r}: expected {expected}: damaged.")
-    if version not in versions:
-        advice = "written by an older pdcorrect: docs/files.md says how to bring it up to date."
-        if version > VERSION:
-            advice = "written by a newer pdcorrect: update it."
-        raise FileVersionError(f"{path}: format version {version}: expected {expected}: {advice}")
+    return hashlib.sha256(read_file(model_folder(path_or_name) / WEIGHTS)).hexdigest()
 
 
 def read_weights(folder: Path, description: Description) -> dict[str, Tensor]:
@@ -372,7 +225,7 @@ def read_weights(folder: Path, description: Description) -> dict[str, Tensor]:
         If the file is damaged or another one.
     """
     path = folder / WEIGHTS
-    data = _read(path)
+    data = read_file(path)
     if hashlib.sha256(data).hexdigest() != description.weights_sha256:
         raise FileFormatError(
             f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "

@@ -1,0 +1,181 @@
+"""``model.json``: what the weights beside it belong to, checked when it is read.
+
+Under ``checksum`` it has the SHA-256 of all its other content, in every version so far.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, JsonValue, ValidationError
+
+from pdcorrect import __version__
+from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.environment import code_digest
+from pdcorrect.errors import FileFormatError, FileVersionError
+from pdcorrect.scene.regions import Strict
+
+FORMAT = "pdcorrect-model"
+VERSION = 5
+WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
+
+_CHECKSUM = "checksum"
+_BROUGHT_UP_BY = {2: "fit_shapes.py", 3: "fit_time_steps.py", 4: "fit_time_steps.py"}
+"""Scripts of the folder ``models`` for older versions; there is none for the first."""
+
+
+class ModelRecord(Strict):
+    """Where a model comes from.
+
+    Attributes
+    ----------
+    dataset, dataset_hash
+        Name of the data set, or names of several with a plus sign between them; and the hash of
+        the configuration or content of what its last training learned.
+    training, metrics
+        Settings of the training, and what the model achieved; any JSON with finite numbers.
+    code_version, code_digest
+        Of the code that made it, see `pdcorrect.environment.code_digest`.
+    """
+
+    dataset: str
+    dataset_hash: str
+    training: dict[str, JsonValue] = Field(default_factory=dict)
+    metrics: dict[str, JsonValue] = Field(default_factory=dict)
+    code_version: str = __version__
+    code_digest: str = Field(default_factory=code_digest)
+
+
+class Description(Strict):
+    """``model.json`` without its checksum; all versions of the format since 2 have these keys."""
+
+    format: Literal["pdcorrect-model"] = "pdcorrect-model"
+    version: int = VERSION
+    architecture: CorrectorConfig
+    parameters: int
+    dtype: Literal["float32"] = "float32"
+    normalisation: dict[str, list[float] | float]
+    record: ModelRecord
+    weights_sha256: str
+
+    def to_json(self) -> str:
+        """The file's text.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
+        content = self.model_dump(mode="json")
+        whole = {**content, _CHECKSUM: content_digest(content)}
+        return json.dumps(whole, indent=1, allow_nan=False) + "\n"
+
+
+def content_digest(content: dict[str, Any]) -> str:
+    """SHA-256 of JSON content, however it is laid out."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_file(path: Path) -> bytes:
+    """One of a model's two files.
+
+    Raises
+    ------
+    FileFormatError
+        If it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
+
+
+def read_description(folder: Path, versions: Sequence[int] = (VERSION,)) -> Description:
+    """What ``model.json`` in a folder says, if it is whole.
+
+    Parameters
+    ----------
+    folder : Path
+    versions : sequence of int
+        Of the format, which may be older ones.
+
+    Raises
+    ------
+    FileFormatError
+        If it is damaged.
+    FileVersionError
+        If it was written in another version of the format.
+    """
+    path = folder / DESCRIPTION
+    content, whole = _content(path)
+    _check_version(folder, content.get("version"), versions, whole)
+    try:
+        return Description.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise FileFormatError(f"{path}: {place}: {first['msg']}.") from None
+
+
+def _content(path: Path) -> tuple[dict[str, Any], bool]:
+    """What the file holds but its checksum, and whether that one is right."""
+    data = read_file(path)
+    try:
+        content = json.loads(data.decode("utf-8"))
+        digest = content_digest({k: v for k, v in content.items() if k != _CHECKSUM})
+    except (ValueError, AttributeError, RecursionError) as error:
+        reason = "expected keys and values" if isinstance(error, AttributeError) else error
+        raise FileFormatError(f"{path}: damaged: not JSON of a model ({reason}).") from None
+    if content.get("format") != FORMAT:
+        raise FileFormatError(f"{path}: expected format {FORMAT!r}: damaged or something else.")
+    return content, content.pop(_CHECKSUM, None) == digest
+
+
+def _check_version(folder: Path, version: object, versions: Sequence[int], whole: bool) -> None:
+    """Refuse what is altered, for its version may be what was altered, and other versions.
+
+    A newer version is not taken for altered by its checksum alone, which may be another one there.
+    """
+    path, expected = folder / DESCRIPTION, " or ".join(map(str, versions))
+    found = version if type(version) is int else 0
+    if found > VERSION:
+        raise FileVersionError(
+            f"{path}: format version {found}: expected {expected}: {_newer(whole)}"
+        )
+    if not whole:
+        raise FileFormatError(
+            f"{path}: damaged: its checksum is not that of its content; copy or save it again."
+        )
+    if found < 1:
+        raise FileVersionError(f"{path}: version is {version!r}: expected {expected}: damaged.")
+    if found not in versions:
+        raise FileVersionError(
+            f"{path}: format version {found}: expected {expected}: written by an older pdcorrect: "
+            f"{_way_up(folder, found)}"
+        )
+
+
+def _newer(whole: bool) -> str:
+    if whole:
+        return "written by a newer pdcorrect: update pdcorrect."
+    return (
+        "its checksum is not that of its content, as this pdcorrect computes it: written by a "
+        "newer one or damaged: update pdcorrect, or copy the model again."
+    )
+
+
+def _way_up(folder: Path, version: int) -> str:
+    """What can be done about a model of an older version."""
+    if version not in _BROUGHT_UP_BY:
+        return "nothing brings it up to date: train the model anew."
+    command = f"python models/{_BROUGHT_UP_BY[version]} {shlex.quote(str(folder))}"
+    return (
+        f"bring it up to date by `{command} DATASET/config.toml ...` with the configurations that "
+        "docs/files.md tells of, or train it anew if its data sets have none."
+    )
