@@ -4,9 +4,10 @@ python models/take_ranges.py MODEL FROM -o OUTPUT
 
 For models that went on from each other, and whose trainings widened the ranges of inputs, bodies
 and time steps on the way, before there was `fitting.widen`: OUTPUT has all of MODEL but its ranges
-(the normaliser's `*_low` and `*_high`), which are those of FROM.  Weights belong to the means and
-deviations with which they were trained; both models must have the same.  Models of older versions
-of the format are brought up to date first, see `fit_time_steps.py`.
+(the normaliser's `*_low` and `*_high`), which are those of FROM, as its record tells, too.  Weights
+belong to the means and deviations with which they were trained; both models must have the same.
+Models of older versions of the format are brought up to date first, see `fit_time_steps.py`.
+OUTPUT is a new folder, or an empty one.
 """
 
 from __future__ import annotations
@@ -32,10 +33,26 @@ def main() -> None:
     parser.add_argument("ranges", metavar="FROM", help="folder or name")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder")
     options = parser.parse_args()
+    check_new(options.output)
     model, other = pc.load_model(options.model), pc.load_model(options.ranges)
     take_ranges(model, other, f"{options.model} and {options.ranges}")
     model.record.training["ranges_of"] = weights_digest(model_folder(options.ranges))
+    model.record.training["fitted_to"] = [*other.fitted_to]
     print(pc.save_model(model.corrector, options.output, record=model.record))
+
+
+def check_new(output: Path) -> None:
+    """Refuse a place where something is already.
+
+    Raises
+    ------
+    InputError
+    """
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise InputError(
+            f"{output}: exists already, and nothing is overwritten: expected a new folder; choose "
+            "another name, or delete it first."
+        )
 
 
 def take_ranges(model: LoadedModel, other: LoadedModel, names: str = "the two models") -> None:

@@ -282,6 +282,20 @@ def test_a_network_takes_the_ranges_of_another_model_of_the_same_normalisation(t
     assert not (tmp_path / "none").exists()
 
 
+def test_ranges_are_not_written_over_what_is_there(tmp_path):
+    folder, _ = copied(tmp_path)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for place in (folder, folder / "model.json", tmp_path):
+        expected = f"{re.escape(str(place))}: exists already, and nothing is overwritten: expected"
+        assert_refused(ran("take_ranges.py", "tiny", "tiny", "-o", place), expected)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    run = ran("take_ranges.py", "tiny", "tiny", "-o", empty)
+    assert run.returncode == 0, run.stderr
+    assert pc.load_model(empty).data_sets == pc.load_model(folder).data_sets
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
