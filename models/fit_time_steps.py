@@ -4,9 +4,10 @@ python models/fit_time_steps.py MODEL DATASET/config.toml ... [--other]
 
 For models of the format versions 3 and 4, from before gates knew time steps, or knew them without
 the cell size; trainings fit the range to their data.  That of models of this version is fitted
-anew; version 2 is for `fit_shapes.py`.  Expected are the configurations of all data sets that the
-model names, each once; `--other` lets sets of other names pass, and the model's be missing.  The
-model is replaced by itself with this range, which is told.
+anew; version 2 is for `fit_shapes.py`.  Expected are the configurations of the data sets that the
+training fitted the ranges to, each once: `fitted_to` in the model's record, or, where that is
+missing, all that it was trained on.  `--other` lets sets of other names pass, and these be missing.
+The model is replaced by itself with this range, which is told.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from program import run_script
 import pdcorrect as pc
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import (
-    JOINT,
     VERSION,
     WEIGHTS,
     LoadedModel,
@@ -59,31 +59,30 @@ def main() -> None:
 
 
 def add_configs(parser: argparse.ArgumentParser) -> None:
-    """Arguments for the data sets of a model's training."""
+    """Arguments for the data sets of a model's ranges."""
     parser.add_argument(
-        "config", type=Path, nargs="+", help="of the data sets that it was trained on"
+        "config", type=Path, nargs="+", help="of the data sets that its ranges were fitted to"
     )
     parser.add_argument("--other", action="store_true", help="other data sets than it names")
 
 
 def configs_of(model: LoadedModel, options: argparse.Namespace) -> list[DatasetConfig]:
-    """The configurations that were asked for, of the data sets that the model names.
+    """The configurations that were asked for, of the data sets of the model's ranges.
 
     Raises
     ------
     InputError
-        If one comes twice, is missing, or of a data set that the model does not name.
+        If one comes twice, is missing, or of another data set.
     """
     configs = [DatasetConfig.load(path) for path in options.config]
     given = [config.name for config in configs]
-    wanted = dict.fromkeys(one for name, _ in model.data_sets for one in name.split(JOINT))
     for name in given:
         if given.count(name) > 1:
             raise InputError(f"data set {name!r} comes twice: expected each one once.")
-    if not options.other and set(given) != set(wanted):
+    if not options.other and set(given) != set(model.fitted_to):
         raise InputError(
-            f"configurations of {', '.join(given)}: expected those of {', '.join(wanted)}, which "
-            "the model was trained on; --other takes others."
+            f"configurations of {', '.join(given)}: expected those of {', '.join(model.fitted_to)},"
+            " the data sets of the model's ranges by its record; --other takes others."
         )
     return configs
 

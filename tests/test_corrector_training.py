@@ -823,7 +823,7 @@ def test_a_teacher_of_another_kind_is_refused(folder, tmp_path):
     Training(samples_of, folder, tmp_path / "best").run()
     teacher = str(tmp_path / "best" / "model")
     stage = samples.unrolled(teacher=teacher)
-    with pytest.raises(InputError, match="its base is 'best': expected 'plain'"):
+    with pytest.raises(InputError, match="its base is 'best': expected 'plain', as here\\.$"):
         Training(samples.config(stage), folder, tmp_path / "out")
     with pytest.raises(InputError, match="velocity is 'recomputed': expected 'kept'"):
         Training(samples.config(stage, base="best", velocity="kept"), folder, tmp_path / "out")
@@ -1388,7 +1388,7 @@ def test_a_start_of_another_architecture_is_refused_with_the_difference(short, e
 
 def test_a_start_of_another_base_or_velocity_is_refused(short, earlier, tmp_path):
     for changes, told in (
-        ({"base": "best"}, "start_from = .*its base is 'plain': expected 'best'"),
+        ({"base": "best"}, "start_from = .*its base is 'plain': expected 'best', as here, or fit"),
         ({"velocity": "kept"}, "its velocity is 'recomputed': expected 'kept'"),
     ):
         settings = samples.config(samples.one_step(), start_from=str(earlier), **changes)

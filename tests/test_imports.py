@@ -224,6 +224,7 @@ ORDER = [
     "training.world",
     "training.sources",
     "training.teachers",
+    "training.lineage",
     "training.optimisation",
     "training.validation",
     "training.history",

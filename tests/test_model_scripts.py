@@ -239,6 +239,28 @@ def test_time_steps_are_fitted_anew_to_the_data_sets_that_are_asked_for(tmp_path
     assert (folder / "model.json").read_bytes() == before
 
 
+@pytest.mark.parametrize("name", ["fit_shapes.py", "fit_time_steps.py"])
+def test_scripts_ask_for_the_data_sets_of_the_ranges_and_not_of_the_weights(tmp_path, name):
+    folder, config = copied(tmp_path)
+    model = pc.load_model(folder)
+    sets = [{"name": one, "config_hash": None} for one in ("before", "tiny")]
+    model.record.training.update(data_sets=sets, fitted_to=["tiny"])
+    save_model(model.corrector, folder, record=model.record)
+    before = load_file(folder / "weights.safetensors")
+    other = tmp_path / "other.toml"
+    other.write_text(config.read_text().replace('name = "tiny"', 'name = "before"'))
+    expected = (
+        "configurations of tiny, before: expected those of tiny, the data sets of the model's "
+        "ranges by its record; --other takes others."
+    )
+    assert_refused(ran(name, folder, config, other), expected)
+    run = ran(name, folder, config)
+    assert run.returncode == 0, run.stderr
+    assert pc.load_model(folder).fitted_to == ["tiny"]
+    after = load_file(folder / "weights.safetensors")
+    assert all(torch.equal(after[key], x) for key, x in before.items())
+
+
 def test_old_models_that_are_damaged_are_refused(tmp_path):
     folder, config = copied(tmp_path)
     as_version(2, folder)
@@ -263,6 +285,7 @@ def test_a_network_takes_the_ranges_of_another_model_of_the_same_normalisation(t
             values += -1.0 if name.endswith("_low") else 1.0
     with torch.no_grad():
         wider.corrector.network.decoder[-1].bias += 1.0
+    wider.record.training["fitted_to"] = ["wide"]
     save_model(wider.corrector, tmp_path / "wider", record=wider.record)
     run = ran("take_ranges.py", folder, tmp_path / "wider", "-o", tmp_path / "both")
     assert run.returncode == 0, run.stderr
@@ -273,6 +296,7 @@ def test_a_network_takes_the_ranges_of_another_model_of_the_same_normalisation(t
         assert torch.equal(values, of[name]), name
     digest = model_io.weights_digest(tmp_path / "wider")
     assert found.record.training["ranges_of"] == digest
+    assert found.fitted_to == ["wide"]
     normaliser.average_mean += 0.1
     save_model(wider.corrector, tmp_path / "wider", record=wider.record)
     refused = ran("take_ranges.py", folder, tmp_path / "wider", "-o", tmp_path / "none")

@@ -84,10 +84,16 @@ def test_choices_that_mean_nothing_are_refused(text, told):
 def test_a_start_of_another_base_is_let_pass_if_the_normalisation_is_fitted_anew(
     data, earlier, tmp_path
 ):
-    told = "start_from = .*its base is 'plain': expected 'best', as here"
-    for fitting in ({}, {"widen": False}):
-        with pytest.raises(InputError, match=told):
+    for fitting, instead in (({}, ""), ({"widen": False}, " in place of fitting.widen = false")):
+        with pytest.raises(InputError) as refusal:
             Training(settings(earlier, fitting, base="best"), data, tmp_path / "refused")
+        assert str(refusal.value) == (
+            f"start_from = {str(earlier)!r}: its base is 'plain': expected 'best', as here, or "
+            f"fitting.anew = true{instead}, which takes over that model's weights alone."
+        )
+    both = settings(earlier, {}, base="best", velocity="kept")
+    with pytest.raises(InputError, match=r"its velocity is .* expected 'kept', as here\.$"):
+        Training(both, data, tmp_path / "refused")  # which anew = true would not let pass
     Training(settings(earlier, {"anew": True}, base="best"), data, tmp_path / "out").run()
     found = load_model(tmp_path / "out" / "model")
     assert found.base == "best"
@@ -132,6 +138,47 @@ def test_such_a_training_goes_on_with_the_same_bits_and_does_not_fit_again(
     changed = settings(earlier, {"widen": False}, checkpoint_every={"iterations": 1})
     with pytest.raises(InputError, match="was begun with config.base"):
         Training(changed, other, tmp_path / "broken", resume=True)
+
+
+# --- the record --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fitting", "expected"),
+    [
+        ({}, ["first", "tiny"]),
+        ({"widen": False}, ["first"]),
+        ({"anew": True}, ["tiny"]),
+    ],
+    ids=str,
+)
+def test_a_model_records_the_data_sets_that_its_ranges_were_fitted_to(
+    data, earlier, tmp_path, fitting, expected
+):
+    model = load_model(earlier)
+    assert model.fitted_to == model.record.training["fitted_to"] == ["tiny"]
+    sets = [{"name": name, "config_hash": name[::-1]} for name in ("first", "second")]
+    model.record.training.update(data_sets=sets, fitted_to=["first"])
+    start = save_model(model.corrector, tmp_path / "start", record=model.record)
+    Training(settings(start, fitting), data, tmp_path / "out").run()
+    found = load_model(tmp_path / "out" / "model")
+    assert [name for name, _ in found.data_sets] == ["first", "second", "tiny"]
+    assert found.record.dataset == "first+second+tiny"
+    assert found.fitted_to == found.record.training["fitted_to"] == expected
+    again = settings(tmp_path / "out" / "model", {})
+    Training(again, data, tmp_path / "again").run()
+    further = load_model(tmp_path / "again" / "model").fitted_to
+    assert further == [*expected, *({"tiny"} - set(expected))]  # each once
+
+
+def test_ranges_of_a_model_that_does_not_record_it_count_as_fitted_to_all_that_it_learned(earlier):
+    model = load_model(earlier)
+    del model.record.training["fitted_to"]
+    sets = [{"name": name, "config_hash": None} for name in ("b+a", "a", "c")]
+    model.record.training["data_sets"] = sets
+    assert model.fitted_to == ["b", "a", "c"]
+    del model.record.training["data_sets"]
+    assert model.fitted_to == ["tiny"]
 
 
 # --- another time step -------------------------------------------------------------------------

@@ -16,14 +16,7 @@ from torch import Tensor
 
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_io import (
-    JOINT,
-    LoadedModel,
-    ModelRecord,
-    load_model,
-    save_model,
-    weights_digest,
-)
+from pdcorrect.corrector.model_io import LoadedModel, ModelRecord, save_model, weights_digest
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
@@ -31,17 +24,17 @@ from pdcorrect.data.missing import check_whole
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.replacement import make_folder, write_text
-from pdcorrect.toml_config import as_toml
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.config import Stage, TrainingConfig
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
 from pdcorrect.training.history import History
+from pdcorrect.training.lineage import lineage_of
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
-from pdcorrect.training.teachers import check_trained_alike, load_teachers
+from pdcorrect.training.teachers import load_start, load_teachers
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 from pdcorrect.training.world import World
@@ -116,8 +109,8 @@ class Training:
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
-        start, self._teachers = self._start(), load_teachers(config, self.device)
-        self._learned = [] if start is None else start.data_sets
+        start = load_start(config, self.device)
+        self._teachers = load_teachers(config, self.device)
         if start is not None:
             self._identity["start"] = weights_digest(str(config.start_from))
         if self._teachers:
@@ -129,6 +122,7 @@ class Training:
         )
         if len(data) > 1:
             _check_alike(self._recordings)
+        self._lineage = lineage_of(config, start, self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
             workers=config.workers, without=without,
@@ -282,25 +276,6 @@ class Training:
 
     # --- states -----------------------------------------------------------------------------
 
-    def _start(self) -> LoadedModel | None:
-        """The model to start from, if there is one, of the configuration's architecture."""
-        if self.config.start_from is None:
-            return None
-        model = load_model(self.config.start_from, self.device)
-        own, wanted = (c.model_dump() for c in (model.corrector.config, self.config.architecture()))
-        unlike = [name for name in own if own[name] != wanted[name]]
-        if unlike:
-            told = ", ".join(f"{name} = {as_toml(own[name])}" for name in unlike)
-            raise InputError(
-                f"start_from = {self.config.start_from!r}: that model has {told}, unlike "
-                "corrector: expected the same there, in corrector.changes."
-            )
-        check_trained_alike(
-            f"start_from = {self.config.start_from!r}", model, self.config,
-            any_base=self.config.fitting.anew,
-        )  # fmt: skip
-        return model
-
     def _new_corrector(self, start: LoadedModel | None, fit: bool) -> Corrector:
         config = self.config
         if start is not None:
@@ -326,15 +301,13 @@ class Training:
         self.progress.metrics = metrics
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
-            own = ((r.dataset, r.config_hash) for r in self._recordings)
-            known = dict.fromkeys((*self._learned, *own))
             record = ModelRecord(
-                dataset=JOINT.join(dict.fromkeys(name for name, _ in known)),
+                dataset=self._lineage.name,
                 dataset_hash=self._identity["data"],
                 training={
                     **self._identity,
                     "integrator": INTEGRATOR,
-                    "data_sets": [{"name": name, "config_hash": x} for name, x in known],
+                    **self._lineage.record(),
                     "iterations": self.progress.total, "seconds": self.progress.seconds,
                     "processes": self.world.size,
                 },
