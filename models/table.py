@@ -22,7 +22,6 @@ from typing import Any
 
 from program import run_script
 from table_rows import (
-    BEFORE,
     BODIES,
     BODY_HEADINGS,
     HARM,
@@ -31,6 +30,8 @@ from table_rows import (
     JOINT_RECORD,
     MEASURED,
     OTHER_HEADINGS,
+    OTHER_STEPS,
+    OTHER_WEIGHTS,
     OTHERS,
     PUBLISHED,
     ROWS,
@@ -197,7 +198,7 @@ def _split_cells(model: str, split: str) -> list[str]:
         ratios.append(f"{statistics.median(each.values()):.2f}, {max(each.values()):.2f}")
     omega, base = (x["measures"]["omega"] for x in (found, runs[found["base"]]))
     return [
-        _weights(model, split), split.replace("-", " "), f"{omega['count']}",
+        _model(model, split), split.replace("-", " "), f"{omega['count']}",
         f"{found['measures']['gate_rate']['mean']:.0f}", _signed(f"{base['mean']:.1f}"),
         _signed(f"{omega['mean']:.1f}, {omega['smallest']:.1f}"), *ratios,
     ]  # fmt: skip
@@ -208,9 +209,11 @@ def _lets_all_pass(run: dict[str, Any]) -> bool:
     return bool(run["measures"]["gate_rate"]["largest"] == 0.0)
 
 
-def _weights(model: str, split: str) -> str:
-    """The model, and whether the record is of other weights than it has now."""
-    return f"`{model}`" + (", weights before" if f"{model}-{split}" in BEFORE else "")
+def _model(model: str, split: str) -> str:
+    """The model, and whether the record is of another gate, or other weights, than now."""
+    parts = ["gate"] if split in OTHER_STEPS else []
+    parts += ["weights"] if f"{model}-{split}" in OTHER_WEIGHTS else []
+    return f"`{model}`" + (f", {' and '.join(parts)} before" if parts else "")
 
 
 def _baseline_cell(record: dict[str, Any], run: str) -> str:
@@ -272,7 +275,7 @@ def _other_cells(record: dict[str, Any], model: str, split: str, frames: int) ->
     omega, harm = record["omega"][model], record["error_over_base"][model]
     refused = sum(len(row["refused"]) for row in each) / (frames * len(each))
     return [
-        _weights(model, split), split.replace("-", " "), f"{len(each)}", f"{100 * refused:.0f}",
+        _model(model, split), split.replace("-", " "), f"{len(each)}", f"{100 * refused:.0f}",
         _signed(f"{omega['own_base']['mean']:.1f}"),
         _signed(f"{omega['with_gate']['mean']:.1f}, {omega['with_gate']['least']:.1f}"),
         *("{median:.2f}, {largest:.2f}".format(**harm[x]) for x in ("with_gate", "without")),

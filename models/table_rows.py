@@ -34,7 +34,7 @@ _FURTHER = "through-further/model"
 ROWS = (
     Row("impulse-as-published", "impulse-as-published-fifth", "model", _IMPULSE),
     Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
-    Row("stretch-as-published", "stretch-as-published-fifth", "model", _STRETCH),
+    Row("stretch-as-published", "stretch-as-published-sixth", "model", _STRETCH),
     Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),
     Row("torsion-as-published", "torsion-as-published-second", "torsion-as-published", _TORSION),
     Row(_HEAVY, "torsion-as-published-second", _HEAVY, _TORSION),
@@ -54,7 +54,9 @@ OTHERS = (
     "half-refined", "long",
 )  # fmt: skip
 """Splits of the second and the third table, in their order."""
-BEFORE = ("torsion-exact-double-step", "torsion-exact-half-step")
+OTHER_STEPS = ("double-step", "half-step")
+"""Splits whose records have gates of before these knew time steps; they refuse all of them now."""
+OTHER_WEIGHTS = ("torsion-exact-double-step", "torsion-exact-half-step")
 """Records of the second and third table of which a model had other weights than it has now."""
 OTHER_HEADINGS = (
     "model", "split", "simulations", "steps refused, %", "base alone: Ω mean",
