@@ -21,7 +21,7 @@ from pdcorrect.fem.coarse_models import Base
 from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 from pdcorrect.toml_config import TomlConfig
 
-_FILE = re.compile(rf"({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
+_FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
 Flag = Annotated[bool, Field(strict=True)]
@@ -42,7 +42,8 @@ def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
         if not _FILE.fullmatch(name):
             raise ValueError(
                 f"{name!r}: expected files of the training and validation splits without their "
-                "ending, such as 'training/mesh-0042'"
+                "ending, such as 'training/mesh-0042', with several data sets "
+                "'SET/training/mesh-0042'"
             )
     if len(set(names)) < len(names):
         raise ValueError("expected each file once")
@@ -293,7 +294,8 @@ class TrainingConfig(TomlConfig):
         does.
     without
         Files of the data set that are left out, such as "training/mesh-0042": of bodies that
-        another set keeps for its evaluation, say.  For one data set.
+        another set keeps for its evaluation, say.  Of several data sets with the name of a set's
+        folder, "impulse-more/training/mesh-0042".
     base
         Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
     velocity

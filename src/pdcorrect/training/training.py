@@ -371,12 +371,25 @@ def _common_splits(folders: Sequence[Path]) -> list[str]:
 
 
 def _check_left_out(names: Sequence[str], folders: Sequence[Path]) -> None:
-    """Refuse files to be left out of several data sets, and those that are not there."""
-    if names and len(folders) > 1:
-        raise InputError(f"without = {list(names)}: expected one data set, got {len(folders)}.")
-    unknown = [name for name in names if not (folders[0] / f"{name}{SUFFIX}").exists()]
-    if unknown:
-        raise InputError(f"without: {folders[0]} has no {unknown[0]}: expected files of it.")
+    """Refuse files to be left out that are not there, or that may be of several data sets."""
+    for name in names:
+        *given, split, mesh = name.split("/")
+        having = [each for each in folders if not given or each.resolve().name == given[0]]
+        if len(having) > 1 and given:
+            raise InputError(
+                f"without = {name!r}: {having[0]} and {having[1]} have the same name: expected "
+                "folders of different names."
+            )
+        if len(having) > 1:
+            raise InputError(
+                f"without = {name!r}: expected the folder of one of the {len(folders)} data sets "
+                f"before it, such as '{folders[0].resolve().name}/{name}'."
+            )
+        if not having:
+            known = ", ".join(each.resolve().name for each in folders)
+            raise InputError(f"without = {name!r}: expected a data set among {known}.")
+        if not (having[0] / split / f"{mesh}{SUFFIX}").exists():
+            raise InputError(f"without: {having[0]} has no {split}/{mesh}: expected files of it.")
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:
