@@ -4,8 +4,7 @@ python models/make_all.py WORK [RECIPE | MODEL ...] [--device cuda] [--generator
     [--together 4] [--measurers 16] [--seconds 1000] [--split evaluation ...]
 
 A recipe is ``models/recipes/DATASET/NAME.toml``; all of them by default.  In place of a data set
-there may be ``all-as-published``, for the three of that setting together, or ``impulse-both``, for
-``impulse-as-published`` and ``impulse-more``.  MODEL is the name of a
+there may be ``all-as-published``, for the three of that setting together.  MODEL is the name of a
 released model, which is evaluated only, beside what is trained for its data sets: on the set that
 it is named after, or else on all that it has learned.  WORK gets
 
@@ -49,7 +48,6 @@ DATASETS = HERE.parent / "datasets"
 LEARNT = (TRAINING, VALIDATION)
 SETS_OF = {
     "all-as-published": ["impulse-as-published", "stretch-as-published", "torsion-as-published"],
-    "impulse-both": ["impulse-as-published", "impulse-more"],
 }
 """Data sets of recipes that learn several, by the recipes' folder."""
 STOPPED = 1

@@ -318,4 +318,5 @@ RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
 @pytest.mark.parametrize("name", RELEASED)
 def test_released_models_know_the_time_step_and_cell_size_of_their_data(name):
     model = pc.load_model(name)
-    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=1e-12)
+    # to the rounding of data sets' corners, which are of single precision
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=1e-6)
