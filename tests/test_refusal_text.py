@@ -1,6 +1,7 @@
 """The sentences about what a gate refused."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,13 @@ def test_a_time_step_of_which_the_training_s_is_not_known_is_told_so():
     )
     assert text.startswith("The time step is 0.02 s, and that of the training is not known")
     assert "Expected the time step of the training (" in way
+
+
+def test_a_body_where_those_of_the_training_are_not_known_is_told_without_measures():
+    unknown = [replace(x, low=np.nan, high=np.nan) for x in (NODES, LONG)]
+    _, text, way = refused_corrections([BODY], Refused(measures=tuple(unknown)))
+    assert text == "The bodies of the training are not known: the gate refuses any body at rest."
+    assert way.startswith("Expected a body like those of the training (")
 
 
 def test_body_and_time_step_are_told_together_where_both_are_refused():

@@ -300,7 +300,7 @@ def test_inputs_of_the_first_step_that_they_refuse_are_named_also_when_continued
     status, out, _ = program(*command, "--frames", 3, "--resume")
     assert status == 0
     assert "2 of 3 corrections were refused by the gate (2 by features)." in out
-    assert "of the training's range in frame 2, in deviations" in out
+    assert " in frame 2, in deviations of which the gate allows" in out
     assert "corrections: at most" in out
     hybrid = pc.hybrid_of(pc.Scene.load(tmp_path / "s.toml"), MODEL)
     run = pc.load_trajectory(tmp_path / "run.h5")

@@ -10,8 +10,7 @@ pytest.importorskip("torch_geometric")
 import torch
 
 import pdcorrect as pc
-from hybrid_samples import PLACEMENTS, PRESSURE, TORSION, fitted, problems, soft_beam
-from pdcorrect.corrector.corrector import Corrector
+from hybrid_samples import PLACEMENTS, PRESSURE, TORSION, fitted, problems, silent, soft_beam
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.corrector.refusal_watch import RefusalWatch
@@ -153,7 +152,7 @@ def test_forces_of_the_caller_count_and_wrong_ones_are_refused():
         hybrid.unknown_inputs("rest")
 
 
-def test_inputs_that_are_not_numbers_are_infinitely_far(monkeypatch):
+def test_inputs_that_are_not_numbers_are_infinitely_far():
     corrector = known(node_features=("load", "previous-correction"))
     hybrid = hybrid_of(twisted(), corrector)
     state = hybrid.problem.rest_state()
@@ -164,9 +163,9 @@ def test_inputs_that_are_not_numbers_are_infinitely_far(monkeypatch):
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_run_is_watched_for_its_first_step_that_is_refused_by_inputs(placement):
-    corrector = known(placement=placement, size=1e-3)
+    corrector = silent(known(placement=placement))
     late = {**TORSION, "strength": 30.0 * TORSION["strength"]}
-    late["table"] = [[0.0, 0.03], [0.02, 0.03], [0.021, 1.0]]
+    late["table"] = [[0.0, 1.0 / 30.0], [0.02, 1.0 / 30.0], [0.021, 1.0]]
     hybrid = hybrid_of(pc.discretise(soft_beam((3, 1, 1), loads=[late])), corrector)
     state = hybrid.problem.rest_state()
     watch, states = RefusalWatch(hybrid, state), [state]
@@ -178,7 +177,6 @@ def test_a_run_is_watched_for_its_first_step_that_is_refused_by_inputs(placement
     assert found.frame == 3
     assert list(found.inputs) == hybrid.unknown_inputs(states[2]) != []
     assert (found.measures, found.step) == ((), None)
-    assert type(corrector) is Corrector
 
 
 def test_a_run_of_known_inputs_has_none():

@@ -153,9 +153,10 @@ def _explained(counts: Mapping[str, int], refused: Refused | None) -> list[str]:
 
 def _of_the_body(measures: Sequence[ForeignMeasure]) -> str:
     """Its measures and their ranges in training, the farthest out first."""
+    if math.isnan(measures[0].low):
+        return "The bodies of the training are not known: the gate refuses any body at rest."
     named = ", ".join(
-        f"{x.name} {_span(x.name, x.least, x.most)} (in training "
-        f"{'not known' if math.isnan(x.low) else _span(x.name, x.low, x.high)})"
+        f"{x.name} {_span(x.name, x.least, x.most)} (in training {_span(x.name, x.low, x.high)})"
         for x in measures
     )
     bodies = max(x.bodies for x in measures)
