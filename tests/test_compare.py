@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli, compare_cli, report, run_text
+from pdcorrect import cli, compare_cli, refusal_text, report, run_text
 from pdcorrect.comparison_cases import HEX27, cases_for, without_best
 from pdcorrect.errors import InputError
 
@@ -223,7 +224,10 @@ def test_a_row_whose_corrections_are_all_refused_says_so(stiff, tmp_path):
     text = report.write_report(found, tmp_path, draw=False).read_text()
     assert f"| {name} |" in text
     assert f"- hybrid {MODEL} is no corrected run" in text
-    assert "'features': the network's inputs are unlike those of its training" in text
+    assert f"- hybrid {MODEL}: inputs (docs/corrector.md#graph-and-features) outside of" in text
+    assert "in frame 1, in deviations of which the gate allows 1: stiffness by 7.11" in text
+    assert ": stiffness by 7.11 at 100 % of the nodes" in text
+    assert f"{refusal_text.PAGE}#{refusal_text.SECTIONS['features']}" in text
     np.testing.assert_array_equal(
         found.runs[hybrid.label].positions, found.runs["best coarse PD"].positions
     )
@@ -256,9 +260,12 @@ def test_another_time_step_is_told_beside_that_of_the_training(stiff):
     told = report.notes(found)
     assert f"{label}: 2 of 2 corrections were refused by the gate (2 by time step)." in told
     assert any(note.startswith(f"{label} is no corrected run") for note in told)
-    (step,) = [note for note in told if note.startswith(f"{label}: the time step is")]
-    assert "0.02 s, that of the training 0.01 s for cells of this size: farther than the" in step
-    assert "Expected a time step as in the training; or, at your own risk, a gate without" in step
+    (step,) = [note for note in told if note.startswith(f"{label}: the time step per cell size")]
+    assert "is 2.0 times that of the training: 0.02 s, where the training has 0.01 s" in step
+    (way,) = [note for note in told if note.startswith(f"{label}: expected")]
+    link = f"{refusal_text.PAGE}#{refusal_text.SECTIONS['time step']}"
+    assert f"expected a time step of 0.01 s ({link}); or, at your own risk, a gate" in way
+    assert "without this bound, Gate(time_step=None), or none (--no-gate)." in way
     assert not any("that of the training" in n for n in report.notes(pc.compare(
         stiff, 1, cases=cases_for(stiff, [MODEL])[4:])))  # fmt: skip
 
@@ -271,24 +278,24 @@ def test_another_time_step_is_told_of_a_foreign_body_too(thick):
         found = pc.compare(scene, 2, cases=cases)
         told = report.notes(found)
         label = cases[0].label
-        body = f"{label}: 2 of 2 corrections were refused by the gate (2 by body)."
-        assert told.count(body) == count
-        assert sum(note.startswith(f"{label}: the time step is 0.02 s") for note in told) == count
+        both = f"{label}: 2 of 2 corrections were refused by the gate (2 by body and time step)."
+        assert told.count(both) == count
+        assert sum(note.startswith(f"{label}: measures of the body") for note in told) == count
+        assert sum(": the time step per cell size is 5.0 times" in note for note in told) == count
+        assert sum("Gate(body=None, time_step=None)" in note for note in told) == count
 
 
-def test_of_time_steps_that_a_gate_lets_pass_nothing_is_told():
-    gate = pytest.importorskip("pdcorrect.corrector.gate").Gate()
-    for excess in (0.0, 0.1):
-        assert run_text.refused_step(gate, 0.01, excess, "0.01 s") is None
-    for excess in (np.nextafter(0.1, 1.0), np.inf):
-        told = run_text.refused_step(gate, 0.02, excess, "0.005 to 0.01 s")
-        assert "The time step is 0.02 s, that of the training 0.005 to 0.01 s for cells" in told
-        assert run_text.refused_step(None, 0.02, excess, "0.01 s") is None
-
-
-def test_every_reason_of_a_gate_has_a_meaning():
-    gate = pytest.importorskip("pdcorrect.corrector.gate")
-    assert list(run_text._MEANINGS) == list(gate.refusals([]))
+def test_of_two_models_that_refuse_the_same_it_is_told_once(thick, tmp_path):
+    pytest.importorskip("torch_geometric")
+    for name in ("one", "two"):
+        shutil.copytree(EXAMPLES.parent / "models" / MODEL, tmp_path / name)
+    cases = pc.evaluate.cases_with([str(tmp_path / name) for name in ("one", "two")])[-2:]
+    told = report.notes(pc.compare(thick.with_changes(time={"step": 0.02}), 1, cases=cases))
+    names = "hybrid one, hybrid two: "
+    for words in ("measures of the body", "the time step per cell size", "expected a body"):
+        assert [note for note in told if words in note] == [
+            note for note in told if note.startswith(names + words)
+        ]
 
 
 def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):

@@ -19,6 +19,7 @@ from typer.testing import CliRunner  # noqa: E402
 import pdcorrect as pc  # noqa: E402
 from pdcorrect.batch.states import BatchState  # noqa: E402
 from pdcorrect.cli import app  # noqa: E402
+from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.gate import Gate, Reason  # noqa: E402
@@ -184,8 +185,24 @@ def test_of_rollouts_that_a_gate_refuses_as_a_whole_the_reason_is_kept(cases):
     found = evaluate([*candidates, fake(cases, perfect, "open")], TINY, batch=3).runs
     for name, reason in (("BODY", 6), ("TIME_STEP", 9), ("FEATURES", 0), ("open", 0)):
         assert found[name].refused_by() == [reason] * 4
+        assert found[name].all_refused == (name != "open")
+        assert found[name].shapes().shape == (4 if name == "BODY" else 0, 10)
         assert found[name].values("gate_rate")[0] == [0.0 if name == "open" else 100.0] * 4
     assert found["plain"].refused_by() == [0] * 4
+    assert not found["plain"].all_refused
+    bodies = BodyGraph.of([case.problems["plain"] for case in cases], dtype=torch.float64)
+    np.testing.assert_allclose(found["BODY"].shapes(), bodies.shapes.numpy(), atol=1e-12)
+
+
+def test_steps_after_a_failure_do_not_count_as_corrected(cases):
+    case = cases[0]
+    reasons = np.zeros(case.steps, dtype=np.int64)
+    reasons[:2] = Reason.FEATURES
+    outcomes = [Outcome(case.reference, None, "plain", reasons, failed) for failed in (3, 4, None)]
+    runs = [EvaluatedRun("run", None, None, (measure(case, one),)) for one in outcomes]
+    assert [run.all_refused for run in runs] == [True, False, False]
+    assert [len(run.trajectories[0].reasons) for run in runs] == [2, 3, case.steps]
+    assert not EvaluatedRun("run", None, None, ()).all_refused
 
 
 def test_names_of_models_must_be_unlike(cases):
@@ -812,10 +829,12 @@ def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged):
     assert {path.name for path in output.iterdir()} == names
     content = json.loads((output / "summary.json").read_text())
     assert content["models"]["zero"]["weights_sha256"]
-    assert len(content["notes"]) == 3
-    (told,) = (note for note in content["notes"] if note.startswith("zero: "))
+    assert len(content["notes"]) == 5
+    told, measures, way = (note for note in content["notes"] if note.startswith("zero: "))
+    assert measures.startswith("zero: measures of bodies at rest that lie outside of the training")
+    assert "Gate(body=None), or none (--no-gate)." in way
     assert "2 of 2 rollouts were refused in all steps by the gate (2 by body)" in told
-    assert told.endswith("'body': the body at rest is unlike those of its training.")
+    assert any("zero (all refused) |" in x for x in (output / "table.md").read_text().splitlines())
     assert content["environment"]["device"] == "cpu"
     found = content["runs"]["zero"]["measures"]
     assert abs(found["omega"]["mean"]) < 0.01  # solved again, to the data set's tolerance
@@ -826,19 +845,30 @@ def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged):
 def test_the_command_says_by_what_whole_rollouts_are_refused(tmp_path, monkeypatch):
     model = untrained(tmp_path / "zero", step=0.5 * STEP)
     counted = "- zero: 4 of 4 rollouts were refused in all steps by the gate (4 by {})"
-    step = f"- zero: the time step is {STEP:g} s, that of the training {0.5 * STEP:g} s for cells"
+    step = (
+        f"- zero: the time step per cell size is 2.0 times that of the training: {STEP:g} s, where "
+        f"the training has {0.5 * STEP:g} s for cells of this size"
+    )
     told = run_command(model, TINY).stdout  # its bodies are foreign, too
-    assert counted.format("body") in told
+    assert counted.format("body and time step") in told
     assert step in told
+    assert "- zero: measures of bodies at rest that lie outside of the training by more" in told
     for gate, reason in ((Gate(body=None), "time step"), (Gate(body=None, margin=0.0), None)):
         if reason is None:
             model = untrained(tmp_path / "zero")
         monkeypatch.setattr("pdcorrect.evaluation.candidates.DEFAULT_GATE", gate)
         told = run_command(model, TINY).stdout
         assert (counted.format(reason) in told) == (step in told) == (reason is not None)
+        inputs = (
+            "- zero: of the 80 steps of all rollouts 80 were refused by the gate (80 by features)"
+        )
+        assert (inputs in told) == (reason is None)
+        assert "measures of bodies" not in told
+        assert told.count("zero (all refused)") == 2  # in both tables
         assert "100.00" in told  # refused, per cent, by whatever
     told = run_command(model, TINY, "--no-gate").stdout
-    assert "refused in all steps" not in told
+    assert "refused" not in told.split("| plain")[1]
+    assert "all refused" not in told
 
 
 def test_bad_input_is_told_in_a_sentence(tmp_path, capsys, monkeypatch):

@@ -19,7 +19,7 @@ from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.io.trajectory import TrajectoryWriter
-from pdcorrect.run_text import refused_corrections
+from pdcorrect.refusal_text import refused_corrections
 from pdcorrect.solvers.resume import continue_from
 
 ROOT = Path(__file__).parent.parent
@@ -354,7 +354,7 @@ def test_a_pause_that_is_no_number_of_steps_is_refused(value):
 def test_pauses_are_counted_and_told():
     reasons = np.array([0.0, 2.0, 7.0, 7.0, 0.0])
     assert refusals(reasons)["pause"] == 2
-    counts, meaning = refused_corrections({"gate": reasons})
+    counts, meaning, _ = refused_corrections(reasons)
     assert counts == "3 of 5 corrections were refused by the gate (1 by features, 2 by pause)."
     assert "'pause': it would have passed, too soon after one that did not" in meaning
 

@@ -11,6 +11,7 @@ import pytest
 import pdcorrect as pc
 from conftest import beam
 from pdcorrect import cli
+from pdcorrect.refusal_text import SECTIONS
 
 weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
 
@@ -203,15 +204,19 @@ def test_a_run_whose_corrections_are_refused_says_so_and_why(
     path = tmp_path / "run.h5"
     status, out, _ = program("simulate", scene_file, "-o", path, "--model", MODEL)
     assert status == 0
-    assert "2 of 2 corrections were refused by the gate (2 by body)" in out
-    assert "'body': the body at rest is unlike those of its training" in out
-    assert "by more than the bound 0.3 (dimensionless): nodes " in out
-    named = out.split("(dimensionless): ")[1].split(".\n")[0].split(", ")
-    sizes = [float(one.split()[-1]) for one in named]
-    assert sizes == sorted(sizes, reverse=True)
-    assert min(sizes) >= 0.3
+    assert "2 of 2 corrections were refused by the gate (2 by body and time step)." in out
+    beyond = pc.hybrid_of(pc.Scene.load(scene_file), MODEL).body_excess()
+    named = out.split("a factor of 1.35): ")[1].split(".\n")[0].split("), ")
+    far = sorted((x, name) for name, x in beyond.items() if x > 0.3)[::-1]
+    assert len(named) == len(far)
+    assert all(told.startswith(name) for told, (_, name) in zip(named, far, strict=True))
+    assert "nodes 45 (in training 225 to 513)" in out
     assert "at most" not in out
-    assert "The time step is 0.01 s, that of the training 0.004 s for cells of this size" in out
+    assert "The time step per cell size is 2.5 times that of the training: 0.01 s, where" in out
+    assert "where the training has 0.004 s for cells of this size" in out
+    (way,) = [line for line in out.splitlines() if line.startswith("Expected a body like")]
+    assert all(f"#{SECTIONS[name]})" in way for name in ("body", "time step"))
+    assert way.endswith("Gate(body=None, time_step=None), or none (--no-gate).")
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)
     best = pc.discretise(pc.best_coarse(pc.Scene.load(scene_file)))
@@ -228,13 +233,15 @@ def test_of_a_foreign_body_it_is_also_told_whether_the_time_step_is_foreign(
         command = ("simulate", tmp_path / "s.toml", "--model", MODEL, "--overwrite", "-o")
         status, out, _ = program(*command, tmp_path / "run.h5")
         assert status == 0
-        assert "2 of 2 corrections were refused by the gate (2 by body)" in out
-        assert "by more than the bound 0.3 (dimensionless): nodes " in out
-        assert ("The time step is 0.02 s, that of the training 0.004 s" in out) == (step == 0.02)
-        assert ("The time step is" in out) == (step == 0.02)
+        both = step == 0.02
+        counted = "(2 by body and time step)" if both else "(2 by body)"
+        assert f"2 of 2 corrections were refused by the gate {counted}." in out
+        assert out.count("nodes 45 (in training 225 to 513)") == 1
+        assert ("The time step per cell size is 5.0 times that of the training" in out) == both
+        assert (SECTIONS["time step"] in out) == ("time_step=None" in out) == both
         status, out, _ = program(*command, tmp_path / "open.h5", "--no-gate")
         assert status == 0
-        assert "The time step is" not in out
+        assert "The time step" not in out
 
 
 @pytest.mark.parametrize("step", [0.02, 0.005])
@@ -247,10 +254,14 @@ def test_a_run_of_another_time_step_is_the_base_s_and_says_of_which_the_training
     status, out, _ = program("simulate", tmp_path / "s.toml", "-o", path, "--model", MODEL)
     assert status == 0
     assert "2 of 2 corrections were refused by the gate (2 by time step)" in out
-    assert "'time step': the time step over the cell size is unlike that of its training" in out
-    assert f"The time step is {step:g} s, that of the training 0.01 s for cells of this" in out
-    assert "the gate's bound 0.1 of its logarithm, a factor of 1.1. Expected a time step as" in out
-    assert "Outside the range of the training bodies" not in out
+    factor = {0.02: "2.0", 0.005: "0.5"}[step]
+    told = f"The time step per cell size is {factor} times that of the training: {step:g} s, where"
+    assert told in out
+    assert (
+        "the training has 0.01 s for cells of this size; the gate's bound is a factor of 1.1" in out
+    )
+    assert "Expected a time step of 0.01 s (docs/results.md#other-time-steps); or, at" in out
+    assert "Measures of" not in out
     assert "This is no corrected run" in out
     run = pc.load_trajectory(path)
     assert run.attributes["trained_step"] == "0.01 s"
@@ -272,3 +283,28 @@ def test_of_a_model_of_several_time_steps_the_least_and_the_largest_are_told(lea
     hybrid = pc.hybrid_of(scene, tmp_path / "several")
     assert hybrid.trained_step == hybrid.describe()["trained_step"] == "0.005 to 0.02 s"
     assert hybrid.time_step_excess() == 0.0
+
+
+def test_inputs_of_the_first_step_that_they_refuse_are_named_also_when_continued(
+    program, learned, tmp_path
+):
+    kick = {"kind": "gravity", "acceleration": [0.0, 0.0, -2e3]}
+    late = {**kick, "table": [[0.0, 0.0], [0.01, 0.0], [0.011, 1.0]]}
+    scene = pc.Scene.load(SCENE)
+    loads = [*(load.model_dump() for load in scene.loads), late]
+    (tmp_path / "s.toml").write_text(scene.with_changes(loads=loads).to_toml(), encoding="utf-8")
+    command = ("simulate", tmp_path / "s.toml", "--model", MODEL, "-o", tmp_path / "run.h5")
+    status, out, _ = program(*command, "--frames", 1)
+    assert status == 0
+    assert "Inputs" not in out
+    status, out, _ = program(*command, "--frames", 3, "--resume")
+    assert status == 0
+    assert "2 of 3 corrections were refused by the gate (2 by features)." in out
+    assert " in frame 2, in deviations of which the gate allows" in out
+    assert "corrections: at most" in out
+    hybrid = pc.hybrid_of(pc.Scene.load(tmp_path / "s.toml"), MODEL)
+    run = pc.load_trajectory(tmp_path / "run.h5")
+    state = pc.State(run.positions[1], run.velocities[1], 0.01)
+    for one in hybrid.unknown_inputs(state):
+        assert f" {one.name} by " in out
+    assert hybrid.unknown_inputs(hybrid.problem.rest_state()) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
 from pdcorrect.state import Status, Stepper, StepResult, Trajectory
+
+if TYPE_CHECKING:
+    from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused
 
 __all__ = [
     "CASES", "Case", "Comparison", "Row", "case_stepper", "cases_for", "cases_with", "compare",
@@ -91,6 +95,8 @@ class Comparison:
         Of cases that did not come to their end, by label: why.
     without_best : str or None
         Why none of the cases is the best coarse model; None if one is, or could be.
+    refused : dict of str to Refused
+        Of correctors, by label: what of the scene their gates refused.
     """
 
     scene: Scene
@@ -103,6 +109,7 @@ class Comparison:
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
     without_best: str | None = None
+    refused: Mapping[str, Refused] = field(default_factory=dict)
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance from the reference in each frame, by label, m."""
@@ -177,12 +184,16 @@ def compare(
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
     coarse = discretise(scene)
     runs, on_coarse, setup, failures = {}, {}, {}, {}
+    watches: dict[str, RefusalWatch] = {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
         started = time.perf_counter()
         try:
             stepper = case_stepper(scene, case)
             setup[case.label] = time.perf_counter() - started
-            run = rollout(stepper, frames, on_step=_progress(on_step, case.label))
+            if case.model is not None:
+                watches[case.label] = _watch(stepper)
+            seen = _seen(on_step, case.label, watches.get(case.label))
+            run = rollout(stepper, frames, on_step=seen)
         except ConvergenceError as error:
             if case is cases[0]:
                 raise
@@ -217,6 +228,7 @@ def compare(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
         _models(cases, runs), failures,
         None if any(case.base == "best" for case in cases) else without_best(scene),
+        {label: watch.refused for label, watch in watches.items()},
     )  # fmt: skip
 
 
@@ -238,17 +250,30 @@ def _models(cases: Sequence[Case], runs: Mapping[str, Trajectory]) -> dict[str, 
     return found
 
 
-def _progress(on_step: OnStep | None, label: str) -> Callable[[StepResult, float], None] | None:
-    if on_step is None:
-        return None
+def _watch(stepper: Stepper) -> RefusalWatch:
+    """Of a hybrid that begins at rest."""
+    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.corrector.refusal_watch import RefusalWatch
+
+    assert isinstance(stepper, HybridStepper)
+    return RefusalWatch(stepper, stepper.problem.rest_state())
+
+
+def _seen(
+    on_step: OnStep | None, label: str, watch: RefusalWatch | None
+) -> Callable[[StepResult, float], None]:
+    """Shows each step to those who look on."""
     frame = 0
 
-    def report(result: StepResult, seconds: float) -> None:
+    def show(result: StepResult, seconds: float) -> None:
         nonlocal frame
         frame += 1
-        on_step(label, frame, result)
+        if watch is not None:
+            watch.add(result)
+        if on_step is not None:
+            on_step(label, frame, result)
 
-    return report
+    return show
 
 
 def _solver_error(cases: tuple[Case, ...], runs: dict[str, Trajectory]) -> float | None:

@@ -83,6 +83,8 @@ def evaluate(
 
 def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) -> list[str]:
     """What a reader of the numbers has to know."""
+    from pdcorrect.refusal_text import by_name
+
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
         count = len(found.missing) + len(found.shards) + len(found.damaged)
@@ -92,7 +94,7 @@ def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) ->
         )
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
-        notes += _refused(one, found, gate)
+    notes += by_name({one.candidate.name: _refused(one, found, gate) for one in saved})
     for name, run in found.runs.items():
         notes += [
             f"{name}: {count} of {len(run.trajectories)} trajectories have no {measure}; its mean "
@@ -111,19 +113,19 @@ def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) ->
 
 
 def _refused(one: SavedCandidate, found: Evaluation, gate: Gate | None) -> list[str]:
-    """Of a model, how many rollouts its gate refused in all steps, and why."""
+    """Of a model, what its gate refused, and why."""
     import torch
 
-    from pdcorrect.run_text import refused_rollouts, refused_step
+    from pdcorrect.corrector.foreign import foreign_measures, foreign_step
+    from pdcorrect.corrector.refusal_watch import Refused
+    from pdcorrect.refusal_text import refused_rollouts
 
-    name, normaliser = one.candidate.name, one.model.corrector.normaliser
-    ratio = torch.tensor([found.time_step / found.cell_size], dtype=torch.float64)
-    excess = float(normaliser.time_step_excess(ratio.log()))
-    told = (
-        refused_rollouts(found.runs[name].refused_by()),
-        refused_step(gate, found.time_step, excess, normaliser.trained_step(found.cell_size)),
+    run, normaliser = found.runs[one.candidate.name], one.model.corrector.normaliser
+    refused = Refused(
+        foreign_measures(gate, normaliser, torch.from_numpy(run.shapes())),
+        foreign_step(gate, normaliser, found.time_step, found.cell_size),
     )
-    return [f"{name}: {text[0].lower()}{text[1:]}" for text in told if text]
+    return refused_rollouts([(t.refused_by, t.reasons) for t in run.trajectories], refused)
 
 
 def _print(found: Evaluation, notes: list[str], seed: int) -> None:

@@ -6,12 +6,8 @@ import numpy as np
 
 from pdcorrect.evaluate import Comparison, Row
 from pdcorrect.metrics import energy_balance, largest_displacement
-from pdcorrect.run_text import (
-    foreign_integrator,
-    inverted_frames,
-    refused_corrections,
-    refused_step,
-)
+from pdcorrect.refusal_text import by_name, refused_corrections
+from pdcorrect.run_text import foreign_integrator, inverted_frames
 from pdcorrect.scene import Scene
 from pdcorrect.state import Trajectory
 
@@ -240,32 +236,21 @@ def _of_the_models(comparison: Comparison) -> list[str]:
             for label, about in comparison.models.items()
         ),
     )
+    told: dict[str, list[str]] = {}
     for row in comparison.rows:
         if not row.refused_frames:
             continue
-        stats, about = comparison.runs[row.label].stats, comparison.models[row.label]
-        counted, meaning = refused_corrections(stats)
+        run, refused = comparison.runs[row.label], comparison.refused.get(row.label)
+        counted, *told[row.label] = refused_corrections(run.stats["gate"], refused)
         found.append(f"{row.label}: {counted}")
-        if row.refused_frames == len(comparison.runs[row.label]):
-            base = about["base"]
+        if row.refused_frames == len(run):
+            base = comparison.models[row.label]["base"]
             found.append(
                 f"{row.label} is no corrected run: with all corrections refused its steps are "
                 f"those of the coarse model that it would correct ({base!r}), to the last bit, "
                 "and take longer."
             )
-        step = _refused_step(comparison, row)
-        found += [f"{row.label}: {one[0].lower()}{one[1:]}" for one in (meaning, step) if one]
-    return found
-
-
-def _refused_step(comparison: Comparison, row: Row) -> str | None:
-    """How the time step differs from that of a model's training, if its gate refuses it."""
-    from pdcorrect.corrector.gate import Gate
-
-    about = comparison.runs[row.label].attributes
-    gate = None if about["gate"] == "none" else Gate.model_validate_json(about["gate"])
-    step, excess = comparison.scene.time.step, float(about["time_step_excess"])
-    return refused_step(gate, step, excess, about["trained_step"])
+    return found + by_name(told)
 
 
 def _of_the_cells(comparison: Comparison) -> list[str]:

@@ -13,10 +13,10 @@ from pdcorrect.errors import InputError
 from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated
 
 if TYPE_CHECKING:
-    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.rollout import StepLog
-    from pdcorrect.state import Stepper, Trajectory
+    from pdcorrect.state import State, Stepper, Trajectory
 
 
 class SolverName(StrEnum):
@@ -69,10 +69,11 @@ def simulate(
     say(_told_of_model(stepper))
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
-    log = _run(stepper, count, output, earlier, overwrite)
+    log, refused = _run(stepper, count, output, earlier, overwrite)
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
+        _corrections(log.arrays(), refused)
         say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
@@ -142,8 +143,11 @@ def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | N
 
 def _run(
     stepper: Stepper, count: int, output: Path, earlier: Trajectory | None, overwrite: bool
-) -> StepLog:
-    """Step to frame ``count`` and write each frame; an interruption ends the program."""
+) -> tuple[StepLog, Refused | None]:
+    """Step to frame ``count`` and write each frame; an interruption ends the program.
+
+    Second: what a gate refused; None of plain steppers.
+    """
     from pdcorrect.io.trajectory import TrajectoryWriter
     from pdcorrect.progress import progress_bar
     from pdcorrect.solvers.resume import continue_from
@@ -159,12 +163,15 @@ def _run(
     else:
         state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
         writer = TrajectoryWriter.resume(output, earlier)
+    watch = _watch(stepper, state, done)
     with writer, progress_bar(hidden=done >= count) as progress:
         task = progress.add_task(problem.scene.name, total=count, completed=done)
         try:
             for result, elapsed in march(stepper, max(0, count - done), state=state):
                 writer.append(result, elapsed)
                 log.add(result, elapsed)
+                if watch is not None:
+                    watch.add(result)
                 progress.advance(task)
         except (KeyboardInterrupt, Terminated) as stop:
             typer.echo(
@@ -173,7 +180,18 @@ def _run(
             )
             ended = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
             raise typer.Exit(ended) from None
-    return log
+    return log, None if watch is None else watch.refused
+
+
+def _watch(stepper: Stepper, state: State, frame: int) -> RefusalWatch | None:
+    """Of a hybrid, which knows whence its corrector comes."""
+    if not hasattr(stepper, "origin"):
+        return None
+    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.corrector.refusal_watch import RefusalWatch
+
+    assert isinstance(stepper, HybridStepper)
+    return RefusalWatch(stepper, state, frame)
 
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
@@ -204,8 +222,6 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
     )
     say(inverted_frames(stats, problem.time_step) or "")
-    if "refused" in stats:
-        _corrections(stats, stepper)
 
 
 def _described(stepper: Stepper) -> dict[str, str]:
@@ -217,36 +233,19 @@ def _described(stepper: Stepper) -> dict[str, str]:
     return told
 
 
-def _corrections(stats: dict[str, Any], stepper: Stepper) -> None:
+def _corrections(stats: dict[str, Any], refused: Refused | None) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
-    from pdcorrect.corrector.gate import Reason
-    from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.run_text import refused_corrections, refused_step
+    from pdcorrect.refusal_text import refused_corrections
 
+    if refused is None:
+        return
     every = bool(stats["refused"].all())
     if not every:
         say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
-    for sentence in refused_corrections(stats):
+    for sentence in refused_corrections(stats["gate"], refused):
         say(sentence)
-    if isinstance(stepper, HybridStepper):
-        if (stats["gate"] == Reason.BODY).any():
-            say(_refused_measures(stepper))
-        step, excess = stepper.problem.time_step, stepper.time_step_excess()
-        say(refused_step(stepper.gate, step, excess, stepper.trained_step) or "")
     if every:
         say("This is no corrected run: its steps are those of the coarse model alone.")
-
-
-def _refused_measures(stepper: HybridStepper) -> str:
-    """By which measures a gate refuses a body, the farthest out first."""
-    bound = stepper.gate.body if stepper.gate else None
-    beyond = {name: x for name, x in stepper.body_excess().items() if bound and x > bound}
-    far = sorted(beyond.items(), key=lambda item: -item[1])
-    measures = ", ".join(f"{name} {excess:.1f}" for name, excess in far)
-    return (
-        f"Outside the range of the training bodies by more than the bound {bound} "
-        f"(dimensionless): {measures}."
-    )
 
 
 def _other_work(stats: dict[str, Any]) -> str:

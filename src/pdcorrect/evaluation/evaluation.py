@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage
 from pdcorrect.data.missing import accepted_gaps
@@ -84,6 +85,17 @@ class EvaluatedRun:
     def refused_by(self) -> list[int]:
         """Of each trajectory, the `Measured.refused_by`."""
         return [t.refused_by for t in self.trajectories]
+
+    @property
+    def all_refused(self) -> bool:
+        """Whether a gate refused all corrections of all trajectories."""
+        every = [reason > 0 for t in self.trajectories for reason in t.reasons.tolist()]
+        return bool(every) and all(every)
+
+    def shapes(self) -> Array:
+        """Measures (B, 10) of the bodies at rest that a gate refused, each `Measured.shape`."""
+        found = [t.shape for t in self.trajectories if len(t.shape)]
+        return np.stack(found) if found else np.zeros((0, len(SHAPE_MEASURES)))
 
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""

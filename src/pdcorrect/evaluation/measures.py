@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import CONVERGED, PLAIN
@@ -126,14 +128,27 @@ class Measured:
     measures : TrajectoryMeasures
     errors : (T+1,)
         RMS distance from the reference over time, m.
-    refused_by : int
-        Number of the `Reason` by which a gate refused the whole of it: the body at rest or the time
-        step; 0 if it did not.
+    reasons : (T,) int64
+        Why a gate left its steps uncorrected, numbers of `Reason`; those until it failed.
+    shape : (10,)
+        Measures of its body at rest, see `pdcorrect.corrector.shapes.shape_measures`, if a gate
+        refused it by them; else (0,).
     """
 
     measures: TrajectoryMeasures
     errors: Array = field(default_factory=lambda: np.zeros(0))
-    refused_by: int = 0
+    reasons: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    shape: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def refused_by(self) -> int:
+        """Number of the `Reason` by which a gate refused the whole of it; 0 if it did not.
+
+        That is the body at rest or the time step.  What is refused by one of these is so in all
+        steps, so the first one tells.
+        """
+        first = int(self.reasons[0]) if len(self.reasons) else 0
+        return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
 
 
 def measure(case: Case, outcome: Outcome) -> Measured:
@@ -162,16 +177,14 @@ def measure(case: Case, outcome: Outcome) -> Measured:
             "a run whose errors can be measured."
         )
     measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
-    return Measured(measures, errors, _refused_by(outcome.reasons))
-
-
-def _refused_by(reasons: NDArray[np.int64] | None) -> int:
-    """The reason of a whole rollout; scenes that are refused by one of these are so in all steps.
-
-    Only a failure ends that, so the first step tells.
-    """
-    first = 0 if reasons is None or not len(reasons) else int(reasons[0])
-    return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
+    if outcome.reasons is None:
+        return Measured(measures, errors)
+    steps = None if outcome.failed is None else outcome.failed - 1
+    found_by = Measured(measures, errors, outcome.reasons[:steps])
+    if found_by.refused_by != Reason.BODY:
+        return found_by
+    body = BodyGraph.of([case.problems[outcome.base or PLAIN]], dtype=torch.float64)
+    return replace(found_by, shape=body.shapes[0].numpy())
 
 
 def omega(positions: Array, coarse: Array | None, reference: Array) -> float | None:

@@ -131,13 +131,13 @@ def headline(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
         "one step", "refused", "failed",
     ]  # fmt: skip
     rows = []
-    for name, run in _shown(evaluation):
+    for run in _shown(evaluation):
         found = summaries(run, seed)
         omega = found.get("omega")
         shares = (omega.median, omega.q05, omega.smallest) if omega else (None, None, None)
         means = ("omega_base", "rms_reduction", "step_omega", "gate_rate")
         rows.append([
-            name, _number(omega.mean if omega else None), _interval(omega),
+            _marked(run), _number(omega.mean if omega else None), _interval(omega),
             *map(_number, shares), *(_mean(found, measure) for measure in means),
             f"{len(run.failures())}/{len(run.trajectories)}",
         ])  # fmt: skip
@@ -161,10 +161,9 @@ def details(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
         for heading, column in columns.items()
         if any(column[0] in each for name, each in found.items() if name != REFERENCE)
     }
-    names = [name for name, _ in _shown(evaluation)]
     rows = [
-        [name, *(_mean(found[name], measure, factor) for measure, factor in used.values())]
-        for name in [*names, REFERENCE]
+        [_marked(run), *(_mean(found[run.name], *column) for column in used.values())]
+        for run in [*_shown(evaluation), evaluation.runs[REFERENCE]]
     ]
     return ["run", *used], rows
 
@@ -253,8 +252,13 @@ def _run(run: EvaluatedRun, seed: int) -> dict[str, Any]:
     }
 
 
-def _shown(evaluation: Evaluation) -> list[tuple[str, EvaluatedRun]]:
-    return [(name, run) for name, run in evaluation.runs.items() if name != REFERENCE]
+def _shown(evaluation: Evaluation) -> list[EvaluatedRun]:
+    return [run for name, run in evaluation.runs.items() if name != REFERENCE]
+
+
+def _marked(run: EvaluatedRun) -> str:
+    """Its name, and whether it is no corrected run."""
+    return f"{run.name} (all refused)" if run.all_refused else run.name
 
 
 def _csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
