@@ -946,13 +946,14 @@ def test_bodies_that_have_no_graph_are_refused():
         ({"node_features": ["colour"]}, "feature 'colour': expected one of young"),
         ({"edge_features": ["strain"]}, "feature 'strain': expected one of rest-position"),
         ({"node_features": ["load", "load"]}, "load, load: expected each one once"),
-        ({"layers": 0}, "layers"),
+        ({"layers": 0}, "layers = 0: expected at least 1.$"),
         ({"width": 0}, "width"),
         ({"mlp_layers": 1}, "mlp_layers"),
         ({"clip": 0.0}, "clip"),
         ({"norm": "some"}, "norm"),
         ({"placement": "after"}, "placement"),
-        ({"depth": 3}, "depth"),
+        ({"depth": 3}, "preset 'compact': depth: unknown key; remove"),
+        ({"widths": 3}, r"preset 'compact': widths: unknown key; did you mean width\?$"),
     ],
 )
 def test_wrong_settings_are_refused_by_name(changes, words):

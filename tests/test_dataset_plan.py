@@ -171,7 +171,12 @@ def test_extra_splits_leave_the_training_distribution_as_told():
     [
         ({"frames": 0}, "frames = 0: expected at least 1"),
         ({"frames": 1.5}, "frames = 1.5: expected an integer"),
-        ({"surprise": 1}, "surprise: unknown key"),
+        ({"surprise": 1}, "surprise: unknown key; remove it or check its spelling."),
+        ({"sed": 1}, "sed: unknown key; did you mean seed?"),
+        ({"refine": 2}, "refine: unknown key; it belongs to [reference] or to [[extra]]."),
+        ({"training": {"meshes": 1, "simulations": 2, "seed": 1}},
+         "training.seed: unknown key; it belongs to the top, above all tables."),
+        ({"name": "a" * 81}, "aa...: expected at most 80 characters."),
         ({"training": {"meshes": 3, "simulations": 2}}, "at least one simulation a mesh"),
         ({"training": 3}, "training = 3: expected a table"),
         ({"material": {"young": [2.0, 1.0], "poisson": [0.3, 0.3], "density": [1.0, 1.0]}},

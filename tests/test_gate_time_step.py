@@ -120,7 +120,7 @@ def test_a_bound_that_is_no_number_from_0_on_is_refused(value):
 
 
 def test_a_test_that_gates_do_not_have_is_refused():
-    with pytest.raises(InputError, match="gate: step: unknown key"):
+    with pytest.raises(InputError, match=r"gate: step: unknown key; did you mean time_step\?"):
         Gate(step=0.1)
 
 

@@ -1,8 +1,10 @@
-"""TOML text to plain values; whatever is wrong with it becomes one sentence."""
+"""TOML text to plain values; whatever is wrong with it becomes one sentence.  A value as TOML."""
 
 from __future__ import annotations
 
+import json
 import tomllib
+from pathlib import PurePath
 from typing import Any
 
 _DEEPEST = 100
@@ -31,6 +33,19 @@ def parse_toml(text: str) -> dict[str, Any]:
     if level:
         raise ValueError(_nested())
     return data
+
+
+def as_toml(value: object) -> str:
+    """A value as it would stand in a TOML file, on one line, for messages."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (str, PurePath)):
+        return json.dumps(str(value), ensure_ascii=False)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {as_toml(own)}' for key, own in value.items())} }}"
+    return str(value)
 
 
 def _parts(value: Any) -> list[Any]:

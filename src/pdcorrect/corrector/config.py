@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, field_validator
 
 from pdcorrect.corrector import features
 from pdcorrect.errors import InputError
+from pdcorrect.explanations import explained
 from pdcorrect.scene.regions import Positive, PositiveCount, Strict
 
 Placement = Literal["state", "force", "guess"]
@@ -51,14 +53,23 @@ class CorrectorConfig(Strict):
     momentum_neutral: bool = False
     placement: Placement = "state"
 
-    @model_validator(mode="after")
-    def _known(self) -> CorrectorConfig:
-        try:
-            features.width(features.NODE_FEATURES, self.node_features)
-            features.width(features.EDGE_FEATURES, self.edge_features)
-        except InputError as error:
-            raise ValueError(str(error)) from None
-        return self
+    @field_validator("node_features")
+    @classmethod
+    def _known_nodes(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return _known(features.NODE_FEATURES, names)
+
+    @field_validator("edge_features")
+    @classmethod
+    def _known_edges(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        return _known(features.EDGE_FEATURES, names)
+
+
+def _known(there: dict[str, features.Feature], names: tuple[str, ...]) -> tuple[str, ...]:
+    try:
+        features.width(there, names)
+    except InputError as error:
+        raise ValueError(str(error)) from None
+    return names
 
 
 _FRAME_NODES = (
@@ -93,6 +104,11 @@ def preset(name: str, **changes: object) -> CorrectorConfig:
     if name not in PRESETS:
         raise InputError(f"preset {name!r}: expected one of {', '.join(PRESETS)}.")
     try:
-        return CorrectorConfig(**{**PRESETS[name].model_dump(), **changes})
-    except ValueError as error:
-        raise InputError(f"preset {name!r}: {error}") from None
+        return changed(name, changes)
+    except ValidationError as error:
+        raise InputError(f"preset {name!r}: {explained(error, CorrectorConfig)}") from None
+
+
+def changed(name: str, changes: Mapping[str, object]) -> CorrectorConfig:
+    """A preset that there is, some of its values changed; wrong ones are a ValidationError."""
+    return CorrectorConfig(**{**PRESETS[name].model_dump(), **changes})

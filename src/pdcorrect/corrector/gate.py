@@ -19,8 +19,8 @@ from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.values import Values, where
 from pdcorrect.errors import InputError
+from pdcorrect.explanations import explained
 from pdcorrect.scene.regions import NonNegative, Number, Strict
-from pdcorrect.toml_config import explained
 
 
 class Reason(IntEnum):
@@ -160,7 +160,7 @@ class Gate(Strict):
         try:
             super().__init__(**values)
         except ValidationError as error:
-            raise InputError(f"gate: {explained(error)}") from None
+            raise InputError(f"gate: {explained(error, Gate)}") from None
 
     def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Why scenes are refused in all steps, by their bodies at rest or time steps.

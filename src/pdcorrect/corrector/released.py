@@ -10,7 +10,7 @@ from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import BASES, coarse_model
 from pdcorrect.fem.problem import Problem
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene, best_coarse, check_scene
 from pdcorrect.solvers.projective import ProjectiveDynamics
 
 
@@ -42,6 +42,7 @@ def hybrid_of(
         one than ``problem``, it does not fit the scene, the scene is quasi-static and the model's
         training was not, or ``gate`` is something else.
     """
+    check_scene(scene)
     loaded = model if isinstance(model, LoadedModel) else load_model(model)
     name = "the model" if isinstance(model, LoadedModel) else model_folder(model).name
     if loaded.base not in BASES:

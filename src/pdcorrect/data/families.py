@@ -17,7 +17,7 @@ import numpy as np
 
 from pdcorrect.data.config import FamilyName
 from pdcorrect.errors import InputError
-from pdcorrect.toml_config import as_toml
+from pdcorrect.toml_text import as_toml
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Shape = dict[str, Any]

@@ -33,7 +33,7 @@ from pdcorrect.fem.hexahedron import (
 )
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.problem import Problem, discretise
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene, best_coarse, check_scene
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import rollout
 from pdcorrect.state import State, Status
@@ -239,6 +239,7 @@ def _frames(name: str, positions: ArrayLike) -> int:
 
 def _in_step(scene: Scene, time_step: float) -> tuple[Scene, float]:
     """A scene and a time step (s) that agree: where they nearly do, by the scene's."""
+    check_scene(scene)
     if math.isclose(time_step, scene.time.step, rel_tol=1e-6):
         return scene, scene.time.step
     return scene.with_changes(time={"step": time_step}), time_step

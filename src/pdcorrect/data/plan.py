@@ -26,7 +26,7 @@ from pdcorrect.data.config import (
 from pdcorrect.data.families import PUBLISHED, Box, Design, count_bodies, draw, extreme
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
-from pdcorrect.toml_config import as_toml
+from pdcorrect.toml_text import as_toml
 
 _DRAWS = 10_000
 """Bodies that are drawn for a mesh before giving up on one that is not there yet."""

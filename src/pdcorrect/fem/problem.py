@@ -23,7 +23,7 @@ from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
 from pdcorrect.fem.selection import Selector
 from pdcorrect.machine import total_memory
-from pdcorrect.scene import Load, MeshFile, Scene
+from pdcorrect.scene import Load, MeshFile, Scene, check_scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -230,8 +230,7 @@ def discretise(
     SceneError, MeshError
         Naming the key or the cell.
     """
-    if not isinstance(scene, Scene):
-        raise InputError(f"scene is a {type(scene).__name__}: expected Scene.load(path).")
+    check_scene(scene)
     if isinstance(refine, bool) or not isinstance(refine, (int, np.integer)) or refine < 1:
         raise InputError(f"refine = {refine!r}: expected a whole number of at least 1.")
     changes = {k: v for k, v in {"mass": mass, "element": element}.items() if v is not None}

@@ -12,7 +12,7 @@ from pdcorrect.scene.clamps import Clamp, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region
-from pdcorrect.scene.scene import Damping, Scene, Solver, Time, best_coarse
+from pdcorrect.scene.scene import Damping, Scene, Solver, Time, best_coarse, check_scene
 
 __all__ = [
     "Beam",
@@ -39,4 +39,5 @@ __all__ = [
     "Voxels",
     "Weight",
     "best_coarse",
+    "check_scene",
 ]

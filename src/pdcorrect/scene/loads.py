@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Union
 from pydantic import Field, model_validator
 
 from pdcorrect.scene.regions import NonNegative, Number, Region, Strict, Vector
+from pdcorrect.toml_text import as_toml
 
 
 class _Load(Strict):
@@ -27,9 +28,11 @@ class _Load(Strict):
     @model_validator(mode="after")
     def _amplitude(self) -> _Load:
         if self.window is not None and self.window[0] >= self.window[1]:
-            raise ValueError(f"expected window = [start, end] with start < end, got {self.window}")
+            told = as_toml(self.window)
+            raise ValueError(f"expected window = [start, end] with start < end, got {told}")
         if self.window is not None and self.window[1] <= 0:
-            raise ValueError(f"expected a window that ends after time 0, got {self.window}")
+            told = as_toml(self.window)
+            raise ValueError(f"expected a window that ends after time 0, got {told}")
         if self.table is not None:
             if self.window is not None or self.ramp:
                 raise ValueError("expected either table, or window and ramp, not both")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdcorrect.errors import SceneError
+from pdcorrect.toml_text import as_toml
 
 Axis = Literal["x", "y", "z"]
 Number = Annotated[float, Field(strict=True, ge=-1e30, le=1e30)]
@@ -59,7 +60,7 @@ class Region(Strict):
         if len(kinds) != 1:
             raise ValueError(
                 "expected exactly one of plane (with at), box, sphere (with radius), nodes, "
-                f"everywhere; got {kinds or 'none'}"
+                f"everywhere, got {', '.join(kinds) or 'none'}"
             )
         if (self.plane is None) != (self.at is None):
             raise ValueError('expected plane and at together, such as { plane = "x", at = 0.0 }')
@@ -94,4 +95,4 @@ class Region(Strict):
 
     def describe(self) -> str:
         """The region as it would stand in the file, for messages."""
-        return str({k: v for k, v in self.model_dump().items() if v is not None})
+        return as_toml({k: v for k, v in self.model_dump().items() if v is not None})

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from difflib import get_close_matches
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
 from pydantic import Field, ValidationError, field_validator
-from pydantic_core import ErrorDetails
 
-from pdcorrect.errors import SceneError
+from pdcorrect.errors import InputError, SceneError
+from pdcorrect.explanations import Location, explained
 from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
 from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
-from pdcorrect.toml_text import parse_toml
+from pdcorrect.toml_files import SCENE, read_tables, read_text
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
@@ -111,7 +110,7 @@ class Scene(Strict):
         try:
             super().__init__(**{key: _plain(value) for key, value in data.items()})
         except ValidationError as error:
-            raise SceneError(f"scene: {_explain(error)}") from None
+            raise SceneError(f"scene: {explained(error, Scene, _key)}") from None
 
     @field_validator("name")
     @classmethod
@@ -127,14 +126,10 @@ class Scene(Strict):
         Raises
         ------
         SceneError
-            If the file cannot be read, is not TOML, or is not a valid scene.
+            If the file cannot be read, is not TOML, looks like something else, or is not a valid
+            scene.
         """
-        path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not a UTF-8 text file"
-            raise SceneError(f"{path}: cannot be read ({reason}).") from None
+        text, path = read_text(path, SCENE, SceneError), Path(path)
         scene = cls.from_toml(text, source=str(path))
         if isinstance(scene.body, MeshFile):  # relative to the scene file, from now on absolute
             found = (path.parent / scene.body.path).resolve()
@@ -144,10 +139,7 @@ class Scene(Strict):
     @classmethod
     def from_toml(cls, text: str, source: str = "scene") -> Scene:
         """Read a scene from TOML text; ``source`` names it in messages."""
-        try:
-            data = parse_toml(text)
-        except ValueError as error:
-            raise SceneError(f"{source}: not valid TOML: {error}.") from None
+        data = read_tables(text, SCENE, source, SceneError)
         try:
             return cls(**data)
         except SceneError as error:
@@ -172,6 +164,25 @@ class Scene(Strict):
             else:
                 data[section] = change
         return Scene(**data)
+
+
+def check_scene(scene: object) -> None:
+    """Refuse what is no scene, with the call that makes one of it.
+
+    Raises
+    ------
+    InputError
+    """
+    if isinstance(scene, Scene):
+        return
+    call = "Scene.load(path)"
+    if isinstance(scene, dict):
+        call = "Scene(**scene)"
+    elif isinstance(scene, str) and ("\n" in scene or "=" in scene):
+        call = "Scene.from_toml(scene)"
+    elif isinstance(scene, (str, PurePath)):
+        call = f"Scene.load({str(scene)!r})"
+    raise InputError(f"scene is a {type(scene).__name__}: expected a Scene, as of {call}.")
 
 
 def best_coarse(scene: Scene) -> Scene:
@@ -204,6 +215,7 @@ def best_coarse(scene: Scene) -> Scene:
     >>> best_coarse(scene).solver.element
     'hex8-bubble-mean'
     """
+    check_scene(scene)
     element = "hex8-bubble" if _one_cell_thick(scene.body) else "hex8-bubble-mean"
     return scene.with_changes(solver={"element": element, "mass": "averaged"})
 
@@ -230,46 +242,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _explain(error: ValidationError) -> str:
-    """One paragraph: each wrong key, its value, and what was expected."""
-    sentences: list[str] = []
-    for item in error.errors():
-        key = _key(item["loc"])
-        if item["type"] == "extra_forbidden":
-            sentences.append(f"{key}: unknown key; {_advice(str(item['loc'][-1]))}")
-        elif item["type"] == "missing":
-            sentences.append(f"{key}: missing; a value is required.")
-        elif item["type"] == "union_tag_not_found":
-            sentences.append(f"{key}.{_tag_name(item)}: missing; a value is required.")
-        elif item["type"] == "union_tag_invalid":
-            context = item["ctx"]
-            sentences.append(
-                f"{key}.{_tag_name(item)} = {context['tag']!r}: expected one of "
-                f"{context['expected_tags']}."
-            )
-        else:
-            message = item["msg"].removeprefix("Value error, ").replace("tuple", "list")
-            value = repr(item["input"])
-            value = value if len(value) < 80 else value[:77] + "..."
-            sentences.append(f"{key} = {value}: {message[0].lower() + message[1:]}.")
-    return " ".join(" ".join(dict.fromkeys(sentences)).split())
-
-
-def _tag_name(item: ErrorDetails) -> str:
-    """The key that chooses among the kinds of a section: kind, shape."""
-    return str(item["ctx"]["discriminator"]).strip("'")
-
-
-def _advice(name: str) -> str:
-    """What to do about an unknown key: the known one that is spelled much like it, if any."""
-    schema = Scene.model_json_schema()
-    sections = [schema, *schema.get("$defs", {}).values()]
-    known = {key for section in sections for key in section.get("properties", ())} - {name}
-    close = get_close_matches(name, sorted(known), n=1)
-    return f"did you mean {close[0]}?" if close else "remove it or check its spelling."
-
-
-def _key(location: tuple[int | str, ...]) -> str:
+def _key(location: Location) -> str:
     """Dotted key as the user wrote it: pydantic also names the union member it chose."""
     parts = [str(part) for part in location]
     tag_at = {"body": 1, "loads": 2}.get(parts[0], len(parts)) if parts else 0

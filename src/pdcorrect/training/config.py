@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
     SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
     model_serializer,
     model_validator,
 )
+from pydantic.config import JsonDict
 
-from pdcorrect.corrector.config import CorrectorConfig, preset
+from pdcorrect.corrector.config import PRESETS, CorrectorConfig, changed
 from pdcorrect.data.config import TRAINING, VALIDATION
-from pdcorrect.errors import InputError
 from pdcorrect.fem.coarse_models import Base
 from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
 from pdcorrect.toml_config import TomlConfig
+from pdcorrect.toml_files import TRAINING as KIND
 
 _FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
@@ -50,27 +53,46 @@ def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
+def _model_name(name: str) -> str:
+    if not name.strip():
+        raise ValueError("expected the folder or name of a model; leave the key out for none")
+    return name
+
+
+ModelName = Annotated[str, AfterValidator(_model_name)]
 Files = Annotated[tuple[str, ...], AfterValidator(_file_names)]
 Horizon = Annotated[tuple[PositiveCount, ...], BeforeValidator(_several), AfterValidator(_rising)]
+
+
+_CHANGES: JsonDict = {name: {} for name in CorrectorConfig.model_fields}
+"""Keys that may be changed, where unknown ones are told of those that there are."""
 
 
 class Architecture(Strict):
     """A preset of `pdcorrect.corrector.config.PRESETS`, and the values that differ from it."""
 
     preset: str = "compact"
-    changes: dict[str, Any] = Field(default_factory=dict)
+    changes: Annotated[dict[str, Any], Field(json_schema_extra={"properties": _CHANGES})] = Field(
+        default_factory=dict
+    )
 
-    @model_validator(mode="after")
-    def _possible(self) -> Architecture:
-        try:
-            self.config()
-        except InputError as error:
-            raise ValueError(str(error)) from None
-        return self
+    @field_validator("preset")
+    @classmethod
+    def _there(cls, name: str) -> str:
+        if name not in PRESETS:
+            raise ValueError(f"expected one of {', '.join(map(repr, PRESETS))}")
+        return name
+
+    @field_validator("changes")
+    @classmethod
+    def _possible(cls, changes: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if "preset" in info.data:
+            changed(info.data["preset"], changes)
+        return changes
 
     def config(self) -> CorrectorConfig:
         """The architecture."""
-        return preset(self.preset, **self.changes)
+        return changed(self.preset, self.changes)
 
 
 class Loss(Strict):
@@ -199,7 +221,7 @@ class Stage(Strict):
     restart: Share = 0.2
     at_rest: Share = 0.0
     lost: Positive = 1.0
-    teacher: Annotated[str, Field(min_length=1)] | None = None
+    teacher: ModelName | None = None
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
     epochs: PositiveCount | None = None
@@ -310,8 +332,10 @@ class TrainingConfig(TomlConfig):
         Processes that read windows ahead.
     """
 
+    kind: ClassVar[str] = KIND
+
     corrector: Architecture = Architecture()
-    start_from: Annotated[str, Field(min_length=1)] | None = None
+    start_from: ModelName | None = None
     without: Files = ()
     base: Base = "plain"
     velocity: Literal["recomputed", "kept"] = "recomputed"

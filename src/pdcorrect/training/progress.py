@@ -7,7 +7,7 @@ from typing import Any
 
 from pdcorrect.errors import InputError
 from pdcorrect.scene.regions import Strict
-from pdcorrect.toml_config import as_toml
+from pdcorrect.toml_text import as_toml
 from pdcorrect.training.config import Every, TrainingConfig
 
 

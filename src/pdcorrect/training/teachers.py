@@ -9,7 +9,7 @@ import torch
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import LoadedModel, load_model
 from pdcorrect.errors import InputError
-from pdcorrect.toml_config import as_toml
+from pdcorrect.toml_text import as_toml
 from pdcorrect.training.config import TrainingConfig
 
 
