@@ -588,7 +588,7 @@ def test_wrong_shapes_and_options_are_refused():
     for wrong in (problem, pc.ProjectiveDynamics):
         with pytest.raises(InputError, match="expected a stepper"):
             pc.rollout(wrong)
-    with pytest.raises(InputError, match="expected Scene"):
+    with pytest.raises(InputError, match="expected a Scene"):
         pc.discretise("scene.toml")
     for bad in ({"frames": -1}, {"frames": 2.5}, {"on_failure": "pray"}):
         with pytest.raises(InputError, match="expected"):
