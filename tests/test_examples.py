@@ -157,10 +157,10 @@ def test_ones_own_body_is_recorded_learned_judged_and_drawn(own, monkeypatch, tm
         else:
             assert line[-1] in ("gmsh", "examples/bring_your_own/hook.msh")
     assert not scripts
-    for folder, name in (("before", "torsion-exact"), ("after", "model")):
+    # of so short simulations the gate refuses all, of those of the page two fifths of one
+    for folder, model in (("before", "torsion-exact"), ("after", "model")):
         table = Path(folder, "table.md").read_text()
-        for run in (name, "best"):  # a gate may have refused all that a model corrected
-            assert re.search(rf"\| {run}( \(all refused\))? \|", table), table
+        assert all(f"| {run} |" in table for run in (f"{model} (all refused)", "best")), table
     assert {path.name for path in Path("hook_vtu").iterdir()} >= {"hook_hybrid.pvd"}
     assert list(Path("hook_data_vtu").rglob("*.pvd"))
     assert Path("hook.png").stat().st_size > 10_000

@@ -313,10 +313,12 @@ def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_f
 
 MODELS = Path(__file__).parents[1] / "models"
 RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
+MEASURED = ("stretch-as-published",)
+"""Whose ranges a training widened to data sets' corners, of single precision; others are exact."""
 
 
 @pytest.mark.parametrize("name", RELEASED)
 def test_released_models_know_the_time_step_and_cell_size_of_their_data(name):
     model = pc.load_model(name)
-    # to the rounding of data sets' corners, which are of single precision
-    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=1e-6)
+    rel = 1e-6 if name in MEASURED else 1e-12
+    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=rel)
