@@ -71,12 +71,16 @@ OWN = ROOT / "examples" / "bring_your_own"
 def own(monkeypatch):
     """The scripts of examples/bring_your_own by name."""
     monkeypatch.syspath_prepend(str(OWN))
+    loaded = set()
 
     def load(name):
         monkeypatch.delitem(sys.modules, name, raising=False)
+        loaded.add(name)
         return importlib.import_module(name)
 
-    return load
+    yield load
+    for name in loaded:  # other folders have modules of these names
+        sys.modules.pop(name, None)
 
 
 def test_the_mesh_of_ones_own_body_is_what_its_script_makes(own, tmp_path):
