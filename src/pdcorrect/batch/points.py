@@ -59,17 +59,18 @@ class Points:
         return out.transpose(0, 1)
 
     def rotations(self, F: Tensor, moved: bool = False) -> Tensor:
-        """Nearest rotations (9, ...); the identity where F is not finite.
+        """Nearest rotations (9, L); the identity where F is not finite.
 
         Parameters
         ----------
-        F : (9, ...)
+        F : (9, L)
         moved : bool
             Whether F is the gradient H of a displacement.
         """
-        U, _, V = self._call(_decompose)(torch.nan_to_num(F), moved)
+        finite = torch.nan_to_num(F)
+        U, _, V = self._svd(_two_in_a_cell(finite) if self._compiled else finite, moved)
         out: Tensor = self._call(_rotate)(U, V)
-        return out
+        return out.reshape(9, -1)[:, : F.shape[1]]
 
     def volume_ratios(self, H: Tensor) -> Tensor:
         """Det F of H (9, ...)."""
@@ -78,7 +79,15 @@ class Points:
 
     def _decomposed(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """U (9, C, Q), s (3, C, Q), V (9, C, Q) of the signed SVD of F."""
-        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(H, True)
+        return self._svd(H, True)
+
+    def _svd(self, F: Tensor, moved: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """The same of F, or of H = F - I where it is ``moved``: a tensor says which.
+
+        A kernel for each would double the minutes that compiling it takes.
+        """
+        identity = F.new_full((), 1.0 if moved else 0.0)
+        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(F, identity)
         return out
 
     def _call(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -105,8 +114,18 @@ def _volume_ratio(H: Tensor) -> Tensor:
     return a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)
 
 
-def _decompose(F: Tensor, moved: bool) -> tuple[Tensor, Tensor, Tensor]:
-    U, s, V = signed_svd(_moved(F) if moved else list(F.unbind()))
+def _two_in_a_cell(F: Tensor) -> Tensor:
+    """Matrices (9, L) as points (9, C, 2), in memory as `CellBatch.gradients` has its own.
+
+    Kernels are compiled for the number of dimensions and their order.  A zero matrix makes L even.
+    """
+    even = torch.nn.functional.pad(F, (0, F.shape[1] % 2))
+    return even.reshape(9, -1, 2).transpose(0, 1).contiguous().transpose(0, 1)
+
+
+def _decompose(F: Tensor, identity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    shifted = [f + identity if i in (0, 4, 8) else f for i, f in enumerate(F.unbind())]
+    U, s, V = signed_svd(shifted)
     return torch.stack(U), torch.stack(s), torch.stack(V)
 
 
