@@ -15,31 +15,35 @@ it is named after, or else on all that it has learned.  WORK gets
     logs/                        what these commands said
 
 Data are generated in the order of the recipes, unless ``--generators 0`` says that they are
-there.  Each training begins as soon as its data are there, several at a time on each GPU, or, if
-it starts from what another recipe makes (``start_from = "trainings/DATASET/NAME/model"``), when
-that has ended by itself; a data set's models are evaluated when all its trainings have.  Commands
-run in WORK.  Trainings that are still running after ``--seconds`` are stopped; their best models
-so far are evaluated, and the next start goes on with them.
+there; several generators are started once for all data sets, since each compiles its kernels for
+minutes, and leave when all are complete.  Each training begins as soon as its data are there,
+several at a time on each GPU, or, if it starts from what another recipe makes
+(``start_from = "trainings/DATASET/NAME/model"``), when that has ended by itself; a data set's
+models are evaluated when all its trainings have.  Commands run in WORK.  Trainings that are still
+running after ``--seconds`` are stopped; their best models so far are evaluated, and the next start
+goes on with them.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from program import run_script
 
 from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
-from pdcorrect.data.workers import visible_gpus
+from pdcorrect.data.workers import local_cluster, visible_gpus
 from pdcorrect.training.config import TrainingConfig
 from pdcorrect.training.training import MODEL
 
@@ -110,8 +114,8 @@ class Machine:
         self._logs = folder / "logs"
         self._logs.mkdir(parents=True, exist_ok=True)
 
-    def run(self, jobs: Sequence[Job]) -> bool:
-        """Run all; whether all were successful."""
+    def run(self, jobs: Sequence[Job], generated: Callable[[], None] | None = None) -> bool:
+        """Run all; whether all were successful.  ``generated`` is called after the last data."""
         started = time.monotonic()
         told: list[Job] = []
         try:
@@ -127,6 +131,9 @@ class Machine:
                     elif job.process is None and job.status is not None and job not in told:
                         told.append(job)
                         self._tell(started, job, "cannot run: what it needs failed")
+                if generated and not any(j.status is None for j in jobs if j.queue == "generate"):
+                    generated()
+                    generated = None
                 time.sleep(0.2)
         finally:
             for job in jobs:
@@ -171,6 +178,22 @@ class Machine:
     @staticmethod
     def _tell(started: float, job: Job, what: str) -> None:
         print(f"{time.monotonic() - started:7.1f} s  {job.name} {what}", flush=True)
+
+
+class _Generators:
+    """A Dask cluster on this machine, or none; may be closed again."""
+
+    def __init__(self, cluster: Any) -> None:
+        self._cluster = cluster
+        self.address: str | None = None if cluster is None else cluster.scheduler_address
+
+    def close(self) -> None:
+        cluster, self._cluster = self._cluster, None
+        if cluster is not None:
+            with contextlib.suppress(
+                TimeoutError
+            ):  # many workers: those left end with this process
+                cluster.close()
 
 
 def plan(
@@ -232,11 +255,12 @@ def _generation(
     work: Path, name: str, splits: Sequence[str], options: argparse.Namespace, after: Sequence[Job]
 ) -> Job:
     chosen = [part for split in splits for part in ("--split", split)]
+    address = options.scheduler
+    workers = ["--scheduler", address] if address else ["--workers", str(options.generators)]
     return Job(
         f"generate-{name}-{splits[0]}",
         ["dataset", "generate", str(DATASETS / name / CONFIG), "-o", str(work / "data" / name),
-         "--workers", str(options.generators), "--device", options.device,
-         "--batch", str(options.batch), *chosen],
+         *workers, "--device", options.device, "--batch", str(options.batch), *chosen],
         after,
         "generate",
     )  # fmt: skip
@@ -307,7 +331,11 @@ def main() -> None:
     gpus = visible_gpus() if options.device == "cuda" else []
     places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
     machine = Machine(work, gpus, places)
-    sys.exit(0 if machine.run(plan(work, recipes, released, options)) else 1)
+    cluster = local_cluster(options.generators) if options.generators > 1 else None
+    with contextlib.closing(_Generators(cluster)) as generators:
+        options.scheduler = generators.address
+        done = machine.run(plan(work, recipes, released, options), generators.close)
+    sys.exit(0 if done else 1)
 
 
 if __name__ == "__main__":

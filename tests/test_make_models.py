@@ -24,7 +24,13 @@ SPEC.loader.exec_module(make)
 
 FINE, REFUSED = ["--help"], ["train", "nowhere.toml"]
 OPTIONS = Namespace(
-    device="cpu", generators=1, batch=60, measurers=1, seconds=None, split=["evaluation"]
+    device="cpu",
+    generators=1,
+    scheduler=None,
+    batch=60,
+    measurers=1,
+    seconds=None,
+    split=["evaluation"],
 )
 
 
@@ -240,8 +246,48 @@ def test_trainings_are_spread_over_the_gpus_that_are_visible(tmp_path):
     assert sorted(job.gpu for job in jobs) == ["2", "2", "5", "5"]
 
 
+def test_generators_are_sent_away_once_all_data_are_there(tmp_path):
+    jobs = [make.Job(f"data {k}", FINE, [], "generate") for k in range(2)]
+    jobs.append(make.Job("training", FINE, [jobs[0]], "train"))
+    seen = []
+    assert machine(tmp_path).run(jobs, lambda: seen.append([job.status for job in jobs[:2]]))
+    assert seen == [[0, 0]]
+    assert machine(tmp_path).run(jobs[2:3], lambda: seen.append("again"))  # nothing left to run
+    assert len(seen) == 1
+
+
+def test_one_cluster_generates_all_data(tmp_path):
+    recipes = [
+        ROOT / "models/recipes" / f"{n}/through.toml" for n in ("torsion-exact", "impulse-exact")
+    ]
+    options = Namespace(**{**vars(OPTIONS), "generators": 4, "scheduler": "tcp://here:1"})
+    for job in make.plan(tmp_path, recipes, [], options):
+        assert (("--scheduler", "tcp://here:1") in pairwise(job.arguments)) == (
+            job.queue == "generate"
+        )
+        assert "--workers" not in job.arguments or job.queue == "evaluate"
+
+
+def test_a_cluster_that_does_not_close_in_time_stops_nothing():
+    class Slow:
+        scheduler_address, closed = "tcp://here:1", 0
+
+        def close(self):
+            self.closed += 1
+            raise TimeoutError
+
+    slow = Slow()
+    generators = make._Generators(slow)
+    assert generators.address == "tcp://here:1"
+    generators.close()
+    generators.close()
+    assert slow.closed == 1
+    make._Generators(None).close()
+
+
 @pytest.mark.slow
-def test_a_recipe_becomes_an_evaluated_model(tmp_path):
+@pytest.mark.parametrize("generators", ["1", "2"])
+def test_a_recipe_becomes_an_evaluated_model(tmp_path, generators):
     recipe = tmp_path / "recipes" / "tiny" / "short.toml"
     recipe.parent.mkdir(parents=True)
     recipe.write_text(
@@ -249,7 +295,9 @@ def test_a_recipe_becomes_an_evaluated_model(tmp_path):
         "[fitting]\nwindows = 20\n"
     )
     shutil.copytree(ROOT / "datasets/tiny", tmp_path / "work/data/tiny")
+    (tmp_path / "work/data/tiny/evaluation/mesh-0002.h5").unlink()  # is made again
     call = [sys.executable, ROOT / "models/make_all.py", tmp_path / "work", recipe]
+    call += ["--generators", generators]
     done = subprocess.run(call, env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=600)
     assert done.returncode == 0
     summary = json.loads((tmp_path / "work/evaluations/tiny/summary.json").read_text())
