@@ -15,14 +15,12 @@ of the one before to keep them busy, and summaries are written by processes of t
 from __future__ import annotations
 
 import argparse
-import contextlib
 import multiprocessing
 import shutil
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 
@@ -32,7 +30,7 @@ from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.workers import Workers, local_cluster
+from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import InputError
 from pdcorrect.progress import FileLines
 from pdcorrect.replacement import make_folder, write_text
@@ -130,7 +128,7 @@ def main() -> int:
     context = multiprocessing.get_context("spawn")
     with (
         ProcessPoolExecutor(SUMMARIES_AT_ONCE, mp_context=context) as summaries,
-        _scheduler(options.workers) as address,
+        local_scheduler(options.workers) as address,
     ):
         workers = Workers(options.workers, address, options.device, options.batch)
         begun: list[Production] = []
@@ -145,16 +143,6 @@ def main() -> int:
             begun[-1].nearly.wait()
         good = [production.succeeded() for production in begun]
     return 0 if sum(good) == len(options.names) else 1
-
-
-@contextlib.contextmanager
-def _scheduler(workers: int) -> Iterator[str | None]:
-    """The address of a cluster on this machine; None for a single worker, which is this process."""
-    if workers < 2:
-        yield None
-        return
-    with local_cluster(workers) as cluster:
-        yield cluster.scheduler_address
 
 
 def summarise(data: Path, target: Path) -> int:

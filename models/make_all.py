@@ -36,14 +36,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from program import run_script
 
 from pdcorrect.corrector.model_io import load_model
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.schema import CONFIG
-from pdcorrect.data.workers import local_cluster, visible_gpus
+from pdcorrect.data.workers import local_scheduler, visible_gpus
 from pdcorrect.training.config import TrainingConfig
 from pdcorrect.training.training import MODEL
 
@@ -178,22 +177,6 @@ class Machine:
     @staticmethod
     def _tell(started: float, job: Job, what: str) -> None:
         print(f"{time.monotonic() - started:7.1f} s  {job.name} {what}", flush=True)
-
-
-class _Generators:
-    """A Dask cluster on this machine, or none; may be closed again."""
-
-    def __init__(self, cluster: Any) -> None:
-        self._cluster = cluster
-        self.address: str | None = None if cluster is None else cluster.scheduler_address
-
-    def close(self) -> None:
-        cluster, self._cluster = self._cluster, None
-        if cluster is not None:
-            with contextlib.suppress(
-                TimeoutError
-            ):  # many workers: those left end with this process
-                cluster.close()
 
 
 def plan(
@@ -331,9 +314,8 @@ def main() -> None:
     gpus = visible_gpus() if options.device == "cuda" else []
     places = {"generate": 1, "train": options.together, "evaluate": max(1, len(gpus))}
     machine = Machine(work, gpus, places)
-    cluster = local_cluster(options.generators) if options.generators > 1 else None
-    with contextlib.closing(_Generators(cluster)) as generators:
-        options.scheduler = generators.address
+    with contextlib.ExitStack() as generators:  # to be closed when they have nothing more to do
+        options.scheduler = generators.enter_context(local_scheduler(options.generators))
         done = machine.run(plan(work, recipes, released, options), generators.close)
     sys.exit(0 if done else 1)
 

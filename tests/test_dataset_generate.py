@@ -25,7 +25,7 @@ from pdcorrect.data.produce import make_engines
 from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.data.workers import Workers
+from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
 from pdcorrect.progress import FileBar, FileLines, progress_bar
 from pdcorrect.replacement import clear_parts, part_of_process
@@ -573,3 +573,42 @@ def test_killed_twenty_times_it_ends_with_the_same_files(generated, tmp_path, wo
     assert generate(config, target)
     assert not list(target.rglob("*.part"))
     assert hashes(target) == hashes(folder)
+
+
+class SlowCluster:
+    """Takes longer to close than Dask waits for."""
+
+    scheduler_address = "tcp://here:1"
+
+    def __init__(self, count):
+        self.count, self.closed = count, 0
+
+    def close(self):
+        self.closed += 1
+        raise TimeoutError("workers are still there")
+
+
+def test_a_cluster_that_closes_slowly_stops_nothing_and_hides_no_error(monkeypatch):
+    made = []
+
+    def cluster(count):
+        made.append(SlowCluster(count))
+        return made[-1]
+
+    monkeypatch.setattr("pdcorrect.data.workers.local_cluster", cluster)
+    with contextlib.ExitStack() as stack:
+        assert stack.enter_context(local_scheduler(3)) == "tcp://here:1"
+        stack.close()  # before the end, and then not once more
+        assert made[0].closed == 1
+    assert (made[0].count, made[0].closed) == (3, 1)
+    with pytest.raises(TimeoutError, match="of the work"), local_scheduler(2):
+        raise TimeoutError("of the work itself")
+    assert made[1].closed == 1
+
+
+def test_one_worker_needs_no_cluster(monkeypatch):
+    monkeypatch.setattr("pdcorrect.data.workers.local_cluster", lambda n: pytest.fail("a cluster"))
+    with local_scheduler(1) as address:
+        assert address is None
+    with local_scheduler(0) as address:
+        assert address is None

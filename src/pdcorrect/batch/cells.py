@@ -224,7 +224,7 @@ class CellBatch:
         return torch.where(self.present_cells, by_cell, math.inf)
 
     def rotations(self, F: Tensor) -> Tensor:
-        """Nearest rotations (9, ...) of matrices (9, ...)."""
+        """Nearest rotations (9, L) of matrices (9, L)."""
         return self._points.rotations(F)
 
     def mean_rotations(self, u: Tensor, shares: Tensor) -> Tensor:

@@ -68,7 +68,7 @@ class Points:
             Whether F is the gradient H of a displacement.
         """
         finite = torch.nan_to_num(F)
-        U, _, V = self._svd(_two_in_a_cell(finite) if self._compiled else finite, moved)
+        U, _, V = self._decomposed(_two_in_a_cell(finite) if self._compiled else finite, moved)
         out: Tensor = self._call(_rotate)(U, V)
         return out.reshape(9, -1)[:, : F.shape[1]]
 
@@ -77,17 +77,13 @@ class Points:
         out: Tensor = self._call(_volume_ratio)(H)
         return out
 
-    def _decomposed(self, H: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """U (9, C, Q), s (3, C, Q), V (9, C, Q) of the signed SVD of F."""
-        return self._svd(H, True)
+    def _decomposed(self, H: Tensor, moved: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """U (9, ...), s (3, ...), V (9, ...) of the signed SVD of F = I + H, or of H itself.
 
-    def _svd(self, F: Tensor, moved: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """The same of F, or of H = F - I where it is ``moved``: a tensor says which.
-
-        A kernel for each would double the minutes that compiling it takes.
+        A tensor says which: compiling takes minutes, and a flag would be compiled twice.
         """
-        identity = F.new_full((), 1.0 if moved else 0.0)
-        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(F, identity)
+        identity = H.new_full((), 1.0 if moved else 0.0)
+        out: tuple[Tensor, Tensor, Tensor] = self._call(_decompose)(H, identity)
         return out
 
     def _call(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -104,9 +100,9 @@ class Points:
         return found
 
 
-def _moved(H: Tensor) -> list[Tensor]:
-    """F = I + H."""
-    return [h + 1.0 if i in (0, 4, 8) else h for i, h in enumerate(H.unbind())]
+def _moved(H: Tensor, identity: Tensor | float = 1.0) -> list[Tensor]:
+    """F = I + H; with 0 in place of 1, H."""
+    return [h + identity if i in (0, 4, 8) else h for i, h in enumerate(H.unbind())]
 
 
 def _volume_ratio(H: Tensor) -> Tensor:
@@ -117,15 +113,15 @@ def _volume_ratio(H: Tensor) -> Tensor:
 def _two_in_a_cell(F: Tensor) -> Tensor:
     """Matrices (9, L) as points (9, C, 2), in memory as `CellBatch.gradients` has its own.
 
-    Kernels are compiled for the number of dimensions and their order.  A zero matrix makes L even.
+    Kernels are compiled for the number of dimensions and their order.  A zero matrix is added to an
+    odd number of them.
     """
     even = torch.nn.functional.pad(F, (0, F.shape[1] % 2))
     return even.reshape(9, -1, 2).transpose(0, 1).contiguous().transpose(0, 1)
 
 
-def _decompose(F: Tensor, identity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    shifted = [f + identity if i in (0, 4, 8) else f for i, f in enumerate(F.unbind())]
-    U, s, V = signed_svd(shifted)
+def _decompose(H: Tensor, identity: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    U, s, V = signed_svd(_moved(H, identity))
     return torch.stack(U), torch.stack(s), torch.stack(V)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import re
@@ -135,6 +136,23 @@ def local_cluster(count: int) -> Any:
     quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
     with ctrl_c_ignored():
         return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
+
+
+@contextlib.contextmanager
+def local_scheduler(count: int) -> Iterator[str | None]:
+    """The address of a cluster of ``count`` processes on this machine; None if that is one.
+
+    Many may take longer to leave than Dask waits for; these end with this process.
+    """
+    if count < 2:
+        yield None
+        return
+    cluster = local_cluster(count)
+    try:
+        yield cluster.scheduler_address
+    finally:
+        with contextlib.suppress(TimeoutError):
+            cluster.close()
 
 
 def _scheduler_client(distributed: Any, address: str) -> Any:
