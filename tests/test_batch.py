@@ -6,17 +6,15 @@ import pickle
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch._dynamo.testing import CompileCounterWithBackend
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
-from pdcorrect.batch import decomposition, fused, minimise, recording
+from pdcorrect.batch import decomposition, minimise, recording
 from pdcorrect.batch.bodies import Bodies
 from pdcorrect.batch.cells import Sizes
 from pdcorrect.batch.memory import expected_bytes
@@ -25,7 +23,7 @@ from pdcorrect.batch.tall import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
-from pdcorrect.fem.hyperelasticity import COROTATED, energy_code
+from pdcorrect.fem.hyperelasticity import energy_code
 
 VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean"]
 DEVICES = [
@@ -136,7 +134,7 @@ def test_stress_and_tangent_at_points_are_those_of_the_energies(energy):
     F = F[np.abs(np.linalg.det(F)) > 1e-3]  # off the kinks
     rng = np.random.default_rng(1)
     mu, omega = rng.uniform(1, 2, (2, len(F)))
-    points = Points(energy_code(energy), 0, 1, compiled=False)
+    points = Points(energy_code(energy), 0, 1)
     weights = torch.as_tensor(np.stack([mu, omega]))
     H = rows(F - np.eye(3))
     density, P = points.stress(H, weights)
@@ -151,34 +149,6 @@ def test_stress_and_tangent_at_points_are_those_of_the_energies(energy):
     exact = np.einsum("nijkl,nkl->nij", C, D)
     scale = 1 + np.abs(C).max(axis=(1, 2, 3, 4))[:, None, None]
     np.testing.assert_allclose(found / scale, exact / scale, atol=1e-9)
-
-
-def test_one_kernel_decomposes_matrices_of_cells_and_of_nodes(monkeypatch):
-    """Compiling it takes minutes, and each other number or order of dimensions would add one."""
-    made = {}
-
-    @cache
-    def compiled(function):
-        made[function.__name__] = CompileCounterWithBackend("eager")
-        return torch.compile(function, dynamic=True, backend=made[function.__name__])
-
-    monkeypatch.setattr(fused, "_compiled", compiled)
-    rng = np.random.default_rng(0)
-    with_kernels, without = (Points(COROTATED, 4, 8, compiled=c) for c in (True, False))
-    for cells in (30, 44):
-        H = torch.as_tensor(rng.normal(size=(cells, 9, 8))).transpose(0, 1)
-        weights = torch.as_tensor(rng.uniform(1, 2, (2, cells, 8)))
-        for name in ("stress", "tangent"):
-            found, expected = (getattr(p, name)(H, weights) for p in (with_kernels, without))
-            torch.testing.assert_close(found, expected)
-    for count in (31, 77, 100):
-        F = torch.as_tensor(rng.normal(size=(9, count)))
-        F[:, 3] = np.nan
-        for moved in (True, False):
-            R = with_kernels.rotations(F, moved)
-            torch.testing.assert_close(R, without.rotations(F, moved), rtol=0, atol=0)
-    assert {name: counter.frame_count for name, counter in made.items()} == dict.fromkeys(made, 1)
-    assert "_decompose" in made
 
 
 @on_every_device

@@ -16,6 +16,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
+distributed = pytest.importorskip("distributed")
 
 from torch_geometric.data import Batch  # noqa: E402
 from torch_geometric.loader import DataLoader  # noqa: E402
@@ -27,6 +28,7 @@ from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E
 from pdcorrect.data.sampling import ShardShuffle  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
+from pdcorrect.data.workers import Workers, mapped  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 
 STEPS = 12  # of a mesh: simulations of 7 and 5
@@ -526,6 +528,21 @@ def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatc
     for count in (1, 3):
         with pytest.raises(FileFormatError, match=r"mesh-0005\.h5: damaged"):
             compute_statistics(tmp_path, processes=count)
+
+
+def test_statistics_by_a_schedulers_workers_have_the_same_bits(tmp_path):
+    samples.write(tmp_path, [samples.shard(number) for number in range(9)])
+    options = {"n_workers": 2, "threads_per_worker": 1, "processes": False}
+    with distributed.LocalCluster(**options, dashboard_address=":0") as cluster:
+        spread = partial(mapped, workers=Workers(scheduler=cluster.scheduler_address))
+        one, several = compute_statistics(tmp_path), compute_statistics(tmp_path, spread=spread)
+        assert several.quantities.keys() == one.quantities.keys()
+        for name in one.quantities:
+            close(several[name], one[name], 0)
+        path = tmp_path / "training" / "mesh-0007.h5"
+        path.write_bytes(path.read_bytes()[:-1])
+        with pytest.raises(FileFormatError, match=r"mesh-0007\.h5: truncated"):
+            compute_statistics(tmp_path, spread=spread)
 
 
 def parts_of_no_other(path, process):

@@ -81,6 +81,8 @@ ORDER = [
     "batch.decomposition",
     "batch.energies",
     "batch.fused",
+    "batch.tracing",
+    "batch.point_kernel",
     "batch.points",
     "batch.narrowing",
     "batch.levels",

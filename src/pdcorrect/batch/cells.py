@@ -109,7 +109,6 @@ class CellBatch:
             first.materials.model,
             first.quadrature.first_volume if first.scene.material.has_volume_term else points,
             points,
-            compiled=device.type == "cuda",
         )
         self._gradients = self._gradient_sets(quadratures)
 

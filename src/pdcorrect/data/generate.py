@@ -11,6 +11,7 @@ import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -24,7 +25,7 @@ from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.statistics import compute_statistics, load_statistics
-from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
+from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, mapped
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.replacement import clear_parts, make_folder, write_text
 
@@ -144,7 +145,7 @@ def generate(
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
     if all(hashes[plan.name] for plan in plans if plan.split == TRAINING):
-        _write_statistics(folder, workers.count)
+        _write_statistics(folder, workers)
     if None not in hashes.values():
         _write_manifest(config, folder, hashes)
     return _generated(plans, chosen, hashes)
@@ -272,9 +273,10 @@ def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, st
     write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")
 
 
-def _write_statistics(folder: Path, processes: int) -> None:
+def _write_statistics(folder: Path, workers: Workers) -> None:
     """Those of the training split, unless they are there."""
     with contextlib.suppress(InputError):
         load_statistics(folder)
         return
-    compute_statistics(folder, processes=processes).save(folder)
+    spread = partial(mapped, workers=workers) if workers.scheduler else None
+    compute_statistics(folder, processes=workers.count, spread=spread).save(folder)

@@ -39,6 +39,9 @@ _MOST_PROCESSES = 60
 """Windows waits for no more."""
 
 Array = NDArray[np.float64]
+_Parts = list[dict[str, "Moments"]]
+_Work = Callable[[Path], _Parts]
+Spread = Callable[[_Work, list[Path]], Iterable[_Parts]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +154,11 @@ class Statistics:
 
 
 def compute_statistics(
-    folder: str | Path, *, skip_damaged: bool = False, processes: int = 1
+    folder: str | Path,
+    *,
+    skip_damaged: bool = False,
+    processes: int = 1,
+    spread: Spread | None = None,
 ) -> Statistics:
     """Statistics of a data set's training split.
 
@@ -164,6 +171,9 @@ def compute_statistics(
         Leave out files that are damaged; all files are read twice then.
     processes : int
         At most so many share the files where there are many; the result has the same bits.
+    spread : callable, optional
+        Has others do the work in place of such processes: takes a function and a list, and
+        returns the function's results in order, as ``map`` does.
 
     Raises
     ------
@@ -178,10 +188,8 @@ def compute_statistics(
     config_hash, shards = _identity(headers)
     bases = frozenset.intersection(*(names for h in headers for _, names in h.runs))
     work = partial(_parts, bases=sorted(bases))
-    return Statistics(_moments(work, paths, processes), config_hash, shards, damaged)
-
-
-_Work = Callable[[Path], list[dict[str, Moments]]]
+    found = _all_merged(spread(work, paths)) if spread else _moments(work, paths, processes)
+    return Statistics(found, config_hash, shards, damaged)
 
 
 def _moments(work: _Work, paths: list[Path], processes: int) -> dict[str, Moments]:
@@ -204,7 +212,7 @@ def _moments_by_several(work: _Work, paths: list[Path], count: int) -> dict[str,
         pool.shutdown(cancel_futures=True)
 
 
-def _all_merged(files: Iterable[list[dict[str, Moments]]]) -> dict[str, Moments]:
+def _all_merged(files: Iterable[_Parts]) -> dict[str, Moments]:
     return reduce(_merged, chain.from_iterable(files))
 
 
@@ -257,7 +265,7 @@ def _identity(headers: list[ShardHeader]) -> tuple[str, dict[str, str]]:
     return configs.pop(), {header.path.name: header.content_hash for header in headers}
 
 
-def _parts(path: Path, bases: list[str]) -> list[dict[str, Moments]]:
+def _parts(path: Path, bases: list[str]) -> _Parts:
     """Moments of a file's mesh, then of each of its simulations."""
     mesh, motions = read_arrays(path, bases)
     steps = sum(len(motion.forces) for motion in motions)
