@@ -15,6 +15,7 @@ import pytest
 
 import pdcorrect as pc
 from dataset_configs import small
+from pdcorrect.data import statistics
 from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
@@ -500,6 +501,22 @@ def test_workers_that_join_later_are_used(tmp_path, monkeypatch):
         workers = Workers(scheduler=cluster.scheduler_address)
         assert not generate(config, tmp_path, workers)  # for nothing was written
     assert len(SEEN) == 2
+
+
+def test_a_schedulers_workers_compute_the_statistics_wherever_they_run(tmp_path, monkeypatch):
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(statistics, "_moments", None)  # by this process, or new ones
+    config = small(frames=1, training={"meshes": 9, "simulations": 9})
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        client.run(os.chdir, tmp_path / "elsewhere")
+        assert generate(config, "set", Workers(scheduler=cluster.scheduler_address))
+    assert len(statistics.load_statistics("set").shards) == 9
+    assert not any((tmp_path / "elsewhere").iterdir())
 
 
 def test_an_unknown_device_is_refused(tmp_path):

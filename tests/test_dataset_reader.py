@@ -16,7 +16,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
-distributed = pytest.importorskip("distributed")
 
 from torch_geometric.data import Batch  # noqa: E402
 from torch_geometric.loader import DataLoader  # noqa: E402
@@ -531,6 +530,7 @@ def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatc
 
 
 def test_statistics_by_a_schedulers_workers_have_the_same_bits(tmp_path):
+    distributed = pytest.importorskip("distributed")
     samples.write(tmp_path, [samples.shard(number) for number in range(9)])
     options = {"n_workers": 2, "threads_per_worker": 1, "processes": False}
     with distributed.LocalCluster(**options, dashboard_address=":0") as cluster:

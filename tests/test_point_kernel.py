@@ -14,10 +14,10 @@ import torch
 from pdcorrect.batch import point_kernel, points
 from pdcorrect.batch.tracing import Program
 from pdcorrect.errors import MissingExtraError
-from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN
+from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF
 
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-ENERGIES = [COROTATED, NEO_HOOKEAN]
+ENERGIES = [COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF]
 
 
 class Pointer:
@@ -27,6 +27,7 @@ class Pointer:
         self.tensor, self.places = tensor, places
 
     def __add__(self, more):
+        assert more.dtype == torch.int64  # 32 bits would not do for large batches
         return Pointer(self.tensor, self.places + more)
 
     def storage(self):
@@ -34,11 +35,9 @@ class Pointer:
         return self.tensor.as_strided((size,), (1,), 0), self.places + self.tensor.storage_offset()
 
 
-class Whole(int):
-    """A whole number with the one method of Triton's that kernels call."""
-
-    def to(self, dtype):
-        return int(self)
+def whole(number):
+    """A whole number as Triton gives it to a kernel."""
+    return torch.tensor(number, dtype=torch.int32)
 
 
 def language(block):
@@ -57,9 +56,9 @@ def language(block):
 
     return SimpleNamespace(
         constexpr=int, int64=torch.int64, float64=torch.float64, float32=torch.float32,
-        PropagateNan=SimpleNamespace(ALL="all"), program_id=lambda axis: block,
-        arange=torch.arange, load=load, store=store, where=torch.where, abs=torch.abs,
-        sqrt=torch.sqrt, sqrt_rn=torch.sqrt, rsqrt=torch.rsqrt,
+        PropagateNan=SimpleNamespace(ALL="all"), program_id=lambda axis: whole(block),
+        arange=partial(torch.arange, dtype=torch.int32), load=load, store=store,
+        where=torch.where, abs=torch.abs, sqrt=torch.sqrt, sqrt_rn=torch.sqrt, rsqrt=torch.rsqrt,
         maximum=extreme(torch.maximum), minimum=extreme(torch.minimum),
         full=lambda shape, value, dtype: torch.full(shape, value, dtype=dtype),
     )  # fmt: skip
@@ -69,15 +68,15 @@ class Interpreted:
     """A kernel that is launched as Triton's are."""
 
     def __init__(self, function, sizes, dtype):
-        self._text = point_kernel.source(Program.of(function, sizes, dtype))
+        self._text = point_kernel.kernel_source(Program.of(function, sizes, dtype), "kernel")
 
     def __getitem__(self, grid):
         return partial(self._launch, grid)
 
     def _launch(self, grid, *arguments, BLOCK, num_warps):
-        given = [Pointer(x) if torch.is_tensor(x) else Whole(x) for x in arguments]
+        given = [Pointer(x) if torch.is_tensor(x) else whole(x) for x in arguments]
         for block in range(*grid):
-            point_kernel.defined(self._text, "test", language(block))(*given, BLOCK=BLOCK)
+            point_kernel.as_function(self._text, "kernel", language(block))(*given, BLOCK=BLOCK)
 
 
 @pytest.fixture
@@ -87,10 +86,7 @@ def interpreted(monkeypatch):
     monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
 
     def computed(function, inputs, sizes, cell_by_cell=False):
-        _, cells, q = inputs[0].shape
-        out = [inputs[0].new_full((k, cells, q), math.nan) for k in sizes]
-        if cell_by_cell:
-            out = [x.transpose(0, 1).contiguous().transpose(0, 1) for x in out]
+        out = [x.fill_(math.nan) for x in points._room(inputs[0], sizes, cell_by_cell)]
         point_kernel.at_points(function, inputs, out)
         return out
 
@@ -141,7 +137,7 @@ def test_kernels_compute_what_torch_does(request, dtype, model, first):
     request.getfixturevalue("interpreted")
     found = everything(p, H, weights)
     tolerance = 1e-12 if dtype == torch.float64 else 1e-4
-    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance)
+    torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance, check_stride=True)
 
 
 @needs_gpu
@@ -168,6 +164,24 @@ def test_without_triton_it_is_told_what_brings_it(monkeypatch):
         point_kernel._kernel.__wrapped__(points._volume_ratio, (9,), torch.float64)
 
 
+def test_not_a_number_stays_one(interpreted):
+    def extremes(x, y):
+        return [[torch.maximum(x[0], y[0]), torch.minimum(x[0], y[0]), torch.clamp(x[0], min=0.0)]]
+
+    x = torch.tensor([[[1.0, math.nan, 2.0, -3.0]]])
+    y = torch.tensor([[[2.0, 1.0, math.nan, -4.0]]])
+    found, expected = (torch.zeros(3, 1, 4) for _ in range(2))
+    point_kernel.at_points(extremes, [x, y], [found])
+    torch.stack([z for row in extremes(x, y) for z in row], out=expected)
+    torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("other", [torch.zeros(9, 3, 8), torch.zeros(9, 2, 8, dtype=torch.float64)])
+def test_tensors_of_other_points_or_types_are_refused(other):
+    with pytest.raises(ValueError, match="the same points, type and device"):
+        point_kernel.at_points(points._volume_ratio, [other], [torch.zeros(1, 2, 8)])
+
+
 def test_numbers_may_lie_anywhere_in_memory(interpreted):
     """Also where places are of other tensors, which must stay as they are."""
 
@@ -192,14 +206,14 @@ def test_what_is_computed_twice_is_written_once():
     assert program.outputs == [[3, 5]]
 
 
-def test_constants_keep_their_sign_and_size():
+def test_constants_are_written_as_they_are():
     def numbers(x):
-        return [[torch.where(x[0] < -0.0, 1e-300, 0.0), torch.where(x[0] < 0.0, math.inf, x[0])]]
+        return [[torch.where(x[0] < -2.0, 1e-300, 0.0), torch.where(x[0] < 0.0, math.inf, x[0])]]
 
     program = Program.of(numbers, [1], torch.float64)
     constants = [line.operands[0] for line in program.lines if line.name == "constant"]
-    assert sorted(map(repr, constants)) == ["-0.0", "0.0", "1e-300", "inf"]
-    text = point_kernel.source(program)
+    assert sorted(map(repr, constants)) == ["-2.0", "0.0", "1e-300", "inf"]
+    text = point_kernel.kernel_source(program, "constants")
     ast.parse(text)
     assert 'float("inf")' in text
     assert "1e-300" in text
@@ -211,6 +225,7 @@ def test_constants_keep_their_sign_and_size():
         (lambda x: [[torch.sin(x[0])]], "sin"),
         (lambda x: [[x[0] ** 3]], "power 3"),
         (lambda x: [[x[0] if x[0] > 0 else -x[0]]], "torch.where"),
+        (lambda x: [[x[0] if x[0] == 0 else -x[0]]], "equality"),
     ],
 )
 def test_what_no_kernel_can_do_is_refused(function, reason):

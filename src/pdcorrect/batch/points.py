@@ -101,13 +101,17 @@ def _computed(
         found = function(*(list(x.unbind()) for x in inputs))
         axis = 1 if cell_by_cell else 0
         return [torch.stack(list(x), dim=axis).movedim(axis, 0) for x in found]
-    _, cells, points = first.shape
-    if cell_by_cell:
-        out = [first.new_empty(cells, k, points).transpose(0, 1) for k in sizes]
-    else:
-        out = [first.new_empty(k, cells, points) for k in sizes]
+    out = _room(first, sizes, cell_by_cell)
     at_points(function, inputs, out)
     return out
+
+
+def _room(x: Tensor, sizes: Sequence[int], cell_by_cell: bool) -> list[Tensor]:
+    """Tensors (k, C, Q) for results at the points of x."""
+    _, cells, points = x.shape
+    if cell_by_cell:
+        return [x.new_empty(cells, k, points).transpose(0, 1) for k in sizes]
+    return [x.new_empty(k, cells, points) for k in sizes]
 
 
 def _moved(H: Components) -> Components:

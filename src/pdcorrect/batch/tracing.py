@@ -61,8 +61,8 @@ class Program:
 
         Raises
         ------
-        NotImplementedError
-            If it does to them what no kernel can.
+        NotImplementedError, TypeError, AttributeError
+            If it does to them what no kernel can, or decides by their values.
         """
         program = cls(dtype)
         arguments = []
@@ -113,8 +113,11 @@ class Value:
     def abs(self) -> Value:
         return _do("abs", self)
 
+    def __abs__(self) -> Value:
+        return self.abs()
+
     def __neg__(self) -> Value:
-        return _do("negative", self)
+        return _do("*", self, -1.0)
 
     def __add__(self, other: Any) -> Value:
         return _do("+", self, other)
@@ -163,13 +166,18 @@ class Value:
     def __bool__(self) -> bool:
         raise NotImplementedError("a decision in a function of points: expected torch.where")
 
+    def __eq__(self, other: object) -> bool:
+        raise NotImplementedError("equality in a function of points: expected < or >")
+
+    __hash__ = object.__hash__
+
 
 def _do(name: str, *operands: Any) -> Value:
     program = next(x.program for x in operands if isinstance(x, Value))
     return program.add(name, *(program.value(x).line for x in operands))
 
 
-def _clamp(x: Value, min: Number) -> Value:
+def _clamp(x: Value, *, min: Number) -> Value:
     return _do("maximum", x, min)
 
 

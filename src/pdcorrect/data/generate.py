@@ -279,4 +279,4 @@ def _write_statistics(folder: Path, workers: Workers) -> None:
         load_statistics(folder)
         return
     spread = partial(mapped, workers=workers) if workers.scheduler else None
-    compute_statistics(folder, processes=workers.count, spread=spread).save(folder)
+    compute_statistics(folder.resolve(), processes=workers.count, spread=spread).save(folder)

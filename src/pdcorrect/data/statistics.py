@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 _Parts = list[dict[str, "Moments"]]
 _Work = Callable[[Path], _Parts]
 Spread = Callable[[_Work, list[Path]], Iterable[_Parts]]
+"""Results of a function of each path, in order."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,8 @@ _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
 _ANSWER = 10
 """Seconds to wait for a scheduler's answer."""
-_ITEMS = 4
-"""Of a list that are handed out together."""
+_ITEMS_A_TASK = 4
+"""Of a list, handed out together."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -129,10 +129,16 @@ def mapped(
     """Results in order, by the workers of a scheduler, before all else that they have to do.
 
     They have imported what is needed already, which new processes would take long to do.
+
+    Raises
+    ------
+    InputError
+        If no scheduler or worker answers.
     """
     distributed = require_extra("distributed", "cluster")
-    parts = [list(items[k : k + _ITEMS]) for k in range(0, len(items), _ITEMS)]
+    parts = [list(items[k : k + _ITEMS_A_TASK]) for k in range(0, len(items), _ITEMS_A_TASK)]
     with _client(distributed, workers) as client:
+        _wait_for_worker(client)
         futures = client.map(partial(_each, function), parts, pure=False, priority=1)
         for future in futures:
             yield from future.result()
