@@ -32,7 +32,7 @@ _KICKED = "impulse-as-published-total-mass"
 _HEAVY = "torsion-as-published-total-mass"
 _FURTHER = "through-further/model"
 ROWS = (
-    Row("impulse-as-published", "impulse-as-published-fifth", "model", _IMPULSE),
+    Row("impulse-as-published", "impulse-as-published-seventh", "model", _IMPULSE),
     Row(_KICKED, f"{_KICKED}-fourth", "model", _IMPULSE),
     Row("stretch-as-published", "stretch-as-published-sixth", "model", _STRETCH),
     Row("stretch-as-published-total-mass", "stretch-as-published-second", "model", _STRETCH),

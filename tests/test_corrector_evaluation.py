@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import shutil
 from dataclasses import asdict, dataclass, fields, replace
@@ -29,6 +30,7 @@ from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
 from pdcorrect.evaluation import tables  # noqa: E402
+from pdcorrect.evaluation.alone import roll_out_alone  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.evaluation.cases import Case, read_cases  # noqa: E402
 from pdcorrect.evaluation.evaluation import Candidate, EvaluatedRun, evaluate  # noqa: E402
@@ -800,6 +802,43 @@ def test_the_gate_refuses_what_the_network_has_not_seen_unless_it_is_off(tmp_pat
         rates[name] = [run.refused.mean() for run in runs]
     assert rates.pop("none") == [0.0, 0.0]
     assert set(map(tuple, rates.values())) == {(1.0, 1.0)}
+
+
+@pytest.mark.parametrize("gate", [None, pc.Gate()])
+def test_scenes_alone_are_evaluated_as_in_a_batch(cases, gate):
+    """Which a CPU does, since it is quicker: to the tolerance of the coarse solver."""
+    (saved,) = saved_candidates(["tiny"], gate=gate)
+    batch = replace(saved.candidate, name="batch", alone=None)
+    found = evaluate([saved.candidate, batch], TINY, device="cpu")
+    for one, other in zip(
+        found.runs[saved.candidate.name].trajectories, found.runs["batch"].trajectories,
+        strict=True,
+    ):  # fmt: skip
+        assert one.measures.failed == other.measures.failed
+        assert one.measures.gate_rate == other.measures.gate_rate
+        assert one.measures.omega == pytest.approx(other.measures.omega, abs=0.05)
+        assert one.measures.step_omega == pytest.approx(other.measures.step_omega, abs=0.05)
+
+
+def test_a_scene_alone_that_fails_is_held(cases):
+    (saved,) = saved_candidates(["tiny"], gate=None)
+    hybrid = saved.candidate.alone(cases[0].problems[saved.candidate.base])
+    step, count = type(hybrid).__call__, itertools.count(1)
+
+    class Failing:
+        problem, coarse, remembers = hybrid.problem, hybrid.coarse, hybrid.remembers
+
+        def __call__(self, state):
+            result = step(hybrid, state)
+            return replace(result, status=Status.LINE_SEARCH) if next(count) == 3 else result
+
+    run = roll_out_alone(Failing(), 6)
+    assert run.failed == 3
+    assert run.positions.shape == (7, *hybrid.problem.positions.shape)
+    assert not np.array_equal(run.positions[2], run.positions[1])
+    for frame in run.positions[3:]:
+        np.testing.assert_array_equal(frame, run.positions[2])
+    assert not run.reasons[2:].any()
 
 
 def run_command(*arguments):

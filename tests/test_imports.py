@@ -214,6 +214,7 @@ ORDER = [
     "evaluation.cases",
     "evaluation.measures",
     "evaluation.rollouts",
+    "evaluation.alone",
     "evaluation.evaluation",
     "evaluation.tables",
     "evaluation.candidates",

@@ -448,6 +448,7 @@ RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
 SEVERAL = {
     "all-as-published-total-mass":
         ["impulse-as-published", "stretch-as-published", "torsion-as-published"],
+    "impulse-as-published": ["impulse-as-published", "impulse-more"],
     "stretch-as-published": ["stretch-as-published", "stretch-more"],
     "torsion-exact": ["torsion-exact", "torsion-many", "torsion-more"],
 }  # fmt: skip

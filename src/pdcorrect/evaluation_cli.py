@@ -27,7 +27,7 @@ def evaluate(
     ],
     split: Annotated[str, typer.Option(help="Split of the data set.")] = "evaluation",
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    batch: Annotated[int, typer.Option(help="Simulations at once.", min=1)] = 32,
+    batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
     workers: Annotated[int, typer.Option(help="Processes that measure.", min=1)] = 1,
     output: Annotated[
         Optional[Path],

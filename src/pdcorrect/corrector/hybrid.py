@@ -72,6 +72,8 @@ class HybridStepper:
     compiled : bool
         Whether a `CompiledCorrector` answers, which is the same to rounding; `prepare` copies
         the weights that it has then.
+    remembers : bool
+        Whether states carry the correction of the step before, `MEMORY`, for the network.
 
     Raises
     ------
@@ -122,7 +124,7 @@ class HybridStepper:
         self._answers: Answers = self.corrector
         if self.compiled:
             self._answers = CompiledCorrector(self.corrector, self.bodies)
-        self._remembers = "previous-correction" in corrector.config.node_features
+        self.remembers = "previous-correction" in corrector.config.node_features
 
     def __repr__(self) -> str:
         return f"{self.coarse!r}, corrected ({self.placement})"
@@ -229,7 +231,7 @@ class HybridStepper:
         correction: Array = decision.correction
         reason = float(decision.reasons.item())
         after, own = result.state, {}
-        if self._remembers:
+        if self.remembers:
             own[MEMORY] = correction
         if self.gate is not None and (shut := self.gate.steps_shut(decision.reasons, left).item()):
             own[PAUSE] = np.full_like(correction, shut)
@@ -247,7 +249,7 @@ class HybridStepper:
 
     def _previous(self, state: State) -> Array | None:
         """The correction of the step before, m, where the network asks for it."""
-        return state.memory.get(MEMORY) if self._remembers else None
+        return state.memory.get(MEMORY) if self.remembers else None
 
     def _step(
         self, state: State, forces: Array | None = None, previous: Array | None = None

@@ -12,6 +12,7 @@ from typing import Any
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.gate import Gate
+from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.model_io import (
     LoadedModel,
     load_model,
@@ -22,6 +23,8 @@ from pdcorrect.corrector.model_io import (
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.evaluation.rollouts import Hybrid
+from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.projective import ProjectiveDynamics
 
 DEFAULT_GATE = Gate()
 _GROUP_DIGITS = 8
@@ -123,7 +126,11 @@ def _saved(path: str | Path, name: str, device: str, gate: Gate | None) -> Saved
     def hybrid(stepper: BatchStepper) -> Hybrid:
         return BatchHybrid(stepper, model.corrector, velocity=model.velocity, gate=gate)
 
-    candidate = Candidate(name, model.base, hybrid, _group(model))
+    def alone(problem: Problem) -> HybridStepper:
+        coarse = ProjectiveDynamics(problem)
+        return HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=gate)
+
+    candidate = Candidate(name, model.base, hybrid, _group(model), alone)
     return SavedCandidate(candidate, folder, model, weights_digest(folder))
 
 

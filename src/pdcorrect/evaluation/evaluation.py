@@ -14,15 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION
 from pdcorrect.data.damage import Damage
 from pdcorrect.data.missing import accepted_gaps
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
+from pdcorrect.evaluation.alone import roll_out_alone, single_steps_alone
 from pdcorrect.evaluation.cases import Case, read_cases
 from pdcorrect.evaluation.measures import Measured, Outcome, TrajectoryMeasures, measure
 from pdcorrect.evaluation.rollouts import Hybrid, roll_out, single_steps
+from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
 OnCases = Callable[[int, int], None]
@@ -43,12 +46,15 @@ class Candidate:
         From a stepper of that model's problems to their corrected step.
     group : str or None
         Shared by models that differ by their seed only.
+    alone : callable or None
+        From one such problem to its corrected step, where there is one; what a CPU takes.
     """
 
     name: str
     base: str
     hybrid: Callable[[BatchStepper], Hybrid]
     group: str | None = None
+    alone: Callable[[Problem], HybridStepper] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,6 +291,9 @@ def _outcomes(
     steppers: dict[str, BatchStepper] = {}
     for candidate in candidates:
         base = candidate.base
+        if device == "cpu" and candidate.alone is not None:
+            yield candidate.name, [_outcome_alone(candidate.alone, base, case) for case in cases]
+            continue
         if base not in steppers:
             steppers[base] = BatchStepper([case.problems[base] for case in cases], device=device)
         stepper = steppers[base]
@@ -299,3 +308,10 @@ def _outcomes(
                 for run, one in zip(runs, steps, strict=True)
             ],
         )
+
+
+def _outcome_alone(alone: Callable[[Problem], HybridStepper], base: str, case: Case) -> Outcome:
+    hybrid = alone(case.problems[base])
+    run = roll_out_alone(hybrid, case.steps)
+    steps = single_steps_alone(hybrid, case.reference, case.predictions.get(base))
+    return Outcome(run.positions, steps, base, run.reasons, run.failed)
