@@ -30,7 +30,7 @@ from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
 from pdcorrect.evaluation import tables  # noqa: E402
-from pdcorrect.evaluation.alone import roll_out_alone  # noqa: E402
+from pdcorrect.evaluation.alone import roll_out_alone, single_steps_alone  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.evaluation.cases import Case, read_cases  # noqa: E402
 from pdcorrect.evaluation.evaluation import Candidate, EvaluatedRun, evaluate  # noqa: E402
@@ -820,6 +820,59 @@ def test_scenes_alone_are_evaluated_as_in_a_batch(cases, gate):
         assert one.measures.step_omega == pytest.approx(other.measures.step_omega, abs=0.05)
 
 
+def test_a_gate_refuses_and_pauses_alone_as_in_a_batch(cases):
+    """Of the first scene; in others two gates may part where energy is at its bound."""
+    (saved,) = saved_candidates(["tiny"], gate=Gate(energy=0.01))
+    problem = cases[0].problems[saved.candidate.base]
+    stepper = pc.BatchStepper([problem])
+    (expected,) = roll_out(saved.candidate.hybrid(stepper), stepper, [20])
+    found = roll_out_alone(saved.candidate.alone(problem), 20)
+    assert {0, Reason.ENERGY, Reason.PAUSE} == set(found.reasons.tolist())
+    np.testing.assert_array_equal(found.reasons, expected.reasons)
+
+
+@pytest.mark.parametrize("lost", [np.nan, 1e9])
+def test_a_scene_alone_that_is_lost_has_failed(cases, lost):
+    (saved,) = saved_candidates(["tiny"], gate=None)
+    hybrid = saved.candidate.alone(cases[0].problems[saved.candidate.base])
+    step = type(hybrid).__call__
+
+    class Lost:
+        problem, coarse, remembers = hybrid.problem, hybrid.coarse, hybrid.remembers
+
+        def __call__(self, state):
+            result, after = step(hybrid, state), SimpleNamespace()
+            after.positions = result.state.positions + lost
+            after.velocities = result.state.velocities
+            return replace(result, state=after)
+
+    run = roll_out_alone(Lost(), 3)
+    assert run.failed == 1
+    np.testing.assert_array_equal(run.positions, np.stack([hybrid.problem.positions] * 4))
+    if np.isnan(lost):
+        reference = cases[0].reference[:3]
+        np.testing.assert_array_equal(single_steps_alone(Lost(), reference, None), reference[:2])
+
+
+def test_single_steps_alone_are_given_what_the_coarse_step_lacked(cases):
+    given = []
+    problem, case = cases[0].problems["plain"], cases[0]
+
+    def hybrid(state):
+        given.append(state.memory)
+        return SimpleNamespace(state=state, status=Status.CONVERGED)
+
+    hybrid.coarse, hybrid.remembers = pc.ProjectiveDynamics(problem), True
+    steps = single_steps_alone(hybrid, case.reference[:3], case.predictions["plain"])
+    np.testing.assert_array_equal(steps, case.reference[:2])
+    first, second = (memory["previous_correction"] for memory in given)
+    assert not first.any()
+    np.testing.assert_allclose(second, case.reference[1] - case.predictions["plain"][0])
+    hybrid.remembers = False
+    single_steps_alone(hybrid, case.reference[:2], None)
+    assert given[-1] == {}
+
+
 def test_a_scene_alone_that_fails_is_held(cases):
     (saved,) = saved_candidates(["tiny"], gate=None)
     hybrid = saved.candidate.alone(cases[0].problems[saved.candidate.base])
@@ -830,15 +883,16 @@ def test_a_scene_alone_that_fails_is_held(cases):
 
         def __call__(self, state):
             result = step(hybrid, state)
+            result = replace(result, stats={**result.stats, "gate": 1.0})
             return replace(result, status=Status.LINE_SEARCH) if next(count) == 3 else result
 
     run = roll_out_alone(Failing(), 6)
     assert run.failed == 3
+    assert run.reasons.tolist() == [1, 1, 0, 0, 0, 0]
     assert run.positions.shape == (7, *hybrid.problem.positions.shape)
     assert not np.array_equal(run.positions[2], run.positions[1])
     for frame in run.positions[3:]:
         np.testing.assert_array_equal(frame, run.positions[2])
-    assert not run.reasons[2:].any()
 
 
 def run_command(*arguments):

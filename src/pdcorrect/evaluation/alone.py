@@ -1,7 +1,9 @@
 """Free rollouts and single steps of one corrected scene on a CPU.
 
 What `pdcorrect.evaluation.rollouts` does for many scenes at once.  On a CPU one scene after the
-other is quicker, since its network runs in compiled loops (see `HybridStepper`).
+other is quicker, since its network runs in compiled loops (see `HybridStepper`).  Results are the
+same to the solver's tolerance; with internal modes a gate may let a correction pass that it refuses
+in a batch, since a scene alone relaxes its modes before its energy is judged.
 """
 
 from __future__ import annotations

@@ -47,7 +47,8 @@ class Candidate:
     group : str or None
         Shared by models that differ by their seed only.
     alone : callable or None
-        From one such problem to its corrected step, where there is one; what a CPU takes.
+        From one problem of that model to its corrected step, which a CPU takes in the place of
+        ``hybrid``; None: batches there, too.
     """
 
     name: str
@@ -167,7 +168,7 @@ def evaluate(
     split : str
     device : str
     batch : int
-        Simulations that are stepped together.
+        Simulations that are stepped together; on a CPU candidates with ``alone`` step one by one.
     workers : int
         Processes that measure; the results do not depend on their number.
     skip_damaged : bool
