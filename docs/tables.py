@@ -1,0 +1,121 @@
+"""Write the tables of the documentation from the records they quote.
+
+A table stands in a Markdown file between `<!-- table: NAME -->` and `<!-- end -->`.  This script
+writes what `TABLES[NAME]` gives between the two lines, in every Markdown file of the repository:
+
+    python docs/tables.py           # rewrite
+    python docs/tables.py --check   # exit 1 if a page would change
+
+A table is a function without arguments that returns the header's cells and the rows' cells.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDS = ROOT / "validation" / "results"
+
+Rows = tuple[Sequence[str], Iterable[Sequence[str]]]
+
+_BLOCK = re.compile(r"(<!-- table: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_SKIPPED = {".git", ".venv", "node_modules", "_build"}
+
+
+def read(path: str | Path) -> Any:
+    """The JSON record at ``path``, relative to the repository's root."""
+    return json.loads((ROOT / path).read_text(encoding="utf-8"))
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """``value`` to ``digits`` significant digits; a dash for none."""
+    if value is None:
+        return "–"
+    if abs(value) >= 10 ** (digits - 1):
+        return f"{value:.0f}"
+    return f"{value:#.{digits}g}"
+
+
+# --- the tables ------------------------------------------------------------------------------
+
+
+def demo() -> Rows:
+    """The comparison of `make demo`."""
+    record = read(RECORDS / "unseen_cross.json")
+    labels = (
+        "coarse PD",
+        "best coarse PD",
+        "hybrid torsion-exact",
+        "intermediate PD",
+        "fine best PD",
+    )
+    runs = {row["label"]: row for row in record["rows"]}
+    rows = [
+        [
+            label,
+            str(runs[label]["nodes"]),
+            _millimetres(runs[label]["rms_error"], label == record["reference"]),
+            _millimetres(runs[label]["largest_error"], label == record["reference"]),
+            number(runs[label]["seconds_a_frame"] * 1e3),
+        ]
+        for label in labels
+    ]
+    return ("solver", "nodes", "RMS, mm", "worst, mm", "ms a frame"), rows
+
+
+def _millimetres(metres: float | None, reference: bool) -> str:
+    return "reference" if reference or metres is None else number(metres * 1e3)
+
+
+TABLES: dict[str, Callable[[], Rows]] = {
+    "demo": demo,
+}
+
+
+# --- writing them ----------------------------------------------------------------------------
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table; the first column to the left, the others to the right."""
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in (header, rule, *rows))
+
+
+def filled(text: str) -> str:
+    """``text`` with all its tables written anew."""
+
+    def block(match: re.Match[str]) -> str:
+        return match[1] + "\n" + markdown(*TABLES[match[2]]()) + "\n" + match[3]
+
+    return _BLOCK.sub(block, text)
+
+
+def pages() -> list[Path]:
+    found = (page for page in ROOT.rglob("*.md") if not _SKIPPED & set(page.parts))
+    return sorted(page for page in found if "<!-- table: " in page.read_text(encoding="utf-8"))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="Write the tables of the documentation.")
+    parser.add_argument("--check", action="store_true", help="change nothing; exit 1 if needed")
+    check = parser.parse_args(arguments).check
+    changed = False
+    for page in pages():
+        old = page.read_text(encoding="utf-8")
+        new = filled(old)
+        if new != old:
+            changed = True
+            print(f"{'out of date' if check else 'written'}: {page.relative_to(ROOT)}")
+            if not check:
+                page.write_text(new, encoding="utf-8")
+    return 1 if check and changed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
