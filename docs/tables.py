@@ -6,40 +6,23 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
     python docs/tables.py           # rewrite
     python docs/tables.py --check   # exit 1 if a page would change
 
-A table is a function without arguments that returns the header's cells and the rows' cells.
+A table is a function without arguments that returns the header's cells and the rows' cells; those
+of models are in `model_tables`, and what all use in `records`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-RECORDS = ROOT / "validation" / "results"
-
-Rows = tuple[Sequence[str], Iterable[Sequence[str]]]
+import model_tables
+from records import RECORDS, ROOT, Rows, number, read
 
 _BLOCK = re.compile(r"(<!-- table: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _SKIPPED = {".git", ".venv", "node_modules", "_build"}
-
-
-def read(path: str | Path) -> Any:
-    """The JSON record at ``path``, relative to the repository's root."""
-    return json.loads((ROOT / path).read_text(encoding="utf-8"))
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """``value`` to ``digits`` significant digits; a dash for none."""
-    if value is None:
-        return "–"
-    if abs(value) >= 10 ** (digits - 1):
-        return f"{value:.0f}"
-    return f"{value:#.{digits}g}"
 
 
 # --- the tables ------------------------------------------------------------------------------
@@ -75,6 +58,7 @@ def _millimetres(metres: float | None, reference: bool) -> str:
 
 TABLES: dict[str, Callable[[], Rows]] = {
     "demo": demo,
+    **dict(model_tables.tables()),
 }
 
 

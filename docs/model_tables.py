@@ -1,0 +1,239 @@
+"""Tables of released models, their baselines, and models that are no more."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any
+
+from records import RECORDS, Rows, interval, number, percent, read
+
+MODELS = (
+    "impulse-as-published", "stretch-as-published", "torsion-as-published",
+    "impulse-exact", "stretch-exact", "torsion-exact",
+)  # fmt: skip
+EXACT = MODELS[3:]
+THESIS = {"impulse": 95.9, "stretch": 99.1, "torsion": 91.3}
+"""Mean Omega of the thesis's own models, of its own meshes and loads (table 7.1)."""
+RUNS = {
+    "plain": "plain coarse mesh",
+    "total-mass": "coarse mesh with the reference's total mass",
+    "best": "best coarse model",
+    "intermediate": "intermediate mesh",
+    "corrected": "corrected",
+}
+BASELINES = {
+    "hex8-mean": "element `hex8-mean`",
+    "hex8-bubble": "element `hex8-bubble`",
+    "hex8-bubble-mean": "element `hex8-bubble-mean`",
+    "consistent mass": "consistent mass",
+    "fitted stiffness": "one factor on Young's modulus, fitted",
+    "total-mass": "the reference's total mass",
+    "best": "best coarse model",
+    "intermediate": "intermediate mesh",
+}
+
+
+def record_of(model: str) -> Any:
+    return read(f"models/{model}/evaluation.json")
+
+
+def base_of(record: Mapping[str, Any]) -> str:
+    return "plain" if record["base"] == "plain" else "best coarse"
+
+
+def released() -> Rows:
+    """The models, what they correct, and how near they come."""
+    rows = []
+    for model in (*MODELS, "tiny"):
+        record = record_of(model)
+        omega = record["runs"]["corrected"]["omega"]
+        sets = [each["name"] for each in data_sets(model)]
+        rows.append([
+            f"[`{model}`]({model}/README.md)", base_of(record),
+            ", ".join(f"`{name}`" for name in sets),
+            percent(omega["mean"]), percent(omega["smallest"]),
+        ])  # fmt: skip
+    return ("model", "corrects", "trained on", "Ω mean", "Ω worst"), rows
+
+
+def data_sets(model: str) -> list[dict[str, Any]]:
+    record = read(f"models/{model}/model.json")["record"]
+    found: list[dict[str, Any]] = record["training"].get("data_sets", [])
+    return found or [{"name": name} for name in record["dataset"].split("+")]
+
+
+def card(model: str) -> Rows:
+    """A model on its evaluation split, beside what needs no network."""
+    runs = record_of(model)["runs"]
+    rows = []
+    for run, label in RUNS.items():
+        if run in runs:
+            found, omega = runs[run], runs[run]["omega"]
+            spread = "–" if run == "plain" else interval(omega["interval"])
+            rows.append([
+                label, percent(omega["mean"]), spread, percent(omega["median"]),
+                percent(omega["smallest"]), number(1e3 * found["rms_error"]),
+                number(found["stress_error"]),
+            ])  # fmt: skip
+    return ("run", "Ω mean", "95 %", "median", "worst", "RMS, mm", "stress error, %"), rows
+
+
+def results() -> Rows:
+    """The six models beside the thesis, their base and the intermediate mesh."""
+    rows = []
+    for model in MODELS:
+        record = record_of(model)
+        runs = record["runs"]
+        omega = runs["corrected"]["omega"]
+        thesis = THESIS[model.partition("-")[0]]
+        exact = model in EXACT
+        rows.append([
+            f"`{model}`", base_of(record), f"({thesis})" if exact else f"{thesis}",
+            f"**{percent(omega['mean'])}**", interval(omega["interval"]),
+            percent(omega["smallest"]), percent(runs[record["base"]]["omega"]["mean"]),
+            percent(runs["intermediate"]["omega"]["mean"]),
+            number(1e3 * runs["corrected"]["rms_error"]),
+        ])  # fmt: skip
+    head = ("model", "corrects", "thesis", "Ω mean", "95 %", "worst", "base alone",
+            "intermediate mesh", "RMS, mm")  # fmt: skip
+    return head, rows
+
+
+def losses() -> Rows:
+    """Where the six models are behind their base or the intermediate mesh."""
+    rows = []
+    for model in MODELS:
+        record = record_of(model)
+        runs = record["runs"]
+        over, single = record["error_over_base"], record["single_step_error_over_base"]
+        rows.append([
+            f"`{model}`", number(single["median"], 2), number(over["median"], 2),
+            number(over["largest"], 2), str(over["above 1.05"]),
+            str(record["intermediate_nearer"]), str(record["intermediate_nearer_in_stress"]),
+            number(runs["corrected"]["stress_error"], 2),
+            number(runs["intermediate"]["stress_error"], 2),
+        ])  # fmt: skip
+    head = (
+        "model", "single step: error over base's", "rollout: median", "largest", "worse than base",
+        "intermediate mesh nearer", "the same in stress", "stress error, %", "intermediate's, %",
+    )  # fmt: skip
+    return head, rows
+
+
+def time_error() -> Rows:
+    """Distances from the run that is converged in time."""
+    rows = []
+    for model in EXACT:
+        record = record_of(model)
+        distance = record["time_error"]["rms_error"]
+        rows.append([
+            f"`{model}`", number(1e3 * record["runs"]["corrected"]["rms_error"]),
+            *(number(1e3 * distance[run]) for run in ("best", "corrected", "reference")),
+        ])  # fmt: skip
+    head = ("model", "corrected to reference", "best coarse to converged",
+            "corrected to converged", "reference to converged")  # fmt: skip
+    return head, rows
+
+
+def further_splits() -> Rows:
+    """The exact models on data unlike those of their training."""
+    found = [
+        {split["split"]: split for split in record_of(model)["further_splits"]} for model in EXACT
+    ]
+    rows = []
+    for split in found[0]:
+        each = [splits[split] for splits in found]
+        cells = [
+            ", ".join(
+                percent(omega, 0)
+                for omega in (one["omega_base"], one["omega"]["mean"], one["omega_without_gate"])
+            )
+            for one in each
+        ]
+        refused = ", ".join(f"{one['refused_steps']:.0f}" for one in each)
+        largest = ", ".join(number(one["error_over_base"]["largest"], 2) for one in each)
+        rows.append([split.replace("-", " "), *cells, refused, largest])
+    names = [model.partition("-")[0] for model in EXACT]
+    head = ("split", *(f"{name}: base, gate, no gate" for name in names),
+            "steps refused, %", "largest error over base's, with gate")  # fmt: skip
+    return head, rows
+
+
+def baselines() -> Rows:
+    """What needs no network, mean and worst Omega."""
+    found = read(RECORDS / "baselines.json")
+    rows = [
+        [label, *(_omega(found[name]["omega"].get(run)) for name in MODELS)]
+        for run, label in BASELINES.items()
+    ]
+    return ("coarse mesh with", *MODELS), rows
+
+
+def _omega(found: Mapping[str, float] | None) -> str:
+    return "" if found is None else f"{percent(found['mean'])}, {percent(found['smallest'])}"
+
+
+def withdrawn() -> Rows:
+    """Models that are no more."""
+    rows = [
+        [
+            f"`{model['name']}`", f"`{model['data']}`", percent(model["omega"]["mean"]),
+            interval(model["omega"]["interval"]), percent(model["omega"]["smallest"]),
+            percent(model["omega_base"]), number(model["stress_error"], 2), model["date"],
+        ]
+        for model in read("models/withdrawn.json")["models"]
+    ]  # fmt: skip
+    head = ("model", "evaluation split of", "Ω mean", "95 %", "worst", "base alone",
+            "stress error, %", "date")  # fmt: skip
+    return head, rows
+
+
+def trainings(*studies: str) -> Rows:
+    """Other trainings of some studies."""
+    found = [t for t in read("models/withdrawn.json")["trainings"] if t["study"] in studies]
+    rows = [
+        [t["name"], *(percent(t["omega"][key]) for key in ("mean", "median", "smallest"))]
+        for t in found
+    ]
+    return ("training", "Ω mean", "median", "worst"), rows
+
+
+def other_bodies() -> Rows:
+    """Bodies of other sizes and families that the gate lets pass."""
+    rows = [
+        [
+            f"`{each['model']}`", each["bodies"], each["nodes"], percent(each["omega_base"]),
+            percent(each["omega"]), ", ".join(number(x, 2) for x in each["error_over_base"]),
+        ]
+        for each in read("models/withdrawn.json")["other_bodies"]
+    ]  # fmt: skip
+    head = ("model", "bodies", "nodes", "base: Ω", "corrected: Ω", "error over base's, each")
+    return head, rows
+
+
+def seeds() -> tuple[float, float]:
+    """Mean and standard deviation of mean Omega over three seeds of one recipe."""
+    each = [
+        t["omega"]["mean"]
+        for t in read("models/withdrawn.json")["trainings"]
+        if t["study"] == "seeds"
+    ]
+    return statistics.mean(each), statistics.stdev(each)
+
+
+def tables() -> Iterable[tuple[str, Any]]:
+    """Names of the tables here and what makes them."""
+    yield from {
+        "models": released, "results": results, "losses": losses, "time-error": time_error,
+        "further-splits": further_splits, "baselines": baselines, "withdrawn": withdrawn,
+        "other-bodies": other_bodies,
+        "recipes-compared": partial(trainings, "recipes"),
+        "changes-one-by-one": partial(trainings, "ablation"),
+        "stray-rollouts": partial(trainings, "pool"),
+        "bodies-and-seeds": partial(trainings, "seeds", "bodies"),
+        "plain-base": partial(trainings, "plain base"),
+    }.items()  # fmt: skip
+    for model in (*MODELS, "tiny"):
+        yield f"model-{model}", partial(card, model)
