@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from pdcorrect import cli
+from pdcorrect.cli import main as cli
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdcorrect import shapes
+from pdcorrect.scene import voxels as shapes
 from pdcorrect.fem.mesh import refine as cut
 from pdcorrect.fem.mesh import voxel_mesh
-from pdcorrect.state import Status, Trajectory
+from pdcorrect.state import Status
+from pdcorrect.trajectory import Trajectory
 
 
 def cross_mesh(refine=1):

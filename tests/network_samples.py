@@ -12,7 +12,7 @@ from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
 from pdcorrect.corrector.normaliser import Moments
-from pdcorrect.data.graph import mesh_edges
+from pdcorrect.fem.graph import mesh_edges
 
 SIZE, STEP = 0.1, 0.02
 

@@ -15,7 +15,8 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam, cross
-from pdcorrect import cli, report
+from pdcorrect.cli import main as cli
+from pdcorrect.evaluation import report
 
 ROOT = Path(__file__).parent.parent
 
@@ -510,7 +511,7 @@ def test_compare_with_a_model_that_is_not_there_is_bad_input(program, scene_file
 def test_compiling_is_told_of_once(tmp_path):
     """In a process of its own, whose kernels are not on disk."""
     code = (
-        "from numba import njit; from pdcorrect.cli_parts import tell_of_compiling\n"
+        "from numba import njit; from pdcorrect.cli.common import tell_of_compiling\n"
         "tell_of_compiling(); tell_of_compiling()\n"
         "for power in (2, 3):\n"
         "    njit(lambda x, p=power: x**p)(2.0)\n"

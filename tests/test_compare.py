@@ -13,8 +13,12 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli, compare_cli, refusal_text, report, run_text
-from pdcorrect.comparison_cases import HEX27, cases_for, without_best
+from pdcorrect.cli import compare as compare_cli
+from pdcorrect.cli import main as cli
+from pdcorrect.evaluation import refusal_text
+from pdcorrect.evaluation import run_text
+from pdcorrect.evaluation import report
+from pdcorrect.evaluation.comparison_cases import HEX27, cases_for, without_best
 from pdcorrect.errors import InputError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -19,7 +19,7 @@ from typer.testing import CliRunner  # noqa: E402
 
 import pdcorrect as pc  # noqa: E402
 from pdcorrect.batch.states import BatchState  # noqa: E402
-from pdcorrect.cli import app  # noqa: E402
+from pdcorrect.cli.main import app  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
@@ -965,7 +965,7 @@ def test_the_command_says_by_what_whole_rollouts_are_refused(tmp_path, monkeypat
 
 
 def test_bad_input_is_told_in_a_sentence(tmp_path, capsys, monkeypatch):
-    from pdcorrect import cli
+    from pdcorrect.cli import main as cli
 
     for arguments, message in (
         ((str(tmp_path / "none"), str(TINY)), "none: not there: expected a folder with model.json"),

@@ -22,7 +22,7 @@ from pdcorrect.corrector import model_io  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.model_io import ModelRecord, load_model, save_model  # noqa: E402
-from pdcorrect.environment import code_digest  # noqa: E402
+from pdcorrect._environment import code_digest  # noqa: E402
 from pdcorrect.errors import (  # noqa: E402
     FileFormatError,
     FileVersionError,

@@ -1265,7 +1265,7 @@ def test_a_killed_training_ends_with_the_same_bits(short, uninterrupted, tmp_pat
     (tmp_path / "c.toml").write_text(settings.to_toml())
     output = tmp_path / "out"
     call = [
-        sys.executable, "-m", "pdcorrect.cli", "train", tmp_path / "c.toml", "--data", short,
+        sys.executable, "-m", "pdcorrect.cli.main", "train", tmp_path / "c.toml", "--data", short,
         "-o", output, "--resume",
     ]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -12,7 +12,7 @@ pytest.importorskip("torch_geometric")
 from typer.testing import CliRunner  # noqa: E402
 
 import reader_samples as samples  # noqa: E402
-from pdcorrect.cli import app  # noqa: E402
+from pdcorrect.cli.main import app  # noqa: E402
 from pdcorrect.data.damage import whole_files  # noqa: E402
 from pdcorrect.data.folder import shard_paths  # noqa: E402
 from pdcorrect.data.info import dataset_info  # noqa: E402

@@ -20,7 +20,7 @@ from conftest import beam, box_mesh
 from dataset_samples import sample_config, write_dataset
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.export import export_meshgraphnet, export_vtu
-from pdcorrect.data.graph import node_means, tetrahedra
+from pdcorrect.fem.graph import node_means, tetrahedra
 from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
 from pdcorrect.data.importing import Motion, shard_from_arrays
 from pdcorrect.data.schema import write_shard

@@ -28,8 +28,8 @@ from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
-from pdcorrect.progress import FileBar, FileLines, progress_bar
-from pdcorrect.replacement import clear_parts, part_of_process
+from pdcorrect.cli.common import FileBar, FileLines, progress_bar
+from pdcorrect._files import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")
@@ -323,7 +323,7 @@ def test_the_program_says_which_splits_are_complete(program, tmp_path):
 
 
 def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, monkeypatch):
-    from pdcorrect import cli
+    from pdcorrect.cli import main as cli
     from pdcorrect.data import workers as module
 
     real = module.produce
@@ -530,7 +530,7 @@ def interrupted(config, folder, delay, workers):
     path = folder.parent / "set.toml"
     path.write_text(config.to_toml())
     command = [
-        sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", path, "-o", folder,
+        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", path, "-o", folder,
         "--workers", str(workers),
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -549,7 +549,7 @@ def interrupted(config, folder, delay, workers):
 def test_ctrl_c_ends_the_workers_without_further_words(tmp_path):
     (tmp_path / "set.toml").write_text(small(frames=200).to_toml())
     command = [
-        sys.executable, "-m", "pdcorrect.cli", "dataset", "generate", tmp_path / "set.toml",
+        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", tmp_path / "set.toml",
         "-o", tmp_path / "set", "--workers", "2",
     ]  # fmt: skip
     process = subprocess.Popen(

@@ -214,7 +214,7 @@ def shell_lines():
 
 def test_documented_commands_run(monkeypatch, example_folder, capsys):
     """In the order of the pages, few frames each, as the commands build on each other's files."""
-    from pdcorrect import cli
+    from pdcorrect.cli import main as cli
 
     lines = list(dict.fromkeys(line for _, line in shell_lines()))
     assert len(lines) >= 4

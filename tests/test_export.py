@@ -9,7 +9,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli
+from pdcorrect.cli import main as cli
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.io.stored_problem import problem_of

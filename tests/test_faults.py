@@ -24,7 +24,7 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from conftest import beam  # noqa: E402
 from dataset_configs import small  # noqa: E402
-from pdcorrect.cli import TERMINATED  # noqa: E402
+from pdcorrect.cli.main import TERMINATED  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard, stored_hashes  # noqa: E402
 from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
@@ -238,7 +238,7 @@ class Bench:
 
     def command(self):
         own = self.program.arguments(self.given, self.output)
-        return [sys.executable, "-m", "pdcorrect.cli", *map(str, own)]
+        return [sys.executable, "-m", "pdcorrect.cli.main", *map(str, own)]
 
     def environment(self, **more):
         paths = {"PYTHONPATH": os.pathsep.join(sys.path), "PDCORRECT_HOME": str(self.given)}

@@ -30,7 +30,7 @@ from fuzzing import (
     within_memory,
     within_seconds,
 )
-from pdcorrect import cli
+from pdcorrect.cli import main as cli
 from pdcorrect.errors import MeshError, PdcorrectError, SceneError
 from pdcorrect.fem.mesh import corner_jacobians
 from pdcorrect.fem.mesh_files import read_hex_mesh

@@ -19,7 +19,7 @@ from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.io.trajectory import TrajectoryWriter
-from pdcorrect.refusal_text import refused_corrections
+from pdcorrect.evaluation.refusal_text import refused_corrections
 from pdcorrect.solvers.resume import continue_from
 
 ROOT = Path(__file__).parent.parent

@@ -3,307 +3,63 @@
 import ast
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 SOURCE = Path(__file__).parent.parent / "src" / "pdcorrect"
-
-ORDER = [
-    "pdcorrect",
-    "errors",
-    "toml_text",
-    "toml_files",
-    "known_keys",
-    "explanations",
-    "home",
-    "machine",
-    "interruption",
-    "replacement",
-    "shapes",
-    "scene.regions",
-    "scene.bodies",
-    "scene.materials",
-    "scene.clamps",
-    "scene.loads",
-    "scene.scene",
-    "scene",
-    "state",
-    "fem",
-    "fem.hexahedron",
-    "fem.mesh_checks",
-    "fem.mesh",
-    "fem.mesh_files",
-    "fem.quadrature",
-    "fem.operators",
-    "fem.decomposition",
-    "fem.hyperelasticity",
-    "fem.energies",
-    "fem.blocks",
-    "fem.kernels",
-    "fem.tangent_kernels",
-    "fem.internal_modes",
-    "fem.conjugate_gradients",
-    "fem.multigrid",
-    "fem.factorisation",
-    "fem.banded",
-    "fem.selection",
-    "fem.fields",
-    "fem.loads",
-    "fem.clamps",
-    "fem.materials",
-    "fem.assembly",
-    "fem.elastic_body",
-    "fem.problem",
-    "fem.coarse_models",
-    "fem.sensitivities",
-    "fem.stress",
-    "fem.modes",
-    "solvers",
-    "solvers.linear",
-    "solvers.schemes",
-    "solvers.integrators",
-    "solvers.step",
-    "solvers.tangent_solver",
-    "solvers.first_hessian",
-    "solvers.reactions",
-    "solvers.lbfgs",
-    "solvers.newton_loop",
-    "solvers.implicit",
-    "solvers.projective",
-    "solvers.newton",
-    "solvers.step_solution",
-    "solvers.adjoint_solve",
-    "solvers.adjoint_terms",
-    "solvers.gradients",
-    "solvers.adjoint",
-    "batch",
-    "batch.decomposition",
-    "batch.energies",
-    "batch.fused",
-    "batch.tracing",
-    "batch.point_kernel",
-    "batch.points",
-    "batch.narrowing",
-    "batch.levels",
-    "batch.bodies",
-    "batch.cells",
-    "batch.material",
-    "batch.tall",
-    "batch.sharing",
-    "batch.turning",
-    "batch.elimination",
-    "batch.dense",
-    "batch.grid",
-    "batch.multigrid",
-    "batch.inverses",
-    "batch.objective",
-    "batch.recording",
-    "batch.linear_solver",
-    "batch.history",
-    "batch.minimise",
-    "batch.memory",
-    "batch.loads",
-    "batch.threads",
-    "batch.states",
-    "batch.checks",
-    "batch.stage",
-    "batch.retry",
-    "batch.stepper",
-    "batch.adjoint",
-    "torch_layer",
-    "solvers.rollout",
-    "solvers.resume",
-    "io",
-    "io.disk_space",
-    "io.superblock",
-    "io.growing_file",
-    "io.trajectory_reader",
-    "io.trajectory",
-    "io.vtk",
-    "io.stored_problem",
-    "metrics",
-    "figures.panels",
-    "figures.sheet",
-    "figures.files",
-    "figures.curves",
-    "figures.learning",
-    "figures.offscreen",
-    "figures",
-    "toml_config",
-    "data",
-    "data.config",
-    "data.families",
-    "data.plan",
-    "data.seal",
-    "data.schema",
-    "data.scene_mesh",
-    "data.hdf5_checks",
-    "data.shard_reader",
-    "data.damage",
-    "data.folder",
-    "data.missing",
-    "data.graph",
-    "data.shard_arrays",
-    "data.cache",
-    "data.sampling",
-    "data.samples",
-    "data.reader",
-    "data.statistics",
-    "data.rebuild",
-    "data.export_target",
-    "data.export",
-    "data.import_checks",
-    "data.importing",
-    "data.import_files",
-    "data.engines",
-    "data.batch_engine",
-    "data.runs",
-    "data.simulate",
-    "data.manifest",
-    "data.check_motion",
-    "data.check_file",
-    "data.twins",
-    "data.check",
-    "data.measuring",
-    "data.info",
-    "data.pictures",
-    "data.card",
-    "environment",
-    "data.produce",
-    "data.workers",
-    "data.generate",
-    "corrector",
-    "corrector.values",
-    "corrector.rotations",
-    "corrector.folds",
-    "corrector.frames",
-    "corrector.shapes",
-    "corrector.bodies",
-    "corrector.features",
-    "corrector.config",
-    "corrector.normaliser",
-    "corrector.network",
-    "corrector.corrector",
-    "corrector.contents",
-    "corrector.products",
-    "corrector.compiled_network",
-    "corrector.compiled_features",
-    "corrector.compiled",
-    "corrector.cost",
-    "corrector.model_description",
-    "corrector.model_names",
-    "corrector.model_io",
-    "corrector.placements",
-    "corrector.gate",
-    "corrector.foreign",
-    "corrector.unknown_inputs",
-    "corrector.pause",
-    "corrector.decision",
-    "corrector.recorded",
-    "corrector.batch_bodies",
-    "corrector.batch_step",
-    "corrector.batch_hybrid",
-    "corrector.single_step",
-    "corrector.hybrid",
-    "corrector.refusal_watch",
-    "corrector.released",
-    "evaluation",
-    "evaluation.resampling",
-    "evaluation.physics",
-    "evaluation.cases",
-    "evaluation.measures",
-    "evaluation.rollouts",
-    "evaluation.alone",
-    "evaluation.evaluation",
-    "evaluation.tables",
-    "evaluation.candidates",
-    "evaluation.speed",
-    "training",
-    "training.config",
-    "training.losses",
-    "training.precision",
-    "training.recordings",
-    "training.resident",
-    "training.windows",
-    "training.fitting",
-    "training.vibrations",
-    "training.scenes",
-    "training.unrolled",
-    "training.world",
-    "training.sources",
-    "training.teachers",
-    "training.lineage",
-    "training.optimisation",
-    "training.validation",
-    "training.history",
-    "training.checkpoints",
-    "training.progress",
-    "training.training",
-    "validation",
-    "validation.outcome",
-    "validation.cases",
-    "validation.records",
-    "validation.running",
-    "validation.prose",
-    "validation.page",
-    "run_text",
-    "refusal_text",
-    "comparison_cases",
-    "evaluate",
-    "report_notes",
-    "report",
-    "progress",
-    "cli_parts",
-    "simulate_cli",
-    "compare_cli",
-    "export_cli",
-    "dataset_cli",
-    "evaluation_cli",
-    "train_cli",
-    "validate_cli",
-    "cli",
-]
-"""From bottom to top: a module imports only modules above it in this list."""
+LAYERS = """
+_version errors _config _files _environment state scene fem trajectory solvers metrics figures io
+batch corrector data training evaluation cli __main__
+""".split()
+"""From the ground up: a folder, or module beside the folders, imports from those before it."""
 
 
 def module_name(path):
     parts = list(path.relative_to(SOURCE).with_suffix("").parts)
-    if parts[-1] == "__init__":
-        parts.pop()
-    return ".".join(parts) or "pdcorrect"
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in SOURCE.rglob("*.py")}
 
 
 def imported(path):
-    """Package modules that a file imports at run time (not under TYPE_CHECKING)."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    hidden = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING":
-            hidden.update(ast.walk(node))
-    for node in ast.walk(tree):
-        if node in hidden:
-            continue
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("pdcorrect"):
+    """Package modules that a file imports anywhere, for types too."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "pdcorrect":
             base = node.module.removeprefix("pdcorrect").lstrip(".")
-            for alias in node.names:
-                name = f"{base}.{alias.name}".lstrip(".")
-                yield name if name in ORDER else (base or "pdcorrect")
+            names = [f"{base}.{alias.name}".lstrip(".") for alias in node.names]
+            yield from (name if name in MODULES else base for name in names)
         elif isinstance(node, ast.Import):
-            for alias in node.names:
-                if alias.name.startswith("pdcorrect"):
-                    yield alias.name.removeprefix("pdcorrect").lstrip(".") or "pdcorrect"
+            yield from (
+                alias.name.removeprefix("pdcorrect").lstrip(".")
+                for alias in node.names
+                if alias.name.split(".")[0] == "pdcorrect"
+            )
 
 
-def test_every_module_has_its_place():
-    assert sorted(module_name(p) for p in SOURCE.rglob("*.py")) == sorted(ORDER)
+GRAPH = {name: set(imported(path)) for name, path in MODULES.items() if name}
+"""The package itself is left out: it loads what it offers when that is first used."""
 
 
-@pytest.mark.parametrize("path", sorted(SOURCE.rglob("*.py")), ids=module_name)
-def test_imports_point_one_way(path):
-    here = module_name(path)
-    for name in imported(path):
-        assert ORDER.index(name) < ORDER.index(here), f"{here} imports {name}"
+def test_every_folder_has_its_layer():
+    assert {name.split(".")[0] for name in GRAPH} == set(LAYERS)
+
+
+@pytest.mark.parametrize("name", sorted(GRAPH))
+def test_imports_run_down(name):
+    here = name.split(".")[0]
+    for other in GRAPH[name] - {""}:
+        there = other.split(".")[0]
+        assert there == here or LAYERS.index(there) < LAYERS.index(here), f"{name} uses {other}"
+
+
+def test_no_modules_import_each_other():
+    try:
+        TopologicalSorter(GRAPH).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(error.args[1]))
 
 
 def test_scikit_fem_is_imported_in_one_place():
@@ -329,7 +85,7 @@ def test_importing_the_package_loads_nothing_heavy():
 def test_help_loads_nothing_heavy():
     code = (
         "import sys; sys.argv = ['pdcorrect', '--help']\n"
-        "from pdcorrect.cli import app\n"
+        "from pdcorrect.cli.main import app\n"
         "try:\n    app()\nexcept SystemExit:\n    pass"
     )
     assert not loaded_after(code) & (HEAVY | {"numpy", "scipy", "numba", "skfem"})
@@ -348,7 +104,7 @@ def test_stepping_loads_neither_torch_nor_files_nor_pictures():
 
 
 def test_rendering_does_not_load_torch():
-    assert "torch" not in loaded_after("from pdcorrect import figures, report")
+    assert "torch" not in loaded_after("from pdcorrect import figures\nimport pdcorrect.evaluation.report")
 
 
 def test_public_names_exist():

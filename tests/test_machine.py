@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from pdcorrect.machine import total_memory
+from pdcorrect._environment import total_memory
 
 V1, V2 = "sys/fs/cgroup/memory/{}/memory.limit_in_bytes", "sys/fs/cgroup/{}/memory.max"
 MACHINE = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from block_meshes import o_grid, spokes, warped
-from pdcorrect import shapes
+from pdcorrect.scene import voxels as shapes
 from pdcorrect.errors import MeshError, SceneError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import (

@@ -13,7 +13,7 @@ import torch
 
 import pdcorrect as pc
 from hybrid_samples import fitted, problems
-from pdcorrect import refusal_text
+from pdcorrect.evaluation import refusal_text
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.foreign import (
     ForeignMeasure,
@@ -25,7 +25,7 @@ from pdcorrect.corrector.gate import Gate, Reason, refusals
 from pdcorrect.corrector.refusal_watch import Refused
 from pdcorrect.corrector.shapes import SHAPE_MEASURES, plain_measures
 from pdcorrect.corrector.unknown_inputs import UnknownInput
-from pdcorrect.refusal_text import by_name, refused_corrections, refused_rollouts
+from pdcorrect.evaluation.refusal_text import by_name, refused_corrections, refused_rollouts
 
 ROOT = Path(__file__).parent.parent
 BODY, STEP, FEATURES = int(Reason.BODY), int(Reason.TIME_STEP), int(Reason.FEATURES)

@@ -17,9 +17,10 @@ import pytest
 import pdcorrect as pc
 from conftest import beam
 from motion import assert_same, remembering, trajectory
-from pdcorrect import cli, report
+from pdcorrect.cli import main as cli
+from pdcorrect.evaluation import report
 from pdcorrect.errors import FileFormatError, InputError, OutputError
-from pdcorrect.interruption import Terminated
+from pdcorrect._files import Terminated
 from pdcorrect.io import trajectory as files
 from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
@@ -585,7 +586,7 @@ def start(*arguments, limit=None):
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     return subprocess.Popen(
-        [sys.executable, "-m", "pdcorrect.cli", *map(str, arguments)],
+        [sys.executable, "-m", "pdcorrect.cli.main", *map(str, arguments)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=restrict,
     )  # fmt: skip

@@ -10,8 +10,8 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect import cli
-from pdcorrect.refusal_text import SECTIONS
+from pdcorrect.cli import main as cli
+from pdcorrect.evaluation.refusal_text import SECTIONS
 
 weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
 

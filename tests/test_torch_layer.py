@@ -10,7 +10,7 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, problem_on
-from pdcorrect import torch_layer
+from pdcorrect.batch import layer as torch_layer
 from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import ConvergenceError, InputError
 from test_batch import VARIANTS, moving_states, on_every_device, unlike

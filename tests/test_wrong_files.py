@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 import pdcorrect as pc
-from pdcorrect import cli
+from pdcorrect.cli import main as cli
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.errors import InputError, SceneError
-from pdcorrect.explanations import WORDS
+from pdcorrect._config import WORDS
 from pdcorrect.known_keys import tables_of
 from pdcorrect.toml_files import looks_like
 

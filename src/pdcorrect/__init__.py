@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from pdcorrect._version import __version__ as __version__
 
 _HOME = {
     "Scene": "pdcorrect.scene",
@@ -23,8 +23,8 @@ _HOME = {
     "State": "pdcorrect.state",
     "Status": "pdcorrect.state",
     "StepResult": "pdcorrect.state",
-    "Stepper": "pdcorrect.state",
-    "Trajectory": "pdcorrect.state",
+    "Stepper": "pdcorrect.trajectory",
+    "Trajectory": "pdcorrect.trajectory",
     "Problem": "pdcorrect.fem.problem",
     "discretise": "pdcorrect.fem.problem",
     "coarse_model": "pdcorrect.fem.coarse_models",
@@ -35,7 +35,7 @@ _HOME = {
     "adjoint": "pdcorrect.solvers.adjoint",
     "BatchStepper": "pdcorrect.batch.stepper",
     "BatchGradients": "pdcorrect.batch.adjoint",
-    "PDLayer": "pdcorrect.torch_layer",
+    "PDLayer": "pdcorrect.batch.layer",
     "Corrector": "pdcorrect.corrector.corrector",
     "load_model": "pdcorrect.corrector.model_io",
     "save_model": "pdcorrect.corrector.model_io",
@@ -54,13 +54,13 @@ _HOME = {
     "write_vtu_series": "pdcorrect.io.vtk",
     "render": "pdcorrect.figures",
     "render_overlay": "pdcorrect.figures",
-    "compare": "pdcorrect.evaluate",
+    "compare": "pdcorrect.evaluation.compare",
 }
 _NEEDS_TORCH = (
     "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "HybridStepper", "hybrid_of",
     "BatchHybrid", "HybridLayer", "Gate", "load_model", "save_model",
 )  # fmt: skip
-_MODULES = ("metrics", "errors", "figures", "evaluate", "report")
+_MODULES = ("metrics", "errors", "figures")
 
 __all__ = [  # noqa: RUF022
     "Scene",
@@ -103,14 +103,13 @@ __all__ = [  # noqa: RUF022
     "metrics",
     "errors",
     "figures",
-    "evaluate",
-    "report",
     "__version__",
 ]
 
 if TYPE_CHECKING:
-    from pdcorrect import errors, evaluate, figures, metrics, report
+    from pdcorrect import errors, figures, metrics
     from pdcorrect.batch.adjoint import BatchGradients
+    from pdcorrect.batch.layer import PDLayer
     from pdcorrect.batch.stepper import BatchStepper
     from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
     from pdcorrect.corrector.corrector import Corrector
@@ -118,7 +117,7 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.hybrid import HybridStepper
     from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.corrector.released import hybrid_of
-    from pdcorrect.evaluate import compare
+    from pdcorrect.evaluation.compare import compare
     from pdcorrect.fem.coarse_models import coarse_model
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, discretise
@@ -132,8 +131,8 @@ if TYPE_CHECKING:
     from pdcorrect.solvers.projective import ProjectiveDynamics
     from pdcorrect.solvers.reactions import reactions
     from pdcorrect.solvers.rollout import march, restrict, rollout
-    from pdcorrect.state import State, Status, Stepper, StepResult, Trajectory
-    from pdcorrect.torch_layer import PDLayer
+    from pdcorrect.state import State, Status, StepResult
+    from pdcorrect.trajectory import Stepper, Trajectory
 
 
 def __getattr__(name: str) -> Any:

@@ -17,7 +17,7 @@ from pdcorrect.errors import InputError
 
 if TYPE_CHECKING:
     from pdcorrect.fem.problem import Problem
-    from pdcorrect.state import Trajectory
+    from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.batch.checks import check_nodal, check_state, start_times
+from pdcorrect.batch.layer import OnFailure, PDLayer
 from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
@@ -25,7 +26,6 @@ from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.corrector.recorded import UNRECORDABLE, RecordedCorrector, recordable
 from pdcorrect.errors import InputError
-from pdcorrect.torch_layer import OnFailure, PDLayer
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from pdcorrect.corrector.folds import corner_jacobians, least_by_body
 from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
 from pdcorrect.corrector.rotations import polar_rotations, turns_between
 from pdcorrect.corrector.shapes import shape_measures
-from pdcorrect.data.graph import mesh_edges, node_means
 from pdcorrect.errors import InputError
+from pdcorrect.fem.graph import mesh_edges, node_means
 from pdcorrect.fem.problem import Problem
 
 

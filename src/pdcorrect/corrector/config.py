@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
+from pdcorrect._config import Positive, PositiveCount, Strict, explained
 from pdcorrect.corrector import features
 from pdcorrect.errors import InputError
-from pdcorrect.explanations import explained
-from pdcorrect.scene.regions import Positive, PositiveCount, Strict
 
 Placement = Literal["state", "force", "guess"]
 

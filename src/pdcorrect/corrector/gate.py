@@ -9,18 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, Any
+from typing import Annotated, ClassVar
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field
 
+from pdcorrect._config import Checked, NonNegative, Number
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.values import Values, where
 from pdcorrect.errors import InputError
-from pdcorrect.explanations import explained
-from pdcorrect.scene.regions import NonNegative, Number, Strict
 
 
 class Reason(IntEnum):
@@ -67,7 +66,7 @@ class Measured:
     work: Values
 
 
-class Gate(Strict):
+class Gate(Checked):
     """When a correction is refused; None switches a test off.
 
     The body at rest is tested first, and the time step: a scene that is refused by them is so in
@@ -156,11 +155,7 @@ class Gate(Strict):
     limit: bool = False
     pause: Annotated[int, Field(strict=True, ge=0)] = 5
 
-    def __init__(self, /, **values: Any) -> None:
-        try:
-            super().__init__(**values)
-        except ValidationError as error:
-            raise InputError(f"gate: {explained(error, Gate)}") from None
+    source: ClassVar[str] = "gate"
 
     def foreign(self, corrector: Answers, bodies: BodyGraph) -> Values:
         """Why scenes are refused in all steps, by their bodies at rest or time steps.

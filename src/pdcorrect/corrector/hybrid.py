@@ -30,7 +30,8 @@ from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.corrector.unknown_inputs import UnknownInput, unknown_inputs
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.implicit import ImplicitStepper
-from pdcorrect.state import State, StepResult, Trajectory
+from pdcorrect.state import State, StepResult
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 from pydantic import Field, JsonValue, ValidationError
 
-from pdcorrect import __version__
+from pdcorrect._config import Strict
+from pdcorrect._environment import code_digest
+from pdcorrect._version import __version__
 from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.environment import code_digest
 from pdcorrect.errors import FileFormatError, FileVersionError
-from pdcorrect.scene.regions import Strict
 
 FORMAT = "pdcorrect-model"
 VERSION = 5
@@ -40,7 +40,7 @@ class ModelRecord(Strict):
     training, metrics
         Settings of the training, and what the model achieved; any JSON with finite numbers.
     code_version, code_digest
-        Of the code that made it, see `pdcorrect.environment.code_digest`.
+        Of the code that made it, see `pdcorrect._environment.code_digest`.
     """
 
     dataset: str

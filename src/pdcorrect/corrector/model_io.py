@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.cost import parameters
 from pdcorrect.corrector.model_description import (
@@ -29,7 +30,6 @@ from pdcorrect.corrector.model_description import (
 )
 from pdcorrect.corrector.model_names import model_folder, models_folder, unlike_ends
 from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
-from pdcorrect.replacement import make_folder, part_of_process, replacing
 
 require_extra("safetensors", "learn")
 

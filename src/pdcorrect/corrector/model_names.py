@@ -6,9 +6,9 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from pdcorrect._environment import home_folder
 from pdcorrect.corrector.model_description import DESCRIPTION, WEIGHTS
 from pdcorrect.errors import InputError
-from pdcorrect.home import home_folder
 
 _EXPECTED = f"expected a folder with {DESCRIPTION} and {WEIGHTS}"
 

@@ -6,14 +6,20 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from pdcorrect.scene.regions import Count, NonNegative, Poisson, Positive, PositiveCount, Strict
-from pdcorrect.toml_config import TomlConfig
-from pdcorrect.toml_files import DATASET
-from pdcorrect.toml_text import as_toml
+from pdcorrect._config import (
+    Count,
+    NonNegative,
+    Poisson,
+    Positive,
+    PositiveCount,
+    Strict,
+    TomlConfig,
+    as_toml,
+)
 
 FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch"]
@@ -178,8 +184,6 @@ class DatasetConfig(TomlConfig):
         On so many meshes of the evaluation split, a run with cells half as long as the
         reference's tells how exact it is.
     """
-
-    kind: ClassVar[str] = DATASET
 
     name: Name
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]

@@ -11,16 +11,16 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import replacing, write_text
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.export_target import SIMULATOR, placed, staging_folder
 from pdcorrect.data.folder import shard_paths, splits_of
-from pdcorrect.data.graph import node_means, tetrahedra, velocities
 from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, OutputError
+from pdcorrect.fem.graph import node_means, tetrahedra, velocities
 from pdcorrect.io.vtk import write_vtu_series
-from pdcorrect.replacement import replacing, write_text
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 NORMAL, HANDLE = 0, 3
 """Types of nodes, ``NodeType`` in google-deepmind/deepmind-research, meshgraphnets/common.py."""

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import h5py
 
+from pdcorrect._files import make_folder
 from pdcorrect.errors import OutputError
-from pdcorrect.replacement import make_folder
 
 SIMULATOR = "pdcorrect"
 """In ``meta.json``."""

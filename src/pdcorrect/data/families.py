@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pdcorrect._config import as_toml
 from pdcorrect.data.config import FamilyName
 from pdcorrect.errors import InputError
-from pdcorrect.toml_text import as_toml
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 Shape = dict[str, Any]

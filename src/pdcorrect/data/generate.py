@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 
+from pdcorrect._files import clear_parts, make_folder, write_text
 from pdcorrect.data.config import TRAINING, DatasetConfig
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.manifest import manifest_content
@@ -27,7 +28,6 @@ from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.statistics import compute_statistics, load_statistics
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, mapped
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
-from pdcorrect.replacement import clear_parts, make_folder, write_text
 
 _MOST_DIFFERENCES = 5
 """Keys of another configuration that are told."""

@@ -20,7 +20,7 @@ from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.io.trajectory import load_trajectory
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[Any]
 

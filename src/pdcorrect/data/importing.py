@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pdcorrect.data.graph import velocities
 from pdcorrect.data.import_checks import (
     bool_array,
     check_moduli,
@@ -26,6 +25,7 @@ from pdcorrect.data.import_checks import (
 from pdcorrect.data.scene_mesh import portable
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.errors import InputError
+from pdcorrect.fem.graph import velocities
 from pdcorrect.fem.hexahedron import (
     VTK_CORNERS,
     gauss_points,

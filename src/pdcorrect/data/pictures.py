@@ -15,7 +15,7 @@ from pdcorrect.errors import InputError, require_extra
 from pdcorrect.figures.files import Image, replacing, write_png
 from pdcorrect.figures.panels import Body, Painter, View, shown_points
 from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _COLUMNS, _WIDTH, _FONT = 4, 420, 19

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pdcorrect._config import as_toml
 from pdcorrect.data.config import (
     EVALUATION,
     TRAINING,
@@ -26,7 +27,6 @@ from pdcorrect.data.config import (
 from pdcorrect.data.families import PUBLISHED, Box, Design, count_bodies, draw, extreme
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
-from pdcorrect.toml_text import as_toml
 
 _DRAWS = 10_000
 """Bodies that are drawn for a mesh before giving up on one that is not there yet."""

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numba
 
+from pdcorrect._environment import code_digest, environment
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.schema import SUFFIX, write_shard
 from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.environment import code_digest, environment
 from pdcorrect.errors import require_extra
 
 LARGEST_BATCHED = 150_000

@@ -39,9 +39,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import part_of_process, replacing
 from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.replacement import part_of_process, replacing
 
 REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"
 """Runs: the truth, and the coarse models, see `pdcorrect.fem.coarse_models`."""

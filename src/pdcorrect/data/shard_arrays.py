@@ -14,10 +14,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.graph import mesh_edges, node_means, velocities
 from pdcorrect.data.hdf5_checks import RefusalError, words
 from pdcorrect.data.schema import HASH, MESH, REFERENCE
 from pdcorrect.data.shard_reader import opened
+from pdcorrect.fem.graph import mesh_edges, node_means, velocities
 
 Array = NDArray[Any]
 

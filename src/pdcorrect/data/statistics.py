@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import ctrl_c_ignored, write_text
 from pdcorrect.data.config import TRAINING
 from pdcorrect.data.damage import Damage, whole_files
 from pdcorrect.data.folder import shard_paths
@@ -29,8 +30,6 @@ from pdcorrect.data.shard_arrays import (
     read_header,
 )
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.interruption import ctrl_c_ignored
-from pdcorrect.replacement import write_text
 
 VERSION = 1
 _FILES_A_PROCESS = 16

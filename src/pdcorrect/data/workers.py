@@ -15,11 +15,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pdcorrect._files import ctrl_c_ignored
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.produce import produce
 from pdcorrect.errors import InputError, require_extra
-from pdcorrect.interruption import ctrl_c_ignored
 
 _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
-from pdcorrect.data.graph import velocities
 from pdcorrect.evaluation.rollouts import LOST, Rollout
+from pdcorrect.fem.graph import velocities
 from pdcorrect.state import State, StepResult
 
 Array = NDArray[np.float64]

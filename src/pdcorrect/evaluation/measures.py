@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
-from pdcorrect.data.graph import velocities
 from pdcorrect.data.schema import CONVERGED, PLAIN
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.evaluation.cases import Case
 from pdcorrect.evaluation.physics import energies, stress_error
+from pdcorrect.fem.graph import velocities
 from pdcorrect.metrics import (
     angular_momentum,
     error_over_time,

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.graph import velocities
+from pdcorrect.fem.graph import velocities
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.stress import stress
 from pdcorrect.metrics import EnergyBalance

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.data.graph import velocities
+from pdcorrect.fem.graph import velocities
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.evaluation.evaluation import EvaluatedRun, Evaluation
 from pdcorrect.evaluation.measures import TrajectoryMeasures
 from pdcorrect.evaluation.resampling import SeedSummary, Summary, over_seeds, summarise
-from pdcorrect.replacement import make_folder, write_text
 
 VERSION = 2
 """Of ``summary.json``; in 1, "gate" says only whether there was one."""

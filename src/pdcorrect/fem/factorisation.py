@@ -20,10 +20,10 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
+from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError
 from pdcorrect.fem.conjugate_gradients import NotPositiveDefinite as NotPositiveDefinite
 from pdcorrect.fem.conjugate_gradients import conjugate_gradients
-from pdcorrect.machine import total_memory
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "band", "cholespy", "splu", "amg"]

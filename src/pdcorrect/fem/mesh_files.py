@@ -11,10 +11,10 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import replacing
 from pdcorrect.errors import MeshError, OutputError
 from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, HexMesh
 from pdcorrect.fem.mesh_checks import TOLERANCE
-from pdcorrect.replacement import replacing
 
 _HEXAHEDRA = ("hexahedron", "hexahedron20", "hexahedron27")
 """Cells that are read; of the second-order ones, the corners."""

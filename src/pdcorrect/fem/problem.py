@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError, MeshError, SceneError
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.clamps import Clamps, resolve_clamps
@@ -22,7 +23,6 @@ from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
 from pdcorrect.fem.selection import Selector
-from pdcorrect.machine import total_memory
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene
 from pdcorrect.state import State
 

@@ -26,7 +26,7 @@ from pdcorrect.figures.files import Image, replacing, write_film, write_png
 from pdcorrect.figures.offscreen import check_offscreen
 from pdcorrect.figures.panels import Body, Painter, View, shown_points
 from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 __all__ = [
     "check_offscreen",

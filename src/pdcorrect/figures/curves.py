@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, require_extra
 from pdcorrect.figures.files import replacing
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pdcorrect import replacement
+from pdcorrect import _files as replacement
 from pdcorrect.errors import InputError, OutputError, require_extra
 
 Image = NDArray[np.uint8]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import require_extra
 from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

@@ -22,10 +22,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import part_of, replacing
 from pdcorrect.errors import OutputError
 from pdcorrect.io.disk_space import Reserve, abandon
 from pdcorrect.io.superblock import read_superblock
-from pdcorrect.replacement import part_of, replacing
 
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
 _FILL: dict[str, Any] = {"f": np.nan, "i": -1, "S": b""}

@@ -8,7 +8,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import DENSITY_CHANGED
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 _ROUNDING = 1e-9
 """Of a cell size: the same mesh, made on another machine."""

@@ -18,7 +18,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect import __version__
+from pdcorrect._files import part_of, replacing
+from pdcorrect._version import __version__
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.growing_file import Column, Content, GrowingFile
 from pdcorrect.io.trajectory_reader import (
@@ -29,8 +30,8 @@ from pdcorrect.io.trajectory_reader import (
     read_storage,
     trajectory_fault,
 )
-from pdcorrect.replacement import part_of, replacing
-from pdcorrect.state import State, StepResult, Trajectory
+from pdcorrect.state import State, StepResult
+from pdcorrect.trajectory import Trajectory
 
 __all__ = ["TrajectoryWriter", "load_trajectory", "save_trajectory"]
 

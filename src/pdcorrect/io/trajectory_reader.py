@@ -12,7 +12,8 @@ import numpy as np
 
 from pdcorrect.errors import FileFormatError
 from pdcorrect.io.superblock import RepairedFile, Superblock, read_superblock
-from pdcorrect.state import Status, Trajectory
+from pdcorrect.state import Status
+from pdcorrect.trajectory import Trajectory
 
 FORMAT = "pdcorrect-trajectory"
 VERSION = 1

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect._files import make_folder, write_bytes
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.stress import stress, von_mises
-from pdcorrect.replacement import make_folder, write_bytes
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Data = Callable[[int], Mapping[str, Array]]

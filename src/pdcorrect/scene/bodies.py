@@ -8,8 +8,8 @@ from typing import Annotated, Literal, Union
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from pdcorrect import shapes
-from pdcorrect.scene.regions import Cells, Count, Positive, PositiveCount, Strict, Vector
+from pdcorrect._config import Cells, Count, Positive, PositiveCount, Strict, Vector
+from pdcorrect.scene import voxels as shapes
 
 
 class _VoxelBody(Strict):

@@ -6,7 +6,8 @@ from itertools import pairwise
 
 from pydantic import Field, model_validator
 
-from pdcorrect.scene.regions import Axis, Number, Region, Strict, Vector
+from pdcorrect._config import Axis, Number, Strict, Vector
+from pdcorrect.scene.regions import Region
 
 
 class Motion(Strict):

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Union
 
 from pydantic import Field, model_validator
 
-from pdcorrect.scene.regions import NonNegative, Number, Region, Strict, Vector
-from pdcorrect.toml_text import as_toml
+from pdcorrect._config import NonNegative, Number, Strict, Vector, as_toml
+from pdcorrect.scene.regions import Region
 
 
 class _Load(Strict):

@@ -7,7 +7,8 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.scene.regions import Poisson, Positive, Region, Strict
+from pdcorrect._config import Poisson, Positive, Strict
+from pdcorrect.scene.regions import Region
 
 Energy = Literal[
     "corotated", "corotated-only", "arap", "volume-only", "neo-hookean", "st-venant-kirchhoff"

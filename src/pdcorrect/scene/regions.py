@@ -1,4 +1,4 @@
-"""Number types that all sections share, and `Region`."""
+"""`Region`: a set of points of a body."""
 
 from __future__ import annotations
 
@@ -6,26 +6,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from pdcorrect._config import Axis, Count, Number, Positive, Strict, Vector, as_toml
 from pdcorrect.errors import SceneError
-from pdcorrect.toml_text import as_toml
-
-Axis = Literal["x", "y", "z"]
-Number = Annotated[float, Field(strict=True, ge=-1e30, le=1e30)]
-Count = Annotated[int, Field(strict=True, ge=0, le=10**9)]
-PositiveCount = Annotated[int, Field(strict=True, ge=1, le=10**9)]
-Positive = Annotated[float, Field(strict=True, gt=0, le=1e30)]
-NonNegative = Annotated[float, Field(strict=True, ge=0, le=1e30)]
-Poisson = Annotated[float, Field(strict=True, ge=0, lt=0.5)]
-Vector = tuple[Number, Number, Number]
-Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
-
-
-class Strict(BaseModel):
-    """Base of all sections: unknown keys, infinite and NaN numbers are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Region(Strict):

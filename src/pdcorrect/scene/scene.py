@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-import tomli_w
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
+from pdcorrect._config import NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.errors import InputError, SceneError
-from pdcorrect.explanations import Location, explained
 from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
-from pdcorrect.scene.regions import NonNegative, Positive, PositiveCount, Strict
-from pdcorrect.toml_files import SCENE, read_tables, read_text
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
@@ -80,7 +77,7 @@ class Solver(Strict):
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
 
 
-class Scene(Strict):
+class Scene(TomlConfig):
     """A body, its material, how it is held and loaded, and for how long.
 
     Examples
@@ -106,11 +103,11 @@ class Scene(Strict):
     loads: tuple[Load, ...] = ()
     solver: Solver = Solver()
 
+    source: ClassVar[str] = "scene"
+    error: ClassVar[type[InputError]] = SceneError
+
     def __init__(self, /, **data: Any) -> None:
-        try:
-            super().__init__(**{key: _plain(value) for key, value in data.items()})
-        except ValidationError as error:
-            raise SceneError(f"scene: {explained(error, Scene, _key)}") from None
+        super().__init__(**{key: _plain(value) for key, value in data.items()})
 
     @field_validator("name")
     @classmethod
@@ -126,29 +123,13 @@ class Scene(Strict):
         Raises
         ------
         SceneError
-            If the file cannot be read, is not TOML, looks like something else, or is not a valid
-            scene.
+            If the file cannot be read, is not TOML, or is not a valid scene.
         """
-        text, path = read_text(path, SCENE, SceneError), Path(path)
-        scene = cls.from_toml(text, source=str(path))
+        scene = super().load(path)
         if isinstance(scene.body, MeshFile):  # relative to the scene file, from now on absolute
-            found = (path.parent / scene.body.path).resolve()
+            found = (Path(path).parent / scene.body.path).resolve()
             scene = scene.with_changes(body={"path": found})
         return scene
-
-    @classmethod
-    def from_toml(cls, text: str, source: str = "scene") -> Scene:
-        """Read a scene from TOML text; ``source`` names it in messages."""
-        data = read_tables(text, SCENE, source, SceneError)
-        try:
-            return cls(**data)
-        except SceneError as error:
-            raise SceneError(str(error).replace("scene:", f"{source}:", 1)) from None
-
-    def to_toml(self) -> str:
-        """The scene as TOML, with every default written out."""
-        data = self.model_dump(mode="json", exclude_none=True, by_alias=True)
-        return tomli_w.dumps(data)
 
     def with_changes(self, **sections: Any) -> Scene:
         """The same scene with some sections' keys replaced.
@@ -240,14 +221,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(part) for part in value]
     return value
-
-
-def _key(location: Location) -> str:
-    """Dotted key as the user wrote it: pydantic also names the union member it chose."""
-    parts = [str(part) for part in location]
-    tag_at = {"body": 1, "loads": 2}.get(parts[0], len(parts)) if parts else 0
-    parts = parts[:tag_at] + parts[tag_at + 1 :]
-    if len(parts) > 1 and parts[-2] == "at":
-        parts.pop()
-    text = "".join(f"[{part}]" if part.isdigit() else f".{part}" for part in parts)
-    return text.lstrip(".") or "the scene"

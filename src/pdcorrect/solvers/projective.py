@@ -18,7 +18,8 @@ from pdcorrect.solvers.implicit import ImplicitStepper, whole
 from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve, minimise
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory
-from pdcorrect.state import State, Status, StepResult, Trajectory
+from pdcorrect.state import State, Status, StepResult
+from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Method = Literal["lbfgs", "local-global"]

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from pdcorrect._config import parse_toml
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.rollout import run_attributes
-from pdcorrect.state import State, Stepper, Trajectory
-from pdcorrect.toml_text import parse_toml
+from pdcorrect.state import State
+from pdcorrect.trajectory import Stepper, Trajectory
 
 _SHOWN = 4
 _NONE = "nothing"

@@ -13,7 +13,8 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import whole
-from pdcorrect.state import State, Stepper, StepResult, Trajectory
+from pdcorrect.state import State, StepResult
+from pdcorrect.trajectory import Stepper, Trajectory
 
 Array = NDArray[np.float64]
 OnStep = Callable[[StepResult, float], None]

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect._environment import total_memory
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.factorisation import (
     MEMORY_SHARE,
@@ -22,7 +23,6 @@ from pdcorrect.fem.factorisation import (
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.problem import Problem
-from pdcorrect.machine import total_memory
 from pdcorrect.solvers.step import StepObjective
 
 Array = NDArray[np.float64]

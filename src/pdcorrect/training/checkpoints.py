@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pdcorrect._files import part_of_process, replacing
 from pdcorrect.errors import FileFormatError, FileVersionError, OutputError, require_extra
-from pdcorrect.replacement import part_of_process, replacing
 
 require_extra("safetensors", "learn")
 

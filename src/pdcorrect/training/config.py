@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -17,12 +17,10 @@ from pydantic import (
 )
 from pydantic.config import JsonDict
 
+from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.corrector.config import PRESETS, CorrectorConfig, changed
 from pdcorrect.data.config import TRAINING, VALIDATION
 from pdcorrect.fem.coarse_models import Base
-from pdcorrect.scene.regions import Count, NonNegative, Positive, PositiveCount, Strict
-from pdcorrect.toml_config import TomlConfig
-from pdcorrect.toml_files import TRAINING as KIND
 
 _FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
@@ -331,8 +329,6 @@ class TrainingConfig(TomlConfig):
     workers
         Processes that read windows ahead.
     """
-
-    kind: ClassVar[str] = KIND
 
     corrector: Architecture = Architecture()
     start_from: ModelName | None = None

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from pdcorrect._config import Strict, as_toml
 from pdcorrect.errors import InputError
-from pdcorrect.scene.regions import Strict
-from pdcorrect.toml_text import as_toml
 from pdcorrect.training.config import Every, TrainingConfig
 
 

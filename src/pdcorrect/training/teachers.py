@@ -6,10 +6,10 @@ from typing import Literal
 
 import torch
 
+from pdcorrect._config import as_toml
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import LoadedModel, load_model
 from pdcorrect.errors import InputError
-from pdcorrect.toml_text import as_toml
 from pdcorrect.training.config import TrainingConfig
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import LoadedModel, ModelRecord, save_model, weights_digest
@@ -23,7 +24,6 @@ from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.missing import check_whole
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.config import Stage, TrainingConfig
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from pdcorrect.environment import code_digest
+from pdcorrect._environment import code_digest, home_folder
 from pdcorrect.errors import InputError
-from pdcorrect.home import home_folder
 from pdcorrect.validation.outcome import Expectations, Outcome, read_expectations
 
 CODE, EXPECTED, README, INPUTS = "run.py", "expected.json", "README.md", "inputs.txt"

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from pdcorrect._config import NonNegative, Number, Strict
 from pdcorrect.errors import InputError
-from pdcorrect.scene.regions import NonNegative, Number, Strict
 
 Figure = float | str
 """A number, or a status by name."""

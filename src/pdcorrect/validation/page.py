@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.errors import OutputError
-from pdcorrect.replacement import make_folder, write_text
 from pdcorrect.validation.cases import ValidationCase
 from pdcorrect.validation.outcome import Figure
 from pdcorrect.validation.prose import as_html, without_links

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pdcorrect.replacement import write_text
+from pdcorrect._files import write_text
 from pdcorrect.validation.outcome import Figure, Outcome, Table, finite
 
 

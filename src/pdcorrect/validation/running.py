@@ -10,9 +10,9 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from pdcorrect.environment import environment
+from pdcorrect._environment import environment
+from pdcorrect._files import clear_parts, make_folder, write_bytes, write_text
 from pdcorrect.errors import InputError, PdcorrectError
-from pdcorrect.replacement import clear_parts, make_folder, write_bytes, write_text
 from pdcorrect.validation.cases import Parts, ValidationCase
 from pdcorrect.validation.outcome import Outcome, missing, outside
 from pdcorrect.validation.records import PartRecord, Record, load, save, table_csv

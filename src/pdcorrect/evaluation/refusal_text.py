@@ -222,7 +222,7 @@ def _of_the_inputs(inputs: Sequence[UnknownInput], frame: int) -> list[str]:
 
 def _deviations(excess: float) -> str:
     """Also where it is not a number."""
-    from pdcorrect.run_text import three_digits
+    from pdcorrect.evaluation.run_text import three_digits
 
     return "no number" if math.isinf(excess) else three_digits(excess)
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from pdcorrect.cli_parts import FAILED, Frames, SceneFile, check_models, say, tell_of_compiling
+from pdcorrect.cli.common import FAILED, Frames, SceneFile, check_models, say, tell_of_compiling
 from pdcorrect.errors import require_extra
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pdcorrect.evaluate import Case, Comparison
+    from pdcorrect.evaluation.compare import Case, Comparison
     from pdcorrect.scene import Scene
     from pdcorrect.state import StepResult
 
@@ -55,9 +55,9 @@ def compare(
     have learned from, and the coarse models that they correct are compared too.  Exit status 1 if
     a solver failed; the report then has the others, unless it was the fine run.
     """
-    from pdcorrect import report
-    from pdcorrect.evaluate import cases_for
-    from pdcorrect.replacement import make_folder
+    from pdcorrect._files import make_folder
+    from pdcorrect.evaluation import report
+    from pdcorrect.evaluation.compare import cases_for
     from pdcorrect.scene import Scene
 
     if figures:
@@ -86,8 +86,8 @@ def compare(
 
 def _run(scene: Scene, count: int, cases: Sequence[Case]) -> Comparison:
     """The comparison, with a bar for each case."""
-    from pdcorrect import evaluate
-    from pdcorrect.progress import progress_bar
+    from pdcorrect.cli.common import progress_bar
+    from pdcorrect.evaluation import compare as evaluate
 
     with progress_bar() as progress:
         tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases[::-1]}
@@ -109,7 +109,7 @@ def _print_table(comparison: Comparison) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pdcorrect import report
+    from pdcorrect.evaluation import report
 
     console = Console()
     if not console.is_terminal:  # a file or a pipe, which has no width

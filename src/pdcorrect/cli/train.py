@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli_parts import tell_of_compiling
+from pdcorrect.cli.common import tell_of_compiling
 
 if TYPE_CHECKING:
     from pdcorrect.training.progress import Progress
@@ -47,7 +47,7 @@ def train(
 ) -> None:
     """Train a corrector; the best model is in OUTPUT/model (extra 'learn').
 
-    Several processes: torchrun --nproc-per-node N -m pdcorrect.cli train ...
+    Several processes: torchrun --nproc-per-node N -m pdcorrect.cli.main train ...
     Exit status 1 if time was up before the end.
     """
     import time
@@ -83,8 +83,8 @@ def train(
     told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
+        from pdcorrect.cli.evaluate import evaluate as judge
         from pdcorrect.corrector.model_io import unlike_ends
-        from pdcorrect.evaluation_cli import evaluate as judge
 
         several = unlike_ends([folder.resolve() for folder in data]) if len(data) > 1 else [""]
         for folder, name in zip(data, several, strict=True):

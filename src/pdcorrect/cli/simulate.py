@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli_parts import Frames, SceneFile, check_models, say, tell_of_compiling
+from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
+from pdcorrect.cli.common import Frames, SceneFile, check_models, say, tell_of_compiling
 from pdcorrect.errors import InputError
-from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated
 
 if TYPE_CHECKING:
     from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.rollout import StepLog
-    from pdcorrect.state import State, Stepper, Trajectory
+    from pdcorrect.state import State
+    from pdcorrect.trajectory import Stepper, Trajectory
 
 
 class SolverName(StrEnum):
@@ -52,8 +53,8 @@ def simulate(
     ] = False,
 ) -> None:
     """Run one scene and write its trajectory, frame by frame."""
+    from pdcorrect._files import make_folder
     from pdcorrect.io.trajectory import load_trajectory
-    from pdcorrect.replacement import make_folder
     from pdcorrect.scene import Scene
 
     if resume and overwrite:
@@ -105,14 +106,14 @@ def _make_stepper(
         from pdcorrect.corrector.released import hybrid_of
 
         return hybrid_of(scene, model, gate=gate).prepare()
-    from pdcorrect.evaluate import make_stepper
+    from pdcorrect.evaluation.compare import make_stepper
 
     return make_stepper(scene, solver.value, refine)
 
 
 def _told_of_model(stepper: Stepper) -> str:
     """Which model corrects, and whether it knows the scene's integrator; empty without one."""
-    from pdcorrect.run_text import foreign_integrator
+    from pdcorrect.evaluation.run_text import foreign_integrator
 
     about = getattr(stepper, "origin", None)
     if not about:
@@ -148,8 +149,8 @@ def _run(
 
     Second: what a gate refused; None of plain steppers.
     """
+    from pdcorrect.cli.common import progress_bar
     from pdcorrect.io.trajectory import TrajectoryWriter
-    from pdcorrect.progress import progress_bar
     from pdcorrect.solvers.resume import continue_from
     from pdcorrect.solvers.rollout import StepLog, march, run_attributes
 
@@ -196,7 +197,7 @@ def _watch(stepper: Stepper, state: State, frame: int) -> RefusalWatch | None:
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
-    from pdcorrect.run_text import inverted_frames, three_digits
+    from pdcorrect.evaluation.run_text import inverted_frames, three_digits
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
@@ -235,7 +236,7 @@ def _described(stepper: Stepper) -> dict[str, str]:
 
 def _corrections(stats: dict[str, Any], refused: Refused | None) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
-    from pdcorrect.refusal_text import refused_corrections
+    from pdcorrect.evaluation.refusal_text import refused_corrections
 
     if refused is None:
         return

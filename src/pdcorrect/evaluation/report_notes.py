@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdcorrect.evaluate import Comparison, Row
+from pdcorrect.evaluation.compare import Comparison, Row
+from pdcorrect.evaluation.refusal_text import by_name, refused_corrections
+from pdcorrect.evaluation.run_text import foreign_integrator, inverted_frames
 from pdcorrect.metrics import energy_balance, largest_displacement
-from pdcorrect.refusal_text import by_name, refused_corrections
-from pdcorrect.run_text import foreign_integrator, inverted_frames
 from pdcorrect.scene import Scene
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 
 def notes(comparison: Comparison) -> list[str]:

@@ -1,43 +1,15 @@
-"""The program ``pdcorrect``.  Each command imports what it needs when it runs."""
+"""The command ``pdcorrect render``."""
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
 
-from pdcorrect import (
-    compare_cli,
-    dataset_cli,
-    evaluation_cli,
-    export_cli,
-    simulate_cli,
-    train_cli,
-    validate_cli,
-)
-from pdcorrect.cli_parts import BAD_INPUT, FAILED, say
-from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
-from pdcorrect.interruption import INTERRUPTED, TERMINATED, Terminated, terminable
-
-__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "TERMINATED", "app", "main"]
-
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
-)
-
-app.command()(simulate_cli.simulate)
-app.command()(compare_cli.compare)
-app.command()(export_cli.export)
-app.add_typer(dataset_cli.app, name="dataset")
-app.command()(evaluation_cli.evaluate)
-app.command()(train_cli.train)
-app.command()(validate_cli.validate)
+from pdcorrect.cli.common import say
+from pdcorrect.errors import InputError
 
 
 class Colour(StrEnum):
@@ -48,7 +20,6 @@ class Colour(StrEnum):
     none = "none"
 
 
-@app.command()
 def render(
     runs: Annotated[list[Path], typer.Argument(help="Trajectory files.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture: .png, .gif or .mp4.")],
@@ -94,47 +65,3 @@ def render(
             fps=fps,
         )
     say(f"wrote {output}")
-
-
-@app.command()
-def doctor() -> None:
-    """Show versions, threads, factorisations, GPU and whether rendering works."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from pdcorrect import environment
-
-    checks = environment.doctor()
-    table = Table("what", "found", "")
-    for check in checks:
-        table.add_row(check.name, check.found, "ok" if check.ok else "PROBLEM")
-    Console().print(table)
-    if not all(check.ok for check in checks):
-        raise typer.Exit(FAILED)
-
-
-def main() -> None:
-    """Entry point: one paragraph and an exit status instead of a traceback."""
-    try:
-        with terminable():
-            app()
-    except Terminated:
-        typer.echo("stopped by SIGTERM", err=True)
-        sys.exit(TERMINATED)
-    except ConvergenceError as error:
-        _stop(str(error), FAILED)
-    except OutputError as error:
-        _stop(str(error), FAILED)
-    except PdcorrectError as error:
-        _stop(str(error), BAD_INPUT)
-    except MemoryError:
-        _stop("not enough memory: use a smaller --refine.", FAILED)
-
-
-def _stop(message: str, status: int) -> None:
-    typer.echo(f"error: {message}", err=True)
-    sys.exit(status)
-
-
-if __name__ == "__main__":
-    main()

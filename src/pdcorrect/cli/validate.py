@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
-from pdcorrect.cli_parts import tell_of_compiling
+from pdcorrect.cli.common import tell_of_compiling
 
 if TYPE_CHECKING:
     from pdcorrect.validation.cases import ValidationCase
@@ -69,7 +69,7 @@ def validate(
 def _run(
     cases: list[ValidationCase], output: Path, quick: bool, again: bool, draw: bool
 ) -> list[Section]:
-    from pdcorrect.progress import progress_bar
+    from pdcorrect.cli.common import progress_bar
     from pdcorrect.validation.page import Section
     from pdcorrect.validation.running import run_case
 

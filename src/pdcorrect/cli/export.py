@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pdcorrect.cli_parts import say
+from pdcorrect.cli.common import say
 from pdcorrect.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
     from pdcorrect.fem.problem import Problem
-    from pdcorrect.state import Trajectory
+    from pdcorrect.trajectory import Trajectory
 
 
 def export(
@@ -33,8 +33,8 @@ def export(
     Points have displacement, velocity, stress and von Mises stress, cells von Mises stress and the
     smallest det F.  An older series of the same run in the folder is replaced.
     """
+    from pdcorrect._files import make_folder
     from pdcorrect.io.vtk import write_vtu_series
-    from pdcorrect.replacement import make_folder
 
     loaded = _loaded(run, salvage)
     make_folder(output)

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdcorrect import metrics
-from pdcorrect.comparison_cases import (
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.evaluation.comparison_cases import (
     CASES,
     Case,
     cases_for,
@@ -18,14 +19,14 @@ from pdcorrect.comparison_cases import (
     check_corrected,
     without_best,
 )
-from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
-from pdcorrect.state import Status, Stepper, StepResult, Trajectory
+from pdcorrect.state import Status, StepResult
+from pdcorrect.trajectory import Stepper, Trajectory
 
 if TYPE_CHECKING:
     from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli_parts import tell_of_compiling
+from pdcorrect.cli.common import tell_of_compiling
 
 if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
@@ -83,7 +83,7 @@ def evaluate(
 
 def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) -> list[str]:
     """What a reader of the numbers has to know."""
-    from pdcorrect.refusal_text import by_name
+    from pdcorrect.evaluation.refusal_text import by_name
 
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
@@ -118,7 +118,7 @@ def _refused(one: SavedCandidate, found: Evaluation, gate: Gate | None) -> list[
 
     from pdcorrect.corrector.foreign import foreign_measures, foreign_step
     from pdcorrect.corrector.refusal_watch import Refused
-    from pdcorrect.refusal_text import refused_rollouts
+    from pdcorrect.evaluation.refusal_text import refused_rollouts
 
     run, normaliser = found.runs[one.candidate.name], one.model.corrector.normaliser
     refused = Refused(
@@ -158,7 +158,7 @@ def _record(
 ) -> dict[str, Any]:
     import datetime
 
-    from pdcorrect.environment import code_digest, environment
+    from pdcorrect._environment import code_digest, environment
 
     return {
         "date": datetime.date.today().isoformat(),

@@ -1,80 +1,29 @@
-"""What a result was made with: hardware, threads and versions; and `doctor`'s checks."""
+"""The command ``pdcorrect doctor``: what the package can use on this machine."""
 
 from __future__ import annotations
 
-import functools
-import hashlib
-import importlib.metadata
 import importlib.util
 import os
-import platform
 from dataclasses import dataclass
-from pathlib import Path
 
-import pdcorrect
-from pdcorrect import __version__
+import typer
 
-_PACKAGES = (
-    "numpy", "scipy", "scikit-fem", "numba", "cholespy", "pyamg", "meshio", "h5py", "pydantic",
-    "pyvista", "vtk", "matplotlib", "torch", "torch-geometric",
-)  # fmt: skip
+from pdcorrect._environment import processor, threads, versions
+from pdcorrect.cli.common import FAILED
 
 
-def versions() -> dict[str, str]:
-    """Installed version of each package that matters, "missing" where there is none."""
-    found = {"pdcorrect": __version__, "python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "missing"
-    return found
+def doctor() -> None:
+    """Show versions, threads, factorisations, GPU and whether rendering works."""
+    from rich.console import Console
+    from rich.table import Table
 
-
-def processor() -> str:
-    """Model name of the processor."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as lines:
-            for line in lines:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
-
-
-def threads() -> int:
-    """Threads that the element kernels use."""
-    import numba
-
-    return int(numba.get_num_threads())
-
-
-def environment() -> dict[str, str]:
-    """One flat record for results: processor, cores, threads, precision, versions."""
-    present = {k: v for k, v in versions().items() if v != "missing"}
-    return {
-        "processor": processor(),
-        "cores": str(os.cpu_count()),
-        "threads": str(threads()),
-        "dtype": "float64",
-        "system": f"{platform.system()} {platform.machine()}",
-        **present,
-    }
-
-
-@functools.cache
-def code_digest() -> str:
-    """SHA-256 of the package's own modules, names and contents, in hexadecimal digits.
-
-    Tells two states of the code apart that have the same version number.
-    """
-    digest = hashlib.sha256()
-    root = Path(pdcorrect.__file__).parent
-    for path in sorted(root.rglob("*.py")):
-        for content in (path.relative_to(root).as_posix().encode(), path.read_bytes()):
-            digest.update(len(content).to_bytes(8, "little") + content)
-    return digest.hexdigest()
+    checks = look()
+    table = Table("what", "found", "")
+    for check in checks:
+        table.add_row(check.name, check.found, "ok" if check.ok else "PROBLEM")
+    Console().print(table)
+    if not all(check.ok for check in checks):
+        raise typer.Exit(FAILED)
 
 
 @dataclass(frozen=True)
@@ -86,7 +35,7 @@ class Check:
     ok: bool = True
 
 
-def doctor() -> list[Check]:
+def look() -> list[Check]:
     """Look at everything that the package can use on this machine."""
     checks = [Check(name, found, _fine(name, found)) for name, found in versions().items()]
     checks.append(Check("processor", f"{processor()}, {os.cpu_count()} cores"))

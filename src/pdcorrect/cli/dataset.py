@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
+from pdcorrect._files import INTERRUPTED, Terminated
 from pdcorrect.errors import InputError
-from pdcorrect.interruption import INTERRUPTED, Terminated
 
 if TYPE_CHECKING:
-    from pdcorrect.progress import FileLines
+    from pdcorrect.cli.common import FileLines
 
 app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
 
@@ -129,8 +129,8 @@ def info(
     if json:
         _write(json, found.to_json() + "\n")
     if figures:
+        from pdcorrect._files import make_folder
         from pdcorrect.data.pictures import histograms, thumbnails
-        from pdcorrect.replacement import make_folder
 
         make_folder(figures)
         typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
@@ -245,7 +245,7 @@ def _simulations() -> Iterator[FileLines]:
 
     An interruption ends the program, and says what is there.
     """
-    from pdcorrect.progress import FileBar, FileLines, progress_bar
+    from pdcorrect.cli.common import FileBar, FileLines, progress_bar
 
     terminal = sys.stdout.isatty()
     bar = progress_bar("simulations", apart=True, hidden=not terminal)
@@ -276,7 +276,7 @@ def card(
 
 
 def _write(path: Path, text: str) -> None:
-    from pdcorrect.replacement import make_folder, write_text
+    from pdcorrect._files import make_folder, write_text
 
     make_folder(path.parent)
     write_text(path, text)
@@ -286,7 +286,7 @@ def _write(path: Path, text: str) -> None:
 @contextlib.contextmanager
 def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
     """A bar on the terminal, if there are files; gives what to call after each of ``count``."""
-    from pdcorrect.progress import progress_bar
+    from pdcorrect.cli.common import progress_bar
 
     with progress_bar("files", apart=True, hidden=not count) as progress:
         task = progress.add_task(title, total=count)

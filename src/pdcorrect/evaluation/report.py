@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 import pdcorrect.figures as figures
-from pdcorrect.environment import environment
-from pdcorrect.evaluate import Comparison, Row
+from pdcorrect._environment import environment
+from pdcorrect._files import make_folder, write_text
+from pdcorrect.evaluation.compare import Comparison, Row
+from pdcorrect.evaluation.report_notes import notes, refused_share, shown_labels
+from pdcorrect.evaluation.run_text import inverted_frames, three_digits
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
-from pdcorrect.replacement import make_folder, write_text
-from pdcorrect.report_notes import notes, refused_share, shown_labels
-from pdcorrect.run_text import inverted_frames, three_digits
-from pdcorrect.state import Trajectory
+from pdcorrect.trajectory import Trajectory
 
 __all__ = [
     "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",

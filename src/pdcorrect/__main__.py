@@ -1,0 +1,5 @@
+"""``python -m pdcorrect``."""
+
+from pdcorrect.cli.main import main
+
+main()

@@ -1,0 +1,235 @@
+"""Settings from TOML or keywords: number types, strict models, and one text for what is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pdcorrect.errors import InputError
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+Axis = Literal["x", "y", "z"]
+Number = Annotated[float, Field(strict=True, ge=-1e30, le=1e30)]
+Count = Annotated[int, Field(strict=True, ge=0, le=10**9)]
+PositiveCount = Annotated[int, Field(strict=True, ge=1, le=10**9)]
+Positive = Annotated[float, Field(strict=True, gt=0, le=1e30)]
+NonNegative = Annotated[float, Field(strict=True, ge=0, le=1e30)]
+Poisson = Annotated[float, Field(strict=True, ge=0, lt=0.5)]
+Vector = tuple[Number, Number, Number]
+Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
+
+_DEEPEST_NESTING = 100
+_LONGEST_INTEGER = 1024  # bits; Python refuses to write out much longer ones
+_LONGEST_VALUE = 80  # characters of a value in a message
+
+
+class Strict(BaseModel):
+    """Base of all settings: unknown keys, infinite and NaN numbers are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Checked(Strict):
+    """Settings whose constructor answers wrong values with the package's own error.
+
+    Raises
+    ------
+    InputError
+        As the class's ``error``, naming each wrong key, its value and what was expected.
+    """
+
+    source: ClassVar[str] = "configuration"
+    error: ClassVar[type[InputError]] = InputError
+
+    def __init__(self, /, **data: Any) -> None:
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise self.error(f"{self.source}: {explained(error, type(self))}") from None
+
+
+class TomlConfig(Checked):
+    """Checked settings that can be read from TOML and written to it."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read settings from a TOML file.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, is not TOML, or a key is wrong.
+        """
+        if not isinstance(path, (str, os.PathLike)) or "\n" in str(path):
+            raise cls.error(f"path is {_shown(path)}: expected the path of a TOML file.")
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except UnicodeDecodeError:
+            raise cls.error(f"{path}: cannot be read (not a UTF-8 text file).") from None
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise cls.error(f"{path}: cannot be read ({reason}).") from None
+        return cls.from_toml(text, str(path))
+
+    @classmethod
+    def from_toml(cls, text: str, source: str = "") -> Self:
+        """Read settings from TOML text; ``source`` names it in messages."""
+        source = source or cls.source
+        try:
+            return cls(**parse_toml(text))
+        except InputError as error:
+            raise cls.error(str(error).replace(f"{cls.source}:", f"{source}:", 1)) from None
+        except ValueError as error:
+            raise cls.error(f"{source}: not valid TOML: {error}.") from None
+
+    def to_toml(self) -> str:
+        """The settings as TOML, with every default written out."""
+        return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True, by_alias=True))
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Read TOML.
+
+    Raises
+    ------
+    ValueError
+        If it is not TOML, nested so deeply that reading it overflows the stack, or holds
+        integers so long that Python does not write them out.
+    """
+    try:
+        data = tomllib.loads(text)
+    except RecursionError:
+        raise ValueError(f"nested more than {_DEEPEST_NESTING} deep") from None
+    level: list[Any] = [data]
+    for _ in range(_DEEPEST_NESTING):
+        level = [part for value in level for part in _parts(value)]
+    if level:
+        raise ValueError(f"nested more than {_DEEPEST_NESTING} deep")
+    return data
+
+
+def _parts(value: Any) -> list[Any]:
+    """What a list or table holds; nothing for any other value of a usable size."""
+    if isinstance(value, int) and value.bit_length() > _LONGEST_INTEGER:
+        raise ValueError(f"an integer of more than {_LONGEST_INTEGER} bits")
+    if isinstance(value, dict):
+        return list(value.values())
+    return value if isinstance(value, list) else []
+
+
+def as_toml(value: object) -> str:
+    """A value as it would stand in a TOML file, on one line, for messages."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (str, PurePath)):
+        return json.dumps(str(value), ensure_ascii=False)
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_toml, value))}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {as_toml(own)}' for key, own in value.items())} }}"
+    return str(value)
+
+
+def explained(error: ValidationError, model: type[BaseModel]) -> str:
+    """One paragraph: each wrong key, its value, and what was expected."""
+    tables = list(_tables(model.model_json_schema()))
+    return " ".join(dict.fromkeys(_sentence(item, tables) for item in error.errors()))
+
+
+_Table = tuple[str, str, frozenset[str]]
+"""Header as in TOML ("" for the top), what chooses it of several kinds, and its keys."""
+
+
+def _sentence(item: ErrorDetails, tables: list[_Table]) -> str:
+    kind, location, value = item["type"], item["loc"], item["input"]
+    context = item.get("ctx", {})
+    key = _key(location, tables, kind == "extra_forbidden")
+    if kind == "extra_forbidden":
+        return f"{key}: unknown key; {_advice(str(location[-1]), key, tables)}"
+    if kind in ("union_tag_not_found", "union_tag_invalid"):  # wrong is the key that chooses
+        chooses = str(context["discriminator"]).strip("'")
+        key, value = f"{key}.{chooses}", context.get("tag")
+    if kind in ("missing", "union_tag_not_found"):
+        return f"{key}: missing; a value is required."
+    told = {
+        "value_error": item["msg"].removeprefix("Value error, "),
+        "union_tag_invalid": f"expected one of {context.get('expected_tags')}",
+    }.get(kind, item["msg"].replace("Input should be", "expected"))
+    if value is not None or kind != "value_error":
+        key = f"{key} = {_shown(value)}" if key else ""
+    told = f"{key}: {told[:1].lower()}{told[1:]}" if key else told
+    return told if told.endswith((".", "?")) else f"{told}."
+
+
+def _key(location: tuple[int | str, ...], tables: list[_Table], unknown: bool) -> str:
+    """A key as the user wrote it, ``loads[0].kind``: pydantic also names union members."""
+    known = frozenset().union(*(keys for _, _, keys in tables))
+    kept = [part for part in location[:-1] if isinstance(part, int) or part in known]
+    if location and (unknown or isinstance(location[-1], int) or location[-1] in known):
+        kept.append(location[-1])
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in kept)
+    return text.lstrip(".")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json", exclude_none=True)
+    text = as_toml(value)
+    return text if len(text) < _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
+
+
+def _advice(name: str, key: str, tables: list[_Table]) -> str:
+    """What an unknown key was probably meant for."""
+    header = ".".join(part for part in key.replace("]", "").replace("[", ".").split(".")[:-1])
+    own = f"[{'.'.join(part for part in header.split('.') if not part.isdigit())}]".strip("[]")
+    homes = [table for table in tables if name in table[2]]
+    kinds = dict.fromkeys(choice for h, choice, _ in homes if h.strip("[]") == own and choice)
+    if kinds:
+        return f"it goes with {' or '.join(kinds)}."
+    if homes:
+        return f"it belongs to {' or '.join(dict.fromkeys(h or 'the top' for h, _, _ in homes))}."
+    for here in (True, False):
+        keys = {k for h, _, keys in tables if (h.strip("[]") == own) is here for k in keys}
+        close = get_close_matches(name, sorted(keys), n=1, cutoff=0.65 if here else 0.8)
+        close = close or [k for k in sorted(keys) if name in k.split("_")][:1]
+        if close:
+            header = min(h for h, _, keys in tables if close[0] in keys) or "the top"
+            return f"did you mean {close[0]}{'' if here else f' of {header}'}?"
+    return "remove it or check its spelling."
+
+
+def _tables(schema: Mapping[str, Any]) -> Iterator[_Table]:
+    """All tables of a model's JSON schema, the top first."""
+    definitions = schema.get("$defs", {})
+
+    def walk(
+        node: Mapping[str, Any], names: tuple[str, ...], several: bool, choice: str
+    ) -> Iterator[_Table]:
+        if "$ref" in node:
+            node = definitions[node["$ref"].rsplit("/", 1)[1]]
+        if "discriminator" in node:
+            key = node["discriminator"]["propertyName"]
+            for kind, target in node["discriminator"]["mapping"].items():
+                yield from walk({"$ref": target}, names, several, f'{key} = "{kind}"')
+            return
+        for part in (*node.get("anyOf", ()), *node.get("allOf", ())):
+            yield from walk(part, names, several, choice)
+        if "items" in node:
+            yield from walk(node["items"], names, True, "")
+        if "properties" in node:
+            header = f"[{'.'.join(names)}]" if names else ""
+            yield f"[{header}]" if several else header, choice, frozenset(node["properties"])
+            for name, part in node["properties"].items():
+                yield from walk(part, (*names, name), False, "")
+
+    return walk(schema, (), False, "")

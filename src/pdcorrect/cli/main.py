@@ -1,0 +1,71 @@
+"""The program ``pdcorrect``: its commands, and what it makes of errors."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from pdcorrect._files import TERMINATED, Terminated, terminable
+from pdcorrect._version import __version__
+from pdcorrect.cli.common import BAD_INPUT, FAILED
+from pdcorrect.cli.compare import compare
+from pdcorrect.cli.dataset import app as dataset
+from pdcorrect.cli.doctor import doctor
+from pdcorrect.cli.evaluate import evaluate
+from pdcorrect.cli.export import export
+from pdcorrect.cli.render import render
+from pdcorrect.cli.simulate import simulate
+from pdcorrect.cli.train import train
+from pdcorrect.cli.validate import validate
+from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
+)
+for command in (simulate, compare, render, export, train, evaluate, validate, doctor):
+    app.command()(command)
+app.add_typer(dataset, name="dataset")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Show the version.", callback=_show_version, is_eager=True),
+    ] = False,
+) -> None:
+    """Coarse-mesh projective dynamics of soft solids, validated against Newton FEM."""
+
+
+def main() -> None:
+    """Entry point: one paragraph and an exit status instead of a traceback."""
+    try:
+        with terminable():
+            app()
+    except Terminated:
+        typer.echo("stopped by SIGTERM", err=True)
+        sys.exit(TERMINATED)
+    except ConvergenceError as error:
+        _stop(str(error), FAILED)
+    except OutputError as error:
+        _stop(str(error), FAILED)
+    except PdcorrectError as error:
+        _stop(str(error), BAD_INPUT)
+    except MemoryError:
+        _stop("not enough memory: use a smaller --refine.", FAILED)
+
+
+def _stop(message: str, status: int) -> None:
+    typer.echo(f"error: {message}", err=True)
+    sys.exit(status)
