@@ -15,7 +15,7 @@ from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
 from pdcorrect.fem.operators import Space
 from pdcorrect.fem.problem import problem_from_body
-from pdcorrect.fem.selection import Selector
+from pdcorrect.fem.clamps import Selector
 
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
 

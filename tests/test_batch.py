@@ -14,12 +14,13 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
-from pdcorrect.batch import decomposition, minimise, recording
-from pdcorrect.batch.bodies import Bodies
+from pdcorrect.batch import decomposition, minimise
+from pdcorrect.batch import gpu as recording
+from pdcorrect.batch.sharing import Bodies
 from pdcorrect.batch.cells import Sizes
-from pdcorrect.batch.memory import expected_bytes
+from pdcorrect.batch.states import expected_bytes
 from pdcorrect.batch.points import Points
-from pdcorrect.batch.tall import tall_product
+from pdcorrect.batch.gpu import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes

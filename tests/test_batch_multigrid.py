@@ -7,12 +7,12 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh
-from pdcorrect.batch.dense import summed_blocks
+from pdcorrect.batch.elimination import summed_blocks
 from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks
-from pdcorrect.batch.grid import largest_eigenvalue
+from pdcorrect.batch.multigrid import largest_eigenvalue
 from pdcorrect.batch.inverses import LARGEST_REST, FirstHessian, chosen
 from pdcorrect.batch.levels import hierarchy
-from pdcorrect.batch.memory import expected_bytes
+from pdcorrect.batch.states import expected_bytes
 from pdcorrect.batch.multigrid import with_mass
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import interpolation, refine

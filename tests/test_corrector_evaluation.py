@@ -26,13 +26,13 @@ from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.gate import Gate, Reason  # noqa: E402
 from pdcorrect.corrector.model_io import ModelRecord, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import Moments  # noqa: E402
-from pdcorrect.data.rebuild import rebuilt_problems  # noqa: E402
+from pdcorrect.data.simulate import rebuilt_problems  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError  # noqa: E402
 from pdcorrect.evaluation import tables  # noqa: E402
 from pdcorrect.evaluation.alone import roll_out_alone, single_steps_alone  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
-from pdcorrect.evaluation.cases import Case, read_cases  # noqa: E402
+from pdcorrect.evaluation.measures import Case, read_cases  # noqa: E402
 from pdcorrect.evaluation.evaluation import Candidate, EvaluatedRun, evaluate  # noqa: E402
 from pdcorrect.evaluation.measures import (  # noqa: E402
     Measured,
@@ -44,7 +44,7 @@ from pdcorrect.evaluation.measures import (  # noqa: E402
 from pdcorrect.evaluation.resampling import mean_interval, over_seeds, summarise  # noqa: E402
 from pdcorrect.evaluation.rollouts import roll_out, single_steps  # noqa: E402
 from pdcorrect.evaluation.speed import _loosest, measure_speed  # noqa: E402
-from pdcorrect.figures.learning import plot_omega, plot_validations  # noqa: E402
+from pdcorrect.figures.curves import plot_omega, plot_validations  # noqa: E402
 from pdcorrect.metrics import error_corrected, mean_squared_error  # noqa: E402
 from pdcorrect.state import State, Status  # noqa: E402
 

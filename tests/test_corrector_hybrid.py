@@ -22,7 +22,7 @@ from hybrid_samples import (
 from pdcorrect.corrector import features
 from pdcorrect.corrector.batch_bodies import BatchBodies, external_forces
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
-from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts
+from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
@@ -32,7 +32,7 @@ from pdcorrect.corrector.normaliser import Moments
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import HexMesh
-from pdcorrect.solvers.resume import check_same_run
+from pdcorrect.solvers.rollout import check_same_run
 
 CELL = 0.02
 OPEN = Gate(body=None, margin=None, average=None, volume=None, crushing=None, energy=None)

@@ -16,7 +16,8 @@ from block_meshes import o_grid, spokes, warped  # noqa: E402
 from conftest import beam, problem_on, rotation  # noqa: E402
 from network_samples import SIZE, STEP, tensor  # noqa: E402
 from pdcorrect import discretise  # noqa: E402
-from pdcorrect.corrector import cost, features, frames, rotations  # noqa: E402
+from pdcorrect.corrector import features, frames, rotations  # noqa: E402
+from pdcorrect.corrector import model_io as cost
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.config import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector, without_momentum  # noqa: E402

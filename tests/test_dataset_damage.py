@@ -13,7 +13,7 @@ from typer.testing import CliRunner  # noqa: E402
 
 import reader_samples as samples  # noqa: E402
 from pdcorrect.cli.main import app  # noqa: E402
-from pdcorrect.data.damage import whole_files  # noqa: E402
+from pdcorrect.data.folder import whole_files  # noqa: E402
 from pdcorrect.data.folder import shard_paths  # noqa: E402
 from pdcorrect.data.info import dataset_info  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
@@ -111,6 +111,6 @@ def test_another_version_of_the_format_is_no_damage(tmp_path, monkeypatch):
     def newer(path):
         raise FileVersionError(f"{path}: version 9")
 
-    monkeypatch.setattr("pdcorrect.data.damage.stored_hashes", newer)
+    monkeypatch.setattr("pdcorrect.data.folder.stored_hashes", newer)
     with pytest.raises(FileVersionError, match="version 9"):
         whole_files(shard_paths(folder, "training"), {})

@@ -20,7 +20,7 @@ from pdcorrect.data.check_file import same_scene
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import dataset_info
-from pdcorrect.data.manifest import manifest_content
+from pdcorrect.data.folder import manifest_content
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import (
     MESH,

@@ -10,7 +10,7 @@ import pytest
 from dataset_samples import with_run, with_simulation
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.manifest import manifest_content
+from pdcorrect.data.folder import manifest_content
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 

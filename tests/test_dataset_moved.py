@@ -11,8 +11,8 @@ import pdcorrect as pc
 from conftest import CLAMPED, GRAVITY, box_mesh
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import shard_from_trajectories
-from pdcorrect.data.rebuild import rebuilt_problems
-from pdcorrect.data.scene_mesh import discretise_stored, portable
+from pdcorrect.data.simulate import rebuilt_problems
+from pdcorrect.data.importing import discretise_stored, portable
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import MeshError

@@ -24,7 +24,7 @@ import pdcorrect.data.statistics as statistics_module  # noqa: E402
 import reader_samples as samples  # noqa: E402
 from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E402
-from pdcorrect.data.sampling import ShardShuffle  # noqa: E402
+from pdcorrect.data.reader import ShardShuffle  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
 from pdcorrect.data.workers import Workers, mapped  # noqa: E402

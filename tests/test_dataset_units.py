@@ -9,7 +9,7 @@ from dataset_configs import small
 from pdcorrect.data import engines, generate, workers
 from pdcorrect.data.engines import Job, OneByOne
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.runs import work_per_node
+from pdcorrect.data.simulate import work_per_node
 from pdcorrect.data.workers import Workers
 from pdcorrect.fem.problem import discretise
 

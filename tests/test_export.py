@@ -12,7 +12,7 @@ from conftest import beam
 from pdcorrect.cli import main as cli
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh_files import write_vtu
-from pdcorrect.io.stored_problem import problem_of
+from pdcorrect.io.trajectory_reader import problem_of
 from pdcorrect.io.vtk import write_vtu_series
 
 

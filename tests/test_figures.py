@@ -10,7 +10,8 @@ import pytest
 from motion import trajectory
 from pdcorrect import figures
 from pdcorrect.errors import InputError, MeshError, MissingExtraError, OutputError
-from pdcorrect.figures import curves, offscreen
+from pdcorrect.figures import curves
+from pdcorrect.figures import panels as offscreen
 
 pytest.importorskip("pyvista")
 pytest.importorskip("matplotlib")

@@ -7,7 +7,7 @@ import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.solvers.first_hessian import Rotations, TrueHessian
 from pdcorrect.solvers.integrators import backward_euler
-from pdcorrect.solvers.resume import continue_from
+from pdcorrect.solvers.rollout import continue_from
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory
 

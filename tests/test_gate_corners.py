@@ -10,7 +10,7 @@ from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot, View
-from pdcorrect.corrector.folds import corner_jacobians
+from pdcorrect.corrector.bodies import corner_jacobians
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.fem import hexahedron

@@ -20,7 +20,7 @@ from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.io.trajectory import TrajectoryWriter
 from pdcorrect.evaluation.refusal_text import refused_corrections
-from pdcorrect.solvers.resume import continue_from
+from pdcorrect.solvers.rollout import continue_from
 
 ROOT = Path(__file__).parent.parent
 CELL, STEP = 0.02, 0.01

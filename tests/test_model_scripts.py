@@ -23,13 +23,13 @@ import pdcorrect as pc  # noqa: E402
 import pdcorrect.errors  # noqa: E402
 from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector import model_io  # noqa: E402
-from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.corrector.model_io import save_model  # noqa: E402
 from pdcorrect.corrector.shapes import SHAPE_MEASURES  # noqa: E402
 from pdcorrect.data.config import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
-from pdcorrect.evaluation.cases import read_cases  # noqa: E402
+from pdcorrect.evaluation.measures import read_cases  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 

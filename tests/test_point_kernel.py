@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pdcorrect.batch import point_kernel, points
-from pdcorrect.batch.tracing import Program
+from pdcorrect.batch.point_kernel import Program
 from pdcorrect.errors import MissingExtraError
 from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF
 

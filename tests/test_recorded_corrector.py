@@ -16,7 +16,7 @@ from torch._subclasses.fake_tensor import (  # noqa: E402
 import pdcorrect as pc  # noqa: E402
 from hybrid_samples import fitted, problems  # noqa: E402
 from pdcorrect.corrector import recorded  # noqa: E402
-from pdcorrect.corrector.batch_step import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.features import Snapshot, View  # noqa: E402
 from pdcorrect.corrector.gate import Reason  # noqa: E402
 from pdcorrect.corrector.recorded import RecordedCorrector, recordable  # noqa: E402

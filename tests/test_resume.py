@@ -25,7 +25,7 @@ from pdcorrect.io import trajectory as files
 from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory
-from pdcorrect.solvers.resume import continue_from, differences
+from pdcorrect.solvers.rollout import continue_from, differences
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
 

@@ -6,7 +6,7 @@ import pytest
 import pdcorrect as pc
 from conftest import GRAVITY, beam, cross
 from pdcorrect.errors import ConvergenceError
-from pdcorrect.solvers.resume import continue_from
+from pdcorrect.solvers.rollout import continue_from
 
 
 def test_a_static_step_without_a_solution_is_not_replaced_by_motion():

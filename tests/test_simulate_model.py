@@ -124,7 +124,7 @@ def test_what_cannot_be_meant_is_refused_before_the_work(
 
 
 def test_a_model_of_an_unknown_base_is_named(learned, tmp_path, monkeypatch):
-    from pdcorrect.corrector import released
+    from pdcorrect.corrector import hybrid as released
 
     shutil.copytree(ROOT / "models" / MODEL, tmp_path / "odd")
     kind = type(pc.load_model(tmp_path / "odd"))

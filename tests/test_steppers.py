@@ -15,7 +15,7 @@ from conftest import CLAMPED, GRAVITY, beam, cross, disturbed, rotation
 from oracle import Oracle
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.solvers.integrators import backward_euler
-from pdcorrect.solvers.lbfgs import History, MinimiserOptions, largest_displacement, minimise
+from pdcorrect.solvers.minimise import History, MinimiserOptions, largest_displacement, minimise
 from pdcorrect.solvers.step import GlobalSolver, StepObjective
 
 

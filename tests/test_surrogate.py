@@ -16,7 +16,7 @@ from pdcorrect.batch.stepper import BatchStepper  # noqa: E402
 from pdcorrect.corrector.config import preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.errors import ConvergenceError, InputError  # noqa: E402
-from pdcorrect.evaluation.cases import read_cases  # noqa: E402
+from pdcorrect.evaluation.measures import read_cases  # noqa: E402
 from pdcorrect.evaluation.rollouts import roll_out  # noqa: E402
 from pdcorrect.training.config import Stage  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser  # noqa: E402

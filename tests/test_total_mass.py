@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
-from pdcorrect.fem.coarse_models import BASES
+from pdcorrect.fem.problem import BASES
 
 ROOT = Path(__file__).parents[1]
 PER_NODE = {"mass": "per-node"}
@@ -201,7 +201,7 @@ def test_files_without_its_runs_are_told_and_made_again(published, tmp_path, pre
 
 @pytest.mark.parametrize("beside", [[], ["total-mass"]])
 def test_its_run_is_measured_with_its_own_masses_whoever_is_a_candidate(published, beside):
-    from pdcorrect.evaluation.cases import read_cases
+    from pdcorrect.evaluation.measures import read_cases
 
     for case in read_cases(published, bases=beside, skip_damaged=False).cases:
         masses = {name: problem.mass.sum() for name, problem in case.problems.items()}

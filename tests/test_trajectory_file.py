@@ -16,7 +16,7 @@ import pytest
 
 from motion import assert_same, remembering, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
-from pdcorrect.io.disk_space import Reserve
+from pdcorrect.io.growing_file import Reserve
 from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory

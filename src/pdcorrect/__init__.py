@@ -27,7 +27,7 @@ _HOME = {
     "Trajectory": "pdcorrect.trajectory",
     "Problem": "pdcorrect.fem.problem",
     "discretise": "pdcorrect.fem.problem",
-    "coarse_model": "pdcorrect.fem.coarse_models",
+    "coarse_model": "pdcorrect.fem.problem",
     "stress": "pdcorrect.fem.stress",
     "modes": "pdcorrect.fem.modes",
     "ProjectiveDynamics": "pdcorrect.solvers.projective",
@@ -40,7 +40,7 @@ _HOME = {
     "load_model": "pdcorrect.corrector.model_io",
     "save_model": "pdcorrect.corrector.model_io",
     "HybridStepper": "pdcorrect.corrector.hybrid",
-    "hybrid_of": "pdcorrect.corrector.released",
+    "hybrid_of": "pdcorrect.corrector.hybrid",
     "BatchHybrid": "pdcorrect.corrector.batch_hybrid",
     "HybridLayer": "pdcorrect.corrector.batch_hybrid",
     "Gate": "pdcorrect.corrector.gate",
@@ -114,13 +114,11 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
     from pdcorrect.corrector.corrector import Corrector
     from pdcorrect.corrector.gate import Gate
-    from pdcorrect.corrector.hybrid import HybridStepper
+    from pdcorrect.corrector.hybrid import HybridStepper, hybrid_of
     from pdcorrect.corrector.model_io import load_model, save_model
-    from pdcorrect.corrector.released import hybrid_of
     from pdcorrect.evaluation.compare import compare
-    from pdcorrect.fem.coarse_models import coarse_model
     from pdcorrect.fem.modes import modes
-    from pdcorrect.fem.problem import Problem, discretise
+    from pdcorrect.fem.problem import Problem, coarse_model, discretise
     from pdcorrect.fem.stress import stress
     from pdcorrect.figures import render, render_overlay
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory

@@ -78,7 +78,6 @@ def code_digest() -> str:
 
 
 HOME = "PDCORRECT_HOME"
-
 """Environment variable: the folder with ``models`` and ``validation``; the checkout by default."""
 
 

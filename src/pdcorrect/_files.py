@@ -129,7 +129,6 @@ def _awaited(process: int) -> bool:
 _PAUSE = 0.01  # s
 
 INTERRUPTED, TERMINATED = 130, 143
-
 """Exit status after Ctrl-C and after SIGTERM."""
 
 

@@ -17,11 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.bodies import Bodies
-from pdcorrect.batch.fused import assembled, at_corners, in_cells, sums
+from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.levels import places
-from pdcorrect.batch.narrowing import with_rows
 from pdcorrect.batch.points import Points, Tangent
+from pdcorrect.batch.sharing import Bodies, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 

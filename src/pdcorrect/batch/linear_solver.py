@@ -8,16 +8,15 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.fused import as_kernel
+from pdcorrect.batch.gpu import Recorder, as_kernel
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
 from pdcorrect.batch.points import Tangent
-from pdcorrect.batch.recording import Recorder
 
 
 class BatchConjugateGradients:
     """Solve H x = b in each scene, H the Hessian at a configuration.
 
-    As `pdcorrect.fem.conjugate_gradients`; scenes that are done, or meet negative
+    As `pdcorrect.fem.multigrid`; scenes that are done, or meet negative
     curvature, stand still.
 
     Attributes

@@ -17,14 +17,251 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.dense import DenseInverse, summed_blocks
-from pdcorrect.batch.grid import Grid
-from pdcorrect.batch.levels import Level, hierarchy
-from pdcorrect.batch.narrowing import with_rows
-from pdcorrect.batch.sharing import Sharing
+from pdcorrect.batch.cells import padded
+from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
+from pdcorrect.batch.gpu import as_kernel, rows_of, sums
+from pdcorrect.batch.levels import Level, Numbers, hierarchy, places, table
+from pdcorrect.batch.sharing import Sharing, with_rows
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
+
+DEGREE = 3
+"""Of the Chebyshev polynomial in D^-1 A times D^-1: products with D^-1 in one smoothing."""
+
+SMOOTHED = 16.0
+"""Ratio of the largest eigenvalue of D^-1 A to the smallest one that the smoother damps."""
+
+
+class Grid:
+    """A level; nodal fields are (B, N, 3), padded.
+
+    Parameters
+    ----------
+    levels : sequence of Level
+        Of the distinct problems.
+    coarse : int
+        Nodes of the largest next coarser level.
+    sharing, storage, device
+        See `Multigrid`.
+
+    Attributes
+    ----------
+    regular : list of bool
+        Whether each distinct problem has a smoother.
+    """
+
+    def __init__(
+        self,
+        levels: Sequence[Level],
+        coarse: int,
+        sharing: Sharing,
+        storage: torch.dtype,
+        device: torch.device,
+    ) -> None:
+        self._sharing = sharing
+        self._factors = torch.tensor(chebyshev(DEGREE, SMOOTHED), dtype=storage, device=device)
+        owners = torch.as_tensor(sharing.owners, device=device)
+        nodes = max(len(level.free) for level in levels)
+        count = max(len(level.cells) for level in levels)
+
+        scene = torch.arange(len(owners), device=device)[:, None, None]
+
+        def real(arrays: Sequence[Array], *shape: int) -> Tensor:
+            return torch.as_tensor(padded(arrays, shape), dtype=storage, device=device)
+
+        def numbers(arrays: Sequence[Numbers], fill: int, *shape: int) -> Tensor:
+            return torch.as_tensor(padded(arrays, shape, fill), device=device)[owners]
+
+        cells = numbers([level.cells for level in levels], 0, count, 8)
+        self._cells = (cells + nodes * scene).reshape(-1)
+        found = [places(level.cells, len(level.free)) for level in levels]
+        slots = numbers(found, -1, nodes, max(p.shape[1] for p in found))
+        slots = torch.where(slots < 0, 8 * count * len(owners), slots + 8 * count * scene)
+        self._slots = slots.flatten(0, 1)
+        self._alike = all(len(level.blocks) == 1 for level in levels)
+        if self._alike:
+            self._blocks = real([level.blocks[0] for level in levels], 24, 24)[owners]
+        else:
+            every = [np.broadcast_to(v.blocks, (len(v.cells), 24, 24)) for v in levels]
+            self._blocks = real(every, count, 24, 24)
+        self._nodal = real([level.nodal[:, None] for level in levels], nodes, 1)[owners]
+        self._free = real([level.free.astype(np.float64) for level in levels], nodes, 3)[owners]
+        inverses = [_scaled_inverse(level, device) for level in levels]
+        self.regular = [bool(inverse.any()) for inverse in inverses]
+        self._inverse = real(inverses, nodes, 3, 3)[owners]
+        self._up, self._down = (
+            (
+                (numbers([t for t, _ in tables], 0, rows, most) + columns * scene).flatten(0, 1),
+                real([w for _, w in tables], rows, most)[owners].flatten(0, 1),
+            )
+            for tables, most, rows, columns in _both_ways(levels, nodes, coarse)
+        )
+
+    @property
+    def bytes(self) -> int:
+        """Memory of its tensors."""
+        tensors = (
+            self._cells, self._slots, self._blocks, self._nodal, self._free, self._inverse,
+            *self._up, *self._down,
+        )  # fmt: skip
+        return sum(t.numel() * t.element_size() for t in tensors)
+
+    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Grid:
+        """Of some scenes, with the matrices that they have."""
+        scenes, nodes, _ = self._free.shape
+        moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None, None]
+
+        def some(table: Tensor) -> Tensor:
+            return table.reshape(scenes, -1, table.shape[-1])[rows]
+
+        def shifted(table: Tensor, size: int) -> Tensor:
+            return (some(table) + size * moved).flatten(0, 1)
+
+        values = len(self._cells) // scenes
+        slots = some(self._slots)
+        none = slots == values * scenes
+        slots = torch.where(none, values * len(rows), slots + values * moved).flatten(0, 1)
+        coarse = len(self._down[0]) // scenes
+        return with_rows(
+            self, rows, "_nodal", "_free", "_inverse", _sharing=sharing, _slots=slots,
+            _cells=shifted(self._cells[:, None], nodes)[:, 0],
+            _blocks=self._blocks[rows if self._alike else kept],
+            _up=(shifted(self._up[0], coarse), some(self._up[1]).flatten(0, 1)),
+            _down=(shifted(self._down[0], nodes), some(self._down[1]).flatten(0, 1)),
+        )  # fmt: skip
+
+    def residual(self, b: Tensor, x: Tensor) -> Tensor:
+        """B - A x; of no meaning where clamped."""
+        local = rows_of(x.reshape(-1, 3), self._cells)
+        images = self._images(local.reshape(len(x), -1, 24)).reshape(-1, 3)
+        kernel = as_kernel(_residual, x.is_cuda)
+        out: Tensor = kernel(b, x, self._nodal, images, self._slots)
+        return out
+
+    def smoothed(self, b: Tensor) -> Tensor:
+        """A Chebyshev polynomial in D^-1 A, times D^-1 b: symmetric, zero where clamped."""
+        kernel = as_kernel(_advanced, b.is_cuda)
+        x, step = torch.zeros_like(b), torch.zeros_like(b)
+        r = b
+        for k, factors in enumerate(self._factors):
+            if k:
+                r = self.residual(b, x)
+            step, x = kernel(self._inverse, r, step, x, factors)
+        return x
+
+    def restricted(self, r: Tensor) -> Tensor:
+        """P^T r, on the next coarser level, for a field that counts where free."""
+        kernel = as_kernel(_weighted, r.is_cuda)
+        flat = (r * self._free).reshape(-1, 3)
+        out: Tensor = kernel(flat, *self._down)
+        return out.reshape(len(r), -1, 3)
+
+    def prolonged(self, x: Tensor) -> Tensor:
+        """P x, zero where clamped."""
+        kernel = as_kernel(_weighted, x.is_cuda)
+        out: Tensor = kernel(x.reshape(-1, 3), *self._up)
+        return out.reshape(self._free.shape) * self._free
+
+    def _images(self, local: Tensor) -> Tensor:
+        """The cells' matrices times their values (B, C, 24)."""
+        if self._alike:
+            return cellwise(self._blocks, local[..., None])
+        shared = self._sharing.gathered(local)  # (K, m, C, 24)
+        moved = cellwise(self._blocks, shared.permute(0, 2, 3, 1))
+        return self._sharing.scattered(moved.permute(0, 3, 1, 2))
+
+
+# --- what is one kernel on a GPU -----------------------------------------------------------------
+
+
+def _residual(b: Tensor, x: Tensor, nodal: Tensor, images: Tensor, slots: Tensor) -> Tensor:
+    return b - nodal * x - sums(images, slots).reshape(b.shape)
+
+
+def _advanced(
+    inverse: Tensor, r: Tensor, step: Tensor, x: Tensor, factors: Tensor
+) -> tuple[Tensor, Tensor]:
+    a, b, c = r.unbind(-1)
+    scaled = inverse[..., 0] * a[..., None] + inverse[..., 1] * b[..., None]
+    step = factors[0] * step + factors[1] * (scaled + inverse[..., 2] * c[..., None])
+    return step, x + step
+
+
+def _weighted(values: Tensor, numbers: Tensor, weights: Tensor) -> Tensor:
+    total = weights[:, 0, None] * values[numbers[:, 0]]
+    for i in range(1, numbers.shape[1]):
+        total = total + weights[:, i, None] * values[numbers[:, i]]
+    return total
+
+
+def chebyshev(degree: int, smoothed: float) -> list[tuple[float, float]]:
+    """Factors of the last step and of D^-1 r in each step, for eigenvalues from 1/smoothed to 1.
+
+    Saad, Iterative methods for sparse linear systems (2003), algorithm 12.1.
+    """
+    middle, half = (1.0 + 1.0 / smoothed) / 2.0, (1.0 - 1.0 / smoothed) / 2.0
+    out, ratio = [(0.0, 1.0 / middle)], half / middle
+    for _ in range(degree - 1):
+        before, ratio = ratio, 1.0 / (2.0 * middle / half - ratio)
+        out.append((ratio * before, 2.0 * ratio / half))
+    return out
+
+
+# --- preparation ---------------------------------------------------------------------------------
+
+
+def largest_eigenvalue(blocks: Array, device: torch.device) -> float:
+    """A bound, from the cells (C, 24, 24), of the eigenvalues of D^-1 A.
+
+    D are the nodes' 3 x 3 blocks of A, which may have more on its diagonal than the cells.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If those of a cell are not positive definite.
+    """
+    A = torch.as_tensor(blocks, device=device)
+    D = A.new_zeros(A.shape)
+    for k in range(0, 24, 3):
+        D[:, k : k + 3, k : k + 3] = A[:, k : k + 3, k : k + 3]
+    L, info = torch.linalg.cholesky_ex(D)
+    if bool(info.any()):
+        raise np.linalg.LinAlgError("a cell's matrix has no positive definite diagonal")
+    half = torch.linalg.solve_triangular(L, A, upper=False)
+    both = torch.linalg.solve_triangular(L, half.transpose(1, 2), upper=False)
+    return max(1.0, float(torch.linalg.eigvalsh(both).max()))
+
+
+def _scaled_inverse(level: Level, device: torch.device) -> Array:
+    """D^-1 by the bound of the eigenvalues of D^-1 A, (N, 3, 3), zero where clamped.
+
+    All zero where some D is not positive definite.
+    """
+    corners = level.blocks.reshape(-1, 8, 3, 8, 3)[:, range(8), :, range(8), :]  # (8, C, 3, 3)
+    corners = np.broadcast_to(corners.swapaxes(0, 1), (len(level.cells), 8, 3, 3))
+    flat, count = level.cells.ravel(), len(level.free)
+    sums = [np.bincount(flat, c, minlength=count) for c in corners.reshape(-1, 9).T]
+    D = np.stack(sums, axis=1).reshape(-1, 3, 3) + level.nodal[:, None, None] * np.eye(3)
+    free = level.free[:, :, None] & level.free[:, None, :]
+    D = np.where(free, D, 0.0) + (~level.free)[:, :, None] * np.eye(3)
+    try:
+        inverse = np.where(free, np.linalg.inv(D), 0.0)
+        return np.asarray(inverse / largest_eigenvalue(level.blocks, device))
+    except np.linalg.LinAlgError:
+        return np.zeros_like(D)
+
+
+def _both_ways(
+    levels: Sequence[Level], nodes: int, coarse: int
+) -> list[tuple[list[tuple[Numbers, Array]], int, int, int]]:
+    """Of P and of P^T: each level's table, its width, and how many nodes both sides have."""
+    out = []
+    for transposed, rows, columns in ((False, nodes, coarse), (True, coarse, nodes)):
+        tables = [table(level.interpolation, transposed) for level in levels]
+        out.append((tables, max(t.shape[1] for t, _ in tables), rows, columns))
+    return out
+
 
 _ROUNDING = 1e-9
 """Of the largest nodal mass: to which masses of cells and of the problem count as equal."""

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.fused import as_kernel, small_products
-from pdcorrect.batch.narrowing import with_rows
+from pdcorrect.batch.gpu import as_kernel, small_products
+from pdcorrect.batch.sharing import with_rows
 
 
 class BatchMass:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import linecache
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cache, partial
 from math import isfinite
 from typing import Any
@@ -16,11 +17,192 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.tracing import PointFunction, Program
 from pdcorrect.errors import MissingExtraError
+
+Number = int | float
+
+PointFunction = Callable[..., Sequence[Sequence[Any]]]
+"""Lists of components, one for each argument, to lists of components."""
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """One line of a program.
+
+    Attributes
+    ----------
+    name : str
+        "constant", "+", "<", "where", ...; see `pdcorrect.batch.point_kernel`.
+    operands : tuple
+        Numbers of earlier lines; of a constant its value.
+    """
+
+    name: str
+    operands: tuple[Any, ...]
+
+
+@dataclass(eq=False)
+class Program:
+    """Operations, each written once.
+
+    Attributes
+    ----------
+    dtype : torch.dtype
+        Of all numbers.
+    inputs : list of list of int
+        Lines that stand for the components of each argument.
+    outputs : list of list of int
+        Lines that are the components of each result.
+    lines : list of Operation
+    """
+
+    dtype: torch.dtype
+    inputs: list[list[int]] = field(default_factory=list)
+    outputs: list[list[int]] = field(default_factory=list)
+    lines: list[Operation] = field(default_factory=list)
+    _known: dict[tuple[Any, ...], int] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, function: PointFunction, sizes: Sequence[int], dtype: torch.dtype) -> Program:
+        """Trace a function whose arguments have so many components each.
+
+        Raises
+        ------
+        NotImplementedError, TypeError, AttributeError
+            If it does to them what no kernel can, or decides by their values.
+        """
+        program = cls(dtype)
+        arguments = []
+        for number, size in enumerate(sizes):
+            components = [program.add("input", number, i) for i in range(size)]
+            program.inputs.append([value.line for value in components])
+            arguments.append(components)
+        for result in function(*arguments):
+            program.outputs.append([program.value(x).line for x in result])
+        return program
+
+    def add(self, name: str, *operands: Any) -> Value:
+        """The result of an operation."""
+        operation = Operation(name, operands)
+        key = (name, *((type(x), repr(x)) for x in operands))
+        if key not in self._known:
+            self._known[key] = len(self.lines)
+            self.lines.append(operation)
+        return Value(self, self._known[key])
+
+    def value(self, x: Any) -> Value:
+        """A number as a constant; a value as it is."""
+        return x if isinstance(x, Value) else self.add("constant", float(x))
+
+
+class Value:
+    """A number at each point, of which only the line of the program is known that computes it."""
+
+    __slots__ = ("line", "program")
+
+    def __init__(self, program: Program, line: int) -> None:
+        self.program, self.line = program, line
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """As of a tensor."""
+        return self.program.dtype
+
+    @classmethod
+    def __torch_function__(
+        cls, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Value:
+        found = _FUNCTIONS.get(function)
+        if found is None:
+            raise NotImplementedError(f"{function.__name__} in a function of points")
+        return found(*args, **(kwargs or {}))
+
+    def abs(self) -> Value:
+        return _do("abs", self)
+
+    def __abs__(self) -> Value:
+        return self.abs()
+
+    def __neg__(self) -> Value:
+        return _do("*", self, -1.0)
+
+    def __add__(self, other: Any) -> Value:
+        return _do("+", self, other)
+
+    def __radd__(self, other: Any) -> Value:
+        return _do("+", other, self)
+
+    def __sub__(self, other: Any) -> Value:
+        return _do("-", self, other)
+
+    def __rsub__(self, other: Any) -> Value:
+        return _do("-", other, self)
+
+    def __mul__(self, other: Any) -> Value:
+        return _do("*", self, other)
+
+    def __rmul__(self, other: Any) -> Value:
+        return _do("*", other, self)
+
+    def __truediv__(self, other: Any) -> Value:
+        return _do("/", self, other)
+
+    def __rtruediv__(self, other: Any) -> Value:
+        return _do("/", other, self)
+
+    def __pow__(self, exponent: int) -> Value:
+        if exponent != 2:
+            raise NotImplementedError(f"power {exponent} in a function of points")
+        return self * self
+
+    def __lt__(self, other: Any) -> Value:
+        return _do("<", self, other)
+
+    def __le__(self, other: Any) -> Value:
+        return _do("<=", self, other)
+
+    def __gt__(self, other: Any) -> Value:
+        return _do(">", self, other)
+
+    def __ge__(self, other: Any) -> Value:
+        return _do(">=", self, other)
+
+    def __and__(self, other: Value) -> Value:
+        return _do("&", self, other)
+
+    def __bool__(self) -> bool:
+        raise NotImplementedError("a decision in a function of points: expected torch.where")
+
+    def __eq__(self, other: object) -> bool:
+        raise NotImplementedError("equality in a function of points: expected < or >")
+
+    __hash__ = object.__hash__
+
+
+def _do(name: str, *operands: Any) -> Value:
+    program = next(x.program for x in operands if isinstance(x, Value))
+    return program.add(name, *(program.value(x).line for x in operands))
+
+
+def _clamp(x: Value, *, min: Number) -> Value:
+    return _do("maximum", x, min)
+
+
+_FUNCTIONS: dict[Any, Callable[..., Value]] = {
+    torch.where: lambda condition, x, y: _do("where", condition, x, y),
+    torch.sqrt: lambda x: _do("sqrt", x),
+    torch.rsqrt: lambda x: _do("rsqrt", x),
+    torch.maximum: lambda x, y: _do("maximum", x, y),
+    torch.minimum: lambda x, y: _do("minimum", x, y),
+    torch.clamp: _clamp,
+    torch.zeros_like: lambda x: x.program.value(0.0),
+    torch.ones_like: lambda x: x.program.value(1.0),
+}
+
 
 BLOCK = 128
 """Points of a thread block, one a thread."""
+
 _FORMS = {
     "abs": "tl.abs({})",
     "rsqrt": "tl.rsqrt({})",
@@ -29,9 +211,12 @@ _FORMS = {
     "minimum": "tl.minimum({}, {}, propagate_nan=tl.PropagateNan.ALL)",
     **{sign: f"{{}} {sign} {{}}" for sign in ("+", "-", "*", "/", "<", "<=", ">", ">=", "&")},
 }
+
 _TYPES = {torch.float64: "tl.float64", torch.float32: "tl.float32"}
+
 _ROOTS = {torch.float64: "tl.sqrt({})", torch.float32: "tl.sqrt_rn({})"}
 """The former is rounded correctly of float64 alone; quotients of float32 are to two units."""
+
 _files = itertools.count()
 
 
@@ -45,8 +230,8 @@ def at_points(
     Parameters
     ----------
     function : callable
-        Of lists of components, as `pdcorrect.batch.tracing` has it.  Its kernel is found again by
-        its identity: pass the same object each time.
+        Of lists of components.  Its kernel is found again by its identity: pass the same object
+        each time.
     inputs, outputs : sequence of tensor
         Each (k, C, Q) for k components at Q points of C cells, of one type, anywhere in memory;
         k may differ.

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from pdcorrect.batch import energies
 from pdcorrect.batch.decomposition import nearest_volume, product, signed_svd, transposed
-from pdcorrect.batch.point_kernel import at_points
-from pdcorrect.batch.tracing import PointFunction
+from pdcorrect.batch.point_kernel import PointFunction, at_points
 from pdcorrect.fem.hyperelasticity import COROTATED
 
 Tangent = tuple[Tensor, Tensor, Tensor]

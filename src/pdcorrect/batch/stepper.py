@@ -30,13 +30,12 @@ from pdcorrect.batch.inverses import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
-from pdcorrect.batch.memory import expected_bytes
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import OneByOne
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.stage import BatchStage, BatchStaging
-from pdcorrect.batch.states import BatchResult, BatchState, apart, together
+from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
 from pdcorrect.batch.threads import one_thread
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import positive, whole
@@ -397,7 +396,7 @@ class BatchStepper:
 
     @property
     def expected_bytes(self) -> int:
-        """Expected peak memory on the device, see `pdcorrect.batch.memory.expected_bytes`.
+        """Expected peak memory on the device, see `pdcorrect.batch.states.expected_bytes`.
 
         Also before the first step, in which it is taken.
         """

@@ -13,7 +13,6 @@ import typer
 from pdcorrect.errors import InputError, require_extra
 
 FAILED, BAD_INPUT = 1, 2
-
 """Exit statuses."""
 
 SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=False)]

@@ -164,7 +164,7 @@ def export(
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
     from pdcorrect.data import export as exports
-    from pdcorrect.data.missing import missing_files
+    from pdcorrect.data.folder import missing_files
 
     if to is Layout.meshgraphnet:
         _unused(to, {"--mesh": mesh, "--simulation": simulation, "--run": run})

@@ -97,7 +97,7 @@ def _gpu() -> Check:
 def _rendering() -> Check:
     if importlib.util.find_spec("pyvista") is None:
         return Check("off-screen rendering", "pyvista missing: pip install 'pdcorrect[view]'")
-    from pdcorrect.figures.offscreen import check_offscreen
+    from pdcorrect.figures.panels import check_offscreen
 
     found = check_offscreen()
     return Check("off-screen rendering", found, found.startswith("ok"))

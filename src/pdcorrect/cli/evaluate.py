@@ -185,8 +185,7 @@ def _draw(found: Evaluation, folder: Path) -> list[Path]:
 
     from pdcorrect.data.schema import PLAIN, REFERENCE
     from pdcorrect.evaluation.tables import mean_errors
-    from pdcorrect.figures.curves import plot_error_over_time
-    from pdcorrect.figures.learning import plot_omega
+    from pdcorrect.figures.curves import plot_error_over_time, plot_omega
 
     drawn = []
     errors = mean_errors(found)

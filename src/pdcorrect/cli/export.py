@@ -58,7 +58,7 @@ def _loaded(path: Path, salvage: bool) -> Trajectory:
 
 def _stepped(run: Trajectory, path: Path) -> Problem | None:
     """What stresses are computed from; None, and why, if the file does not say."""
-    from pdcorrect.io.stored_problem import problem_of
+    from pdcorrect.io.trajectory_reader import problem_of
 
     try:
         return problem_of(run)

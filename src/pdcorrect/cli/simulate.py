@@ -103,7 +103,7 @@ def _make_stepper(
     scene: Scene, solver: SolverName, refine: int, model: str | None, gate: bool
 ) -> Stepper:
     if model is not None:
-        from pdcorrect.corrector.released import hybrid_of
+        from pdcorrect.corrector.hybrid import hybrid_of
 
         return hybrid_of(scene, model, gate=gate).prepare()
     from pdcorrect.evaluation.compare import make_stepper
@@ -128,7 +128,7 @@ def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | N
     from dataclasses import replace
 
     from pdcorrect.io.trajectory import load_trajectory
-    from pdcorrect.solvers.resume import check_same_run
+    from pdcorrect.solvers.rollout import check_same_run
 
     if not output.exists():
         say(f"{output} does not exist yet: starting from the beginning")
@@ -151,8 +151,7 @@ def _run(
     """
     from pdcorrect.cli.common import progress_bar
     from pdcorrect.io.trajectory import TrajectoryWriter
-    from pdcorrect.solvers.resume import continue_from
-    from pdcorrect.solvers.rollout import StepLog, march, run_attributes
+    from pdcorrect.solvers.rollout import StepLog, continue_from, march, run_attributes
 
     problem = stepper.problem
     if earlier is None:

@@ -59,8 +59,7 @@ def train(
 
     loaded = TrainingConfig.load(config)
     if evaluate is not None:
-        from pdcorrect.data.folder import shard_paths
-        from pdcorrect.data.missing import check_whole
+        from pdcorrect.data.folder import check_whole, shard_paths
 
         for folder in data:
             shard_paths(folder, evaluate)  # refused now, not when the training has ended

@@ -4,20 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pdcorrect.corrector.folds import corner_jacobians, least_by_body
-from pdcorrect.corrector.frames import cell_axes, node_axes, turned_back
-from pdcorrect.corrector.rotations import polar_rotations, turns_between
+from pdcorrect.corrector.frames import (
+    cell_axes,
+    node_axes,
+    polar_rotations,
+    turned_back,
+    turns_between,
+)
 from pdcorrect.corrector.shapes import shape_measures
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import mesh_edges, node_means
+from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
 from pdcorrect.fem.problem import Problem
+
+
+def corner_jacobians(positions: Tensor, cells: Tensor) -> Tensor:
+    """`pdcorrect.fem.hexahedron.corner_jacobians` of tensors: (c, 8), m3."""
+    corners = positions.index_select(0, cells.reshape(-1)).reshape(*cells.shape, 3)
+    slopes = _slopes(positions.dtype, positions.device) @ corners
+    a, b, c = slopes.reshape(len(cells), 3, -1, 3).unbind(dim=1)
+    return (a * torch.linalg.cross(b, c)).sum(dim=2)
+
+
+@cache
+def _slopes(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Shape functions' derivatives at the corners, (24, 8)."""
+    with torch.inference_mode(False):
+        derivatives = shape_derivatives(VTK_CORNERS.astype(float)).reshape(-1, len(VTK_CORNERS))
+        return torch.as_tensor(derivatives, dtype=dtype, device=device)
+
+
+def least_by_body(ratios: Tensor, cells: Tensor, graph: Tensor, bodies: int) -> Tensor:
+    """The least of values (c, 8) of each body's cells, (B,); infinite without any.
+
+    What is not a number stays so.
+    """
+    owner = graph.index_select(0, cells[:, 0])
+    least = ratios.amin(dim=1)
+    return least.new_full((bodies,), torch.inf).scatter_reduce(0, owner, least, "amin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,10 +269,14 @@ class BodyGraph:
 
 
 REST_OF_NODES = ("rest_frames", "cell_counts")
+
 REST_OF_EDGES = ("rest_edges", "rest_turns")
+
 REST_OF_CELLS = ("rest_inverses",)
+
 KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
 """What a graph computes of its bodies at rest once for a network, when first asked for."""
+
 KNOWN_TO_GATES = ("shapes", "rest_corners")
 """The same for a gate."""
 

@@ -26,11 +26,10 @@ from pdcorrect.corrector.features import (
     Snapshot,
     View,
 )
-from pdcorrect.corrector.frames import EDGE_MEANS
+from pdcorrect.corrector.frames import EDGE_MEANS, rotations
 from pdcorrect.corrector.normaliser import EXTREME
-from pdcorrect.corrector.rotations import rotations
-from pdcorrect.fem.blocks import PARALLEL
 from pdcorrect.fem.decomposition import OPTIONS
+from pdcorrect.fem.kernels import PARALLEL
 
 Array = NDArray[Any]
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.products import EPSILON, ROWS, filled_up, normalise, product, strips
-from pdcorrect.fem.blocks import PARALLEL, REDUCE
+from pdcorrect.fem.kernels import PARALLEL, REDUCE
 
 Array = NDArray[Any]
 

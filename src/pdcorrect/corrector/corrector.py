@@ -21,7 +21,7 @@ from pdcorrect.corrector.features import (
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.normaliser import Normaliser
-from pdcorrect.corrector.values import Values
+from pdcorrect.corrector.placements import Values
 
 
 class Answers(Protocol):

@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 from pdcorrect.corrector.corrector import Answers
 from pdcorrect.corrector.features import View
 from pdcorrect.corrector.gate import Gate, Measured, Reason
-from pdcorrect.corrector.values import Values, filled, where
+from pdcorrect.corrector.placements import Values, filled, where
 
 _HALVINGS = 6
 """How often a limited correction is halved before it is refused."""

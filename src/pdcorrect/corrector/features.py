@@ -17,8 +17,13 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.frames import node_gradients, product, turned_back
-from pdcorrect.corrector.rotations import polar_rotations, turns_between
+from pdcorrect.corrector.frames import (
+    node_gradients,
+    polar_rotations,
+    product,
+    turned_back,
+    turns_between,
+)
 from pdcorrect.errors import InputError
 
 STILL = 1e-9

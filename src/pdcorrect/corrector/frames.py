@@ -10,15 +10,19 @@ R does not depend on how a mesh orders the corners of its cells; the frame at re
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
+from typing import Any
 
 import torch
+from numba import njit
 from torch import Tensor
 
-from pdcorrect.batch.fused import as_kernel
+from pdcorrect.batch.gpu import as_kernel
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 EDGE_MEANS = (2.0 * VTK_CORNERS - 1.0) / 4.0
@@ -101,3 +105,144 @@ _unrolled: ContextVar[bool] = ContextVar("unrolled", default=False)
 def _product(A: Tensor, B: Tensor) -> Tensor:
     first, second, third = (A[:, :, i, None] * B[:, i, None] for i in range(3))
     return first + second + third
+
+
+_NEWTON_STEPS = 8
+
+_FLATTEST = 1e-3 * 3.0**-1.5
+"""Least determinant that a rotation is made of, where the matrix has norm 1."""
+
+
+def polar_rotations(matrices: Tensor) -> Tensor:
+    """Rotations R of M = R U for matrices (n, 3, 3) with positive determinants.
+
+    Can be differentiated.  Where the determinant is not positive, or tiny beside the matrix,
+    R is the identity.
+    """
+    found: Tensor = _Polar.apply(matrices)  # type: ignore[no-untyped-call]
+    return found
+
+
+def turns_between(R: Tensor, S: Tensor) -> Tensor:
+    """Axial parts (n, 3) of R^T S: sine of the angle from R to S times the axis, told in R."""
+    return 0.5 * torch.linalg.cross(S, R, dim=2).sum(dim=1)
+
+
+class _Polar(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, matrices: Tensor) -> Tensor:
+        if matrices.device.type == "cpu":
+            R = torch.empty(matrices.shape, dtype=matrices.dtype)
+            rotations(matrices.detach().contiguous().numpy(), R.numpy())
+        else:
+            R = together(matrices)
+        ctx.save_for_backward(matrices, R)
+        return R
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        R, X, G = (x.permute(1, 2, 0) for x in (ctx.saved_tensors[1], ctx.saved_tensors[0], grad))
+        X, size, usable = _unit(X)
+        X = torch.where(usable, X, R)
+        U, Q = ((R[:, :, None] * x[:, None]).sum(dim=0) for x in (X, G))
+        A = _identity(U) * U.diagonal().sum(dim=1) - U
+        C = _cofactors(A)
+        q = _axial(Q.flatten(0, 1))
+        z = (C * q[:, None]).sum(dim=0) / (_determinants(A, C) * size)
+        back = torch.linalg.cross(R, z.expand_as(R), dim=1)
+        return torch.where(usable, back, 0.0).permute(2, 0, 1)
+
+
+def together(matrices: Tensor) -> Tensor:
+    """`polar_rotations` by operations on all matrices, without derivatives."""
+    X, _, usable = _unit(matrices.permute(1, 2, 0).contiguous())  # long rows are quicker
+    identity = _identity(X)
+    X = torch.where(usable, X, identity)
+    for _ in range(_NEWTON_STEPS):
+        C = _cofactors(X)
+        inverse = C / _determinants(X, C)
+        scale = (inverse.square().sum(dim=(0, 1)) / X.square().sum(dim=(0, 1))).sqrt().sqrt()
+        X = (0.5 * scale) * X + inverse / (2.0 * scale)
+    return torch.where(usable, X, identity).permute(2, 0, 1).contiguous()
+
+
+def _unit(X: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Matrices (3, 3, n) over their norms, these (n,), and which have a rotation."""
+    squares = X.square().sum(dim=(0, 1))
+    size = torch.where(squares > 0.0, squares, 1.0).sqrt()
+    X = X / size
+    usable = _determinants(X, _cofactors(X)) > _FLATTEST
+    return X, torch.where(usable, size, 1.0), usable
+
+
+def _identity(X: Tensor) -> Tensor:
+    return torch.eye(3, dtype=X.dtype, device=X.device)[..., None]
+
+
+def _cofactors(A: Tensor) -> Tensor:
+    """Det A A^-T of (3, 3, n)."""
+    rows = torch.cat([A, A[:2]])
+    B = torch.cat([rows, rows[:, :2]], dim=1)
+    return B[1:4, 1:4] * B[2:, 2:] - B[1:4, 2:] * B[2:, 1:4]
+
+
+def _determinants(A: Tensor, cofactors: Tensor) -> Tensor:
+    """Of (3, 3, n), (n,)."""
+    return (A[0] * cofactors[0]).sum(dim=0)
+
+
+def _axial(nine: Tensor) -> Tensor:
+    """Axial vectors (3, n) of A - A^T, for the components (9, n) of A."""
+    here, there = _off_diagonal(nine.device)
+    return nine.index_select(0, here) - nine.index_select(0, there)
+
+
+@cache
+def _off_diagonal(device: torch.device) -> tuple[Tensor, Tensor]:
+    """Where zy, xz and yx are in the nine of a matrix, and yz, zx and xy."""
+    with torch.inference_mode(False):
+        return torch.tensor([7, 2, 3], device=device), torch.tensor([5, 6, 1], device=device)
+
+
+@njit(inline="always", **OPTIONS)
+def _cofactors_of(a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
+    """Of one matrix, row by row."""
+    return (
+        e * i - f * h, f * g - d * i, d * h - e * g,
+        h * c - i * b, i * a - g * c, g * b - h * a,
+        b * f - c * e, c * d - a * f, a * e - b * d,
+    )  # fmt: skip
+
+
+@njit(**OPTIONS)
+def rotations(M, out):  # type: ignore[no-untyped-def]
+    """`polar_rotations` (n, 3, 3), one by one."""
+    for k in range(M.shape[0]):
+        squares = 0.0
+        for row in range(3):
+            for column in range(3):
+                squares += M[k, row, column] * M[k, row, column]
+        by = 1.0 / math.sqrt(squares) if squares > 0.0 else 1.0
+        a, b, c = by * M[k, 0, 0], by * M[k, 0, 1], by * M[k, 0, 2]
+        d, e, f = by * M[k, 1, 0], by * M[k, 1, 1], by * M[k, 1, 2]
+        g, h, i = by * M[k, 2, 0], by * M[k, 2, 1], by * M[k, 2, 2]
+        C = _cofactors_of(a, b, c, d, e, f, g, h, i)
+        if not a * C[0] + b * C[1] + c * C[2] > _FLATTEST:
+            a = e = i = 1.0
+            b = c = d = f = g = h = 0.0
+        else:
+            for _ in range(_NEWTON_STEPS):
+                C = _cofactors_of(a, b, c, d, e, f, g, h, i)
+                by = 1.0 / (a * C[0] + b * C[1] + c * C[2])
+                squares = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
+                others = 0.0
+                for x in C:
+                    others += x * x
+                scale = math.sqrt(math.sqrt(others * by * by / squares))
+                p, q = 0.5 * scale, 0.5 * by / scale
+                a, b, c = p * a + q * C[0], p * b + q * C[1], p * c + q * C[2]
+                d, e, f = p * d + q * C[3], p * e + q * C[4], p * f + q * C[5]
+                g, h, i = p * g + q * C[6], p * h + q * C[7], p * i + q * C[8]
+        out[k, 0, 0], out[k, 0, 1], out[k, 0, 2] = a, b, c
+        out[k, 1, 0], out[k, 1, 1], out[k, 1, 2] = d, e, f
+        out[k, 2, 0], out[k, 2, 1], out[k, 2, 2] = g, h, i

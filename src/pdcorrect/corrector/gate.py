@@ -18,7 +18,7 @@ from pdcorrect._config import Checked, NonNegative, Number
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
 from pdcorrect.corrector.features import View
-from pdcorrect.corrector.values import Values, where
+from pdcorrect.corrector.placements import Values, where
 from pdcorrect.errors import InputError
 
 

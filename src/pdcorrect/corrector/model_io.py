@@ -11,46 +11,181 @@ refused.  Nothing is ever unpickled.
 from __future__ import annotations
 
 import hashlib
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import Tensor
+
+from pdcorrect._environment import home_folder
 from pdcorrect._files import make_folder, part_of_process, replacing
+from pdcorrect.corrector import features
 from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.corrector.cost import parameters
+from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_description import (
     DESCRIPTION,
-    VERSION,
     WEIGHTS,
     Description,
     ModelRecord,
-    content_digest,
     read_description,
     read_file,
 )
-from pdcorrect.corrector.model_names import model_folder, models_folder, unlike_ends
 from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
 
 require_extra("safetensors", "learn")
 
-import torch  # noqa: E402
 from safetensors import SafetensorError  # noqa: E402
 from safetensors import torch as safetensors  # noqa: E402
-from torch import Tensor  # noqa: E402
 
-from pdcorrect.corrector.corrector import Corrector  # noqa: E402
+_EXPECTED = f"expected a folder with {DESCRIPTION} and {WEIGHTS}"
 
-__all__ = [
-    "DESCRIPTION", "JOINT", "VERSION", "WEIGHTS", "LoadedModel", "ModelRecord", "content_digest",
-    "load_model", "model_folder", "models_folder", "read_description", "read_weights",
-    "save_model", "unlike_ends", "weights_digest",
-]  # fmt: skip
+
+def model_folder(path_or_name: str | Path) -> Path:
+    """Where a model given by path or name is.
+
+    Raises
+    ------
+    InputError
+        If there is none, or it is no path or name.
+    """
+    if not isinstance(path_or_name, (str, os.PathLike)) or not str(path_or_name).strip():
+        raise InputError(
+            f"model {path_or_name!r}: expected the name of a model or the path of its folder."
+        )
+    named = isinstance(path_or_name, str) and path_or_name.strip(".") != ""
+    named = named and not set(str(path_or_name)) & {"/", os.sep}
+    folder = models_folder() / path_or_name if named else Path(path_or_name)
+    if has_model(folder):
+        return folder
+    if not named:
+        raise InputError(f"{folder}: {_without_model(folder)}.")
+    here = ", which is a folder here" if Path(path_or_name).is_dir() else ""
+    raise InputError(
+        f"model {path_or_name!r}: not in {models_folder()}: expected one of "
+        f"{', '.join(_released()) or '(none)'}, or a path such as ./{path_or_name}{here}."
+    )
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a model, be it half of one."""
+    return any((folder / name).is_file() for name in (DESCRIPTION, WEIGHTS))
+
+
+def models_folder() -> Path:
+    """Where models are looked up by name.
+
+    Raises
+    ------
+    InputError
+        If the environment does not say, and the code is not in its checkout.
+    """
+    return home_folder("models", ", or the path of a model")
+
+
+def unlike_ends(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of paths that are all unlike, such as "seed-1/model".
+
+    Raises
+    ------
+    InputError
+        If a folder comes twice.
+    """
+    for folder in folders:
+        if folders.count(folder) > 1:
+            raise InputError(f"{folder} comes twice: expected each one once.")
+    longest = max((len(folder.parts) for folder in folders), default=0)
+    for length in range(1, longest + 1):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return []
+
+
+def _without_model(path: Path) -> str:
+    """What is there in place of a model's folder, and what is expected."""
+    if path.is_dir():
+        inner = _models_in(path)
+        such_as = f", such as {path}{os.sep}{inner[0]}" if inner else ""
+        return f"holds no model: {_EXPECTED}{such_as}"
+    try:
+        released = _released()
+    except InputError:  # no models can be given by name
+        released = []
+    names = f", or the name of a released model: {', '.join(released)}" if released else ""
+    return f"{'a file' if path.is_file() else 'not there'}: {_EXPECTED}{names}"
+
+
+def _released() -> list[str]:
+    return _models_in(models_folder())
+
+
+def _models_in(folder: Path) -> list[str]:
+    """Names of the folders in a folder that hold models."""
+    return sorted(path.parent.name for path in folder.glob(f"*/{DESCRIPTION}"))
+
+
+OUTPUTS = 3
+"""Components of the network's output."""
+
+
+def parameters(config: CorrectorConfig) -> int:
+    """Trainable numbers of the network."""
+    width, layers = config.width, config.mlp_layers
+    hidden = config.norm != "none"
+    nodes, edges = _inputs(config)
+    encoders = _mlp(nodes, width, width, layers, hidden) + _mlp(edges, width, width, layers, hidden)
+    one = _mlp(3 * width, width, width, layers, hidden) + _mlp(
+        2 * width, width, width, layers, hidden
+    )
+    decoder = _mlp(width, width, OUTPUTS, layers, config.norm == "all")
+    return encoders + (1 if config.shared else config.layers) * one + decoder
+
+
+def flops(config: CorrectorConfig, nodes: int, edges: int) -> int:
+    """Operations of one call for n nodes and E directed edges: twice the multiply-adds.
+
+    Those of the linear maps; their biases, ReLU, LayerNorm, sums over edges, and the
+    features are left out.
+    """
+    width, layers = config.width, config.mlp_layers
+    of_node, of_edge = _inputs(config)
+    square = width * width
+    encoders = nodes * _maps(of_node, width, width, layers)
+    encoders += edges * _maps(of_edge, width, width, layers)
+    # the first map of the edges' network is applied to nodes and edges apart
+    one = edges * layers * square + 2 * nodes * square
+    one += nodes * _maps(2 * width, width, width, layers)
+    decoder = nodes * _maps(width, width, OUTPUTS, layers)
+    return 2 * (encoders + config.layers * one + decoder)
+
+
+def _inputs(config: CorrectorConfig) -> tuple[int, int]:
+    return (
+        features.width(features.NODE_FEATURES, config.node_features),
+        features.width(features.EDGE_FEATURES, config.edge_features),
+    )
+
+
+def _maps(inputs: int, width: int, outputs: int, layers: int) -> int:
+    """Multiply-adds of an MLP for one row."""
+    return sum(a * b for a, b in pairwise([inputs, *[width] * (layers - 1), outputs]))
+
+
+def _mlp(inputs: int, width: int, outputs: int, layers: int, norm: bool) -> int:
+    biases = (layers - 1) * width + outputs
+    return _maps(inputs, width, outputs, layers) + biases + (2 * outputs if norm else 0)
+
 
 BACKWARD_EULER = "backward-euler"
 """What all data sets have, also those of models that do not record it."""
 
 JOINT = "+"
 """Between the names of data sets that a model was trained on, together or one after another."""
+
 _NORMALISER = "normaliser."
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.corrector.values import Values
+from pdcorrect.corrector.placements import Values
 
 PAUSE = "gate_pause"
 """For how many steps more a gate is shut, in the memory of states; absent where it is open."""

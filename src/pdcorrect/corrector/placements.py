@@ -8,9 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-from pdcorrect.corrector.values import where
+import numpy as np
+import torch
+
 from pdcorrect.errors import InputError
 from pdcorrect.solvers.schemes import Scheme
+
+Values = Any
+"""A NumPy array or a tensor."""
+
+
+def where(condition: Values, one: Values, other: Values) -> Values:
+    """``one`` where a condition holds, else ``other``; either may be a number."""
+    library = np if isinstance(condition, np.ndarray) else torch
+    return library.where(condition, one, other)
+
+
+def filled(like: Values, value: float) -> Values:
+    """A number in the shape and type of other values."""
+    return (np if isinstance(like, np.ndarray) else torch).full_like(like, value)
+
 
 Velocity = Literal["recomputed", "kept"]
 """Of corrected states: what the integrator makes of the corrected positions, or the coarse

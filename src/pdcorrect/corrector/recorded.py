@@ -13,13 +13,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.gpu import Recorder
 from pdcorrect.batch.objective import dot
-from pdcorrect.batch.recording import Recorder
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled import usual
+from pdcorrect.corrector.compiled import Contents, usual
 from pdcorrect.corrector.config import CorrectorConfig
-from pdcorrect.corrector.contents import Contents
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot, View
 from pdcorrect.corrector.frames import unrolled_products

@@ -13,8 +13,7 @@ from torch import Tensor
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.features import Snapshot, View
 from pdcorrect.corrector.gate import Measured
-from pdcorrect.corrector.placements import Velocity, as_forces, ballistic, moved
-from pdcorrect.corrector.values import Values
+from pdcorrect.corrector.placements import Values, Velocity, as_forces, ballistic, moved
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.state import State, Status, StepResult
 

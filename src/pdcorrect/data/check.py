@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -13,17 +14,62 @@ import numpy as np
 from pdcorrect.data.check_file import cell_size, file_faults, plan_faults
 from pdcorrect.data.check_motion import step_faults
 from pdcorrect.data.config import DatasetConfig
-from pdcorrect.data.folder import all_shards, shard_number
-from pdcorrect.data.manifest import manifest_content
+from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import CONFIG, MANIFEST, NORMALISATION, SUFFIX, Shard
+from pdcorrect.data.schema import (
+    CONFIG,
+    MANIFEST,
+    NORMALISATION,
+    REFERENCE,
+    SUFFIX,
+    Array,
+    Shard,
+    Simulation,
+)
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
 from pdcorrect.data.statistics import load_statistics
-from pdcorrect.data.twins import body_digests, load_digest
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
+_DIGITS = 6
+"""Decimals, in cells, to which meshes are compared."""
+
+
+def body_digests(shard: Shard) -> tuple[str, str]:
+    """Equal for equal meshes, and for equal meshes with equal materials.
+
+    Neither the numbering of nodes and cells nor the place in space matters.
+    """
+    scale = 1.0 / cell_size(shard)
+    points = _rounded(scale * (shard.points - shard.points.min(axis=0)))
+    centres = points[shard.cells].mean(axis=1)
+    shape = _digest(_sorted(points)) + _digest(_sorted(_rounded(centres)))
+    material = np.column_stack([shard.young, shard.poisson, shard.density])
+    return shape, shape + _digest(_sorted(np.hstack([_rounded(centres), material])))
+
+
+def load_digest(simulation: Simulation) -> str:
+    """Equal for equal forces; of simulations without, for those that start alike."""
+    reference = simulation.runs.get(REFERENCE)
+    if simulation.forces.any() or reference is None or reference.positions is None:
+        return _digest(simulation.forces)
+    return _digest(reference.positions[:2])
+
+
+def _rounded(values: Array) -> Array:
+    return np.round(values, _DIGITS) + 0.0  # no minus zero
+
+
+def _sorted(rows: Array) -> Array:
+    return rows[np.lexsort(rows.T)]
+
+
+def _digest(values: Array) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values).data).hexdigest()
+
+
 Severity = Literal["error", "warning"]
+
 _OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from pdcorrect.data.check_motion import load_faults, model_faults, volume_faults
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.runs import lacking
 from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
+from pdcorrect.data.simulate import lacking
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.problem import discretise
 

@@ -15,13 +15,11 @@ import numpy as np
 from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.engines import MOST_ITERATIONS
 from pdcorrect.data.plan import MeshPlan
-from pdcorrect.data.rebuild import FORCE_ERROR, rebuilt_problems
-from pdcorrect.data.runs import models
 from pdcorrect.data.schema import REFERENCE, STATISTICS, Array, Shard, Simulation
+from pdcorrect.data.simulate import FORCE_ERROR, models, rebuilt_problems
 from pdcorrect.errors import InputError
-from pdcorrect.fem.coarse_models import BASES
 from pdcorrect.fem.hexahedron import shape_derivatives
-from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.problem import BASES, Problem
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
-from pdcorrect.data.schema import SUFFIX
-from pdcorrect.errors import InputError
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.plan import make_plan
+from pdcorrect.data.schema import CONFIG, SUFFIX
+from pdcorrect.data.shard_reader import stored_hashes
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
+
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
 
 
@@ -101,3 +107,114 @@ def _names(path: Path) -> set[str]:
 
 def _rank(split: str) -> tuple[int, str]:
     return (_FIRST.index(split) if split in _FIRST else len(_FIRST)), split
+
+
+Damage = dict[Path, str]
+"""Damaged files and what is wrong with them."""
+
+
+def whole_files(paths: Sequence[Path], damaged: Damage | None) -> list[Path]:
+    """The files that are to be read.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    damaged : dict or None
+        Where given, each file is compared with its checksum, which reads all of it; those
+        that are damaged are noted here and left out.
+
+    Raises
+    ------
+    FileFormatError
+        If all files are damaged.
+    FileVersionError
+        If one is of another version, which is no damage.
+    """
+    if damaged is None:
+        return list(paths)
+    whole = []
+    for path in paths:
+        try:
+            stored_hashes(path)
+        except FileVersionError:
+            raise
+        except FileFormatError as error:
+            damaged[path] = str(error)
+        else:
+            whole.append(path)
+    if paths and not whole:
+        first = damaged[paths[0]]
+        raise FileFormatError(f"all {len(paths)} files are damaged, the first one so: {first}")
+    return whole
+
+
+def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
+    """Files that a data set's ``config.toml`` asks for and that are not there.
+
+    None are missing where there is no configuration, as in imported data sets.
+
+    Parameters
+    ----------
+    folder : path
+    split : str, optional
+        The only one to look at; all by default.
+
+    Raises
+    ------
+    InputError
+        If the configuration cannot be used.
+    """
+    folder = Path(folder)
+    if not (folder / CONFIG).exists():
+        return []
+    plans = make_plan(DatasetConfig.load(folder / CONFIG))
+    paths = [folder / f"{p.name}{SUFFIX}" for p in plans if split in (None, p.split)]
+    return [path for path in paths if not path.exists()]
+
+
+def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
+    """Refuse splits of which files are missing.
+
+    Raises
+    ------
+    InputError
+        If some are, with the first one's name, or as of `missing_files`.
+    """
+    for split in splits:
+        accepted_gaps(folder, split, incomplete=False)
+
+
+def accepted_gaps(folder: str | Path, split: str, *, incomplete: bool) -> list[Path]:
+    """Files of a split that are missing, which only ``incomplete`` permits.
+
+    It permits a configuration that cannot be used, too: none are known to be missing then.
+
+    Raises
+    ------
+    InputError
+        Without ``incomplete``, as of `check_whole`.
+    """
+    try:
+        missing = missing_files(folder, split)
+    except InputError:
+        if not incomplete:
+            raise
+        return []
+    if missing and not incomplete:
+        raise InputError(
+            f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
+            f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
+            "generate' goes on), or --incomplete for those that are there."
+        )
+    return missing
+
+
+def manifest_content(config: DatasetConfig, hashes: Mapping[str, str | None]) -> dict[str, Any]:
+    """What the manifest says of files by name, with one hash of them all."""
+    whole = hashlib.sha256(json.dumps(dict(hashes), sort_keys=True).encode()).hexdigest()
+    return {
+        "dataset": config.name,
+        "config_hash": config.hash(),
+        "content_hash": whole,
+        "files": dict(hashes),
+    }

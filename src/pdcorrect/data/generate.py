@@ -17,26 +17,28 @@ from statistics import median
 
 from pdcorrect._files import clear_parts, make_folder, write_text
 from pdcorrect.data.config import TRAINING, DatasetConfig
-from pdcorrect.data.folder import all_shards
-from pdcorrect.data.manifest import manifest_content
+from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
-from pdcorrect.data.runs import lacking, work_per_node
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
+from pdcorrect.data.simulate import lacking, work_per_node
 from pdcorrect.data.statistics import compute_statistics, load_statistics
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, mapped
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _MOST_DIFFERENCES = 5
 """Keys of another configuration that are told."""
+
 _LONGEST = 4
 """Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
+
 OnBegin = Callable[[int, int, Sequence[str]], None]
 """Called once before anything is computed with how many simulations of how many are there, and
 with the names of files that are damaged and will be computed again.
 """
+
 OnFile = Callable[[str, int, int, int], None]
 """Called with a finished file's name, how many simulations of how many are there now, and how
 many of them are new since the generation was started.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +21,7 @@ from pdcorrect.data.import_checks import (
     real_array,
     with_held_nodes,
 )
-from pdcorrect.data.scene_mesh import portable
-from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Run, Shard, Simulation
+from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities
 from pdcorrect.fem.hexahedron import (
@@ -33,16 +31,46 @@ from pdcorrect.fem.hexahedron import (
 )
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.problem import Problem, discretise
-from pdcorrect.scene import Scene, best_coarse, check_scene
+from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import rollout
 from pdcorrect.state import State, Status
 
-Array = NDArray[Any]
+
+def portable(scene: Scene) -> Scene:
+    """The scene as a data set holds it: of the path of a mesh file the name alone."""
+    if not isinstance(scene.body, MeshFile):
+        return scene
+    return scene.with_changes(body={"path": scene.body.path.name})
+
+
+def discretise_stored(scene: Scene, points: Array, cells: Array, refine: int = 1) -> Problem:
+    """A stored scene's problem.
+
+    Parameters
+    ----------
+    scene : Scene
+    points : (N, 3)
+        Of the file that holds the scene, m.
+    cells : (C, 8)
+        Of the same file, VTK order.
+    refine : int
+
+    Raises
+    ------
+    SceneError, MeshError
+        As `discretise`.
+    """
+    if not isinstance(scene.body, MeshFile):
+        return discretise(scene, refine)
+    return discretise(scene, refine, mesh=HexMesh.create(points, cells.astype(np.int64)))
+
 
 SETTING = "imported"
+
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
+
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean")
 """Of coarse models: those whose nodes are the corners of the cells, as a data set's."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdcorrect.data.damage import Damage
+from pdcorrect.data.folder import Damage
 from pdcorrect.data.measuring import (
     MeasuredMesh,
     MeasuredRun,

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pdcorrect.data.damage import Damage, whole_files
-from pdcorrect.data.folder import all_shards
+from pdcorrect.data.folder import Damage, all_shards, whole_files
 from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError

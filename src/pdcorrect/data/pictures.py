@@ -12,8 +12,7 @@ from pdcorrect.data.measuring import MeasuredMesh, dataset_files, measure_datase
 from pdcorrect.data.schema import PLAIN, REFERENCE, Array
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, require_extra
-from pdcorrect.figures.files import Image, replacing, write_png
-from pdcorrect.figures.panels import Body, Painter, View, shown_points
+from pdcorrect.figures.panels import Body, Image, Painter, View, replacing, shown_points, write_png
 from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
 from pdcorrect.trajectory import Trajectory
 

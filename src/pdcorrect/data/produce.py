@@ -1,4 +1,4 @@
-"""`produce`: what one worker computes of a data set, some meshes' files."""
+"""Compute what is missing of a shard."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pdcorrect.errors import require_extra
 LARGEST_BATCHED = 150_000
 """Nodes of the largest mesh that is stepped in batches.
 
-A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.memory`), so a batch of 32
+A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.states`), so a batch of 32
 such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
 """
 

@@ -44,7 +44,7 @@ from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
 
 REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"
-"""Runs: the truth, and the coarse models, see `pdcorrect.fem.coarse_models`."""
+"""Runs: the truth, and the coarse models, see `pdcorrect.fem.problem`."""
 CONVERGED = "time-converged"
 """Run: the reference with smaller time steps."""
 SUFFIX = ".h5"

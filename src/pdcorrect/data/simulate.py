@@ -3,21 +3,112 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
+from pdcorrect.data.importing import discretise_stored
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.runs import Model, models
-from pdcorrect.data.schema import PLAIN, REFERENCE, Run, Shard, Simulation
-from pdcorrect.errors import ConvergenceError
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.data.schema import (
+    BEST,
+    CONVERGED,
+    PLAIN,
+    REFERENCE,
+    TOTAL_MASS,
+    Run,
+    Shard,
+    Simulation,
+)
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.problem import BASES, Problem, discretise
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.state import State
+
+
+@dataclass(frozen=True)
+class Model:
+    """How a simulation is discretised and stepped.
+
+    Attributes
+    ----------
+    refine : int
+    best : bool
+        `pdcorrect.best_coarse`'s element and mass.
+    predict : bool
+        Whether to take single steps from the reference, too.
+    divisor : int
+        Parts of each time step.
+    heavy : bool
+        Density scaled so that the mass is the reference's.
+    truth : bool
+        Stepped by the reference's solver.
+    sample : bool
+        For the first simulation of the mesh only.
+    """
+
+    refine: int
+    best: bool = False
+    predict: bool = False
+    divisor: int = 1
+    heavy: bool = False
+    truth: bool = False
+    sample: bool = False
+
+
+def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
+    """The runs of a mesh by name, the reference first."""
+    exact = config.setting == "exact"
+    found = {
+        REFERENCE: Model(mesh.refine, best=exact, truth=True),
+        PLAIN: Model(1, predict=True),
+    }
+    if exact:
+        found[BEST] = Model(1, best=True, predict=True)
+    else:
+        found[TOTAL_MASS] = Model(1, heavy=True, predict=True)
+    if mesh.split in (TRAINING, VALIDATION):
+        return found
+    if mesh.refine > 2:
+        found["intermediate"] = Model(2)
+    if mesh.split == EVALUATION:
+        if config.converged_steps:
+            found[CONVERGED] = Model(
+                mesh.refine, best=exact, divisor=config.converged_steps, truth=True
+            )
+        if mesh.number < config.finest_meshes:
+            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
+    return found
+
+
+def lacking(
+    config: DatasetConfig,
+    mesh: MeshPlan,
+    number: int,
+    runs: Collection[str],
+    predictions: Collection[str],
+) -> list[str]:
+    """What a simulation of a mesh lacks that has these runs, and single steps of those."""
+    found = []
+    for name, model in sorted(models(config, mesh).items()):
+        if model.sample and number:
+            continue
+        if name not in runs:
+            found.append(f"run {name!r}")
+        elif model.predict and name not in predictions:
+            found.append(f"single steps of run {name!r}")
+    return found
+
+
+def work_per_node(config: DatasetConfig, mesh: MeshPlan) -> float:
+    """About how much a simulation takes for each coarse node: steps of refined nodes."""
+    runs = (m for m in models(config, mesh).values() if not m.sample)
+    return float(mesh.frames * sum((1 + m.predict) * m.refine**3 * m.divisor for m in runs))
+
 
 MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
@@ -276,3 +367,104 @@ def _run(draft: _Draft, name: str, engines: Engines) -> Run:
             "time_step": draft.meshed.plan.step / model.divisor,
         },
     )
+
+
+FORCE_ERROR = 1e-5
+"""Largest difference of loads from the stored ones, over their largest; those are float32."""
+
+
+def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem]:
+    """The problem of each simulation of a file, discretised as one of its runs was.
+
+    Bodies from mesh files are discretised on the file's own mesh.
+
+    Problems of one file share mesh, operators and masses.
+
+    Parameters
+    ----------
+    shard : Shard
+    path : Path
+        Of its file, for messages.
+    run : str
+        One of `pdcorrect.fem.problem.BASES`, or "reference".
+
+    Raises
+    ------
+    InputError
+        If a simulation has no scene, as imported ones, lacks the run, or what its scene
+        leads to is not what the file holds.
+    """
+    if run not in (*BASES, REFERENCE):
+        raise InputError(f"run {run!r}: expected one of {', '.join((*BASES, REFERENCE))}.")
+    scenes = [_scene(shard, path, k) for k in range(len(shard.simulations))]
+    stored = shard.simulations[0].runs.get(run)
+    if stored is None:
+        raise InputError(f"{path}: no run {run!r}: expected one of {_names(shard)}.")
+    plain = discretise_stored(scenes[0], shard.points, shard.cells)
+    _check_mesh(plain, shard, path)
+    for k, scene in enumerate(scenes):
+        _check_loads(plain.with_loads(scene.loads), shard, path, k)
+    problem = plain
+    if run == TOTAL_MASS:
+        problem = plain.with_total_mass(float(stored.attributes["total_mass"]))
+    elif run != PLAIN:
+        exact = run == BEST or shard.attributes["setting"] == "exact"
+        refine = int(stored.attributes.get("refine", 1))
+        scene = best_coarse(scenes[0]) if exact else scenes[0]
+        problem = discretise_stored(scene, shard.points, shard.cells, refine)
+    return [_under(problem, scene) for scene in scenes]
+
+
+def _under(problem: Problem, scene: Scene) -> Problem:
+    """The problem under another scene's loads, and by its name."""
+    loaded = problem.with_loads(scene.loads)
+    return replace(loaded, scene=loaded.scene.with_changes(name=scene.name))
+
+
+def _names(shard: Shard) -> str:
+    return ", ".join(sorted(shard.simulations[0].runs))
+
+
+def _scene(shard: Shard, path: Path, k: int) -> Scene:
+    text = shard.simulations[k].scene_toml
+    if not text:
+        raise InputError(
+            f"{path}: simulation {k} has no scene, as if imported: expected one that "
+            "`pdcorrect dataset generate` made, for it has to be stepped again."
+        )
+    return Scene.from_toml(text, f"{path}, scene of simulation {k}")
+
+
+def _check_mesh(problem: Problem, shard: Shard, path: Path) -> None:
+    """Refuse a scene that does not lead to the file's coarse mesh and material."""
+    step = float(shard.attributes["time_step"])
+    materials = problem.materials
+    pairs = {
+        "points": (problem.positions, shard.points),
+        "cells": (problem.cells, shard.cells),
+        "free": (problem.free, shard.free),
+        "mass": (problem.mass, shard.mass),
+        "young": (materials.young, shard.young),
+        "poisson": (materials.poisson, shard.poisson),
+        "density": (materials.density, shard.density),
+        "time_step": (np.array(problem.time_step), np.array(step)),
+    }
+    for name, (found, stored) in pairs.items():
+        if found.shape != stored.shape or not np.allclose(found, stored, rtol=1e-9, atol=1e-12):
+            raise InputError(
+                f"{path}: {name} rebuilt from the stored scene differs from the file's: expected "
+                "the same. Was the file made by another version of the code?"
+            )
+
+
+def _check_loads(problem: Problem, shard: Shard, path: Path, k: int) -> None:
+    """The same for the loads in the first and the last step."""
+    forces, h = shard.simulations[k].forces, problem.time_step
+    size = float(np.abs(forces).max())
+    for step in (0, len(forces) - 1):
+        found = problem.external_forces(step * h, (step + 1) * h)
+        if np.abs(found - forces[step]).max() > FORCE_ERROR * size:
+            raise InputError(
+                f"{path}: simulation {k}: loads of step {step + 1} rebuilt from the stored scene "
+                "differ from the file's: expected the same."
+            )

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import ctrl_c_ignored, write_text
 from pdcorrect.data.config import TRAINING
-from pdcorrect.data.damage import Damage, whole_files
-from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.folder import Damage, shard_paths, whole_files
 from pdcorrect.data.schema import NORMALISATION
 from pdcorrect.data.shard_arrays import (
     MeshArrays,

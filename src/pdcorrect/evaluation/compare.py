@@ -19,8 +19,7 @@ from pdcorrect.evaluation.comparison_cases import (
     check_corrected,
     without_best,
 )
-from pdcorrect.fem.coarse_models import BASES
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import BASES, Problem, discretise
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -145,8 +144,8 @@ def case_stepper(scene: Scene, case: Case) -> Stepper:
     """
     if case.model is None:
         return _stepper(case.problem(scene), case.solver)
+    from pdcorrect.corrector.hybrid import hybrid_of
     from pdcorrect.corrector.model_io import load_model
-    from pdcorrect.corrector.released import hybrid_of
 
     check_corrected(case, load_model(case.model).base)
     return hybrid_of(scene, case.model, gate=case.gate).prepare()
@@ -243,7 +242,7 @@ def _models(cases: Sequence[Case], runs: Mapping[str, Trajectory]) -> dict[str, 
     """Which models the correctors are, by label."""
     if not any(case.model for case in cases):
         return {}
-    from pdcorrect.corrector.released import about_model
+    from pdcorrect.corrector.hybrid import about_model
 
     found = {case.label: about_model(case.model) for case in cases if case.model}
     for label in found.keys() & runs.keys():

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.coarse_models import BASES, coarse_model
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import BASES, Problem, coarse_model, discretise
 from pdcorrect.scene import Scene, best_coarse
 
 

@@ -17,13 +17,18 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.config import EVALUATION
-from pdcorrect.data.damage import Damage
-from pdcorrect.data.missing import accepted_gaps
+from pdcorrect.data.folder import Damage, accepted_gaps
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.alone import roll_out_alone, single_steps_alone
-from pdcorrect.evaluation.cases import Case, read_cases
-from pdcorrect.evaluation.measures import Measured, Outcome, TrajectoryMeasures, measure
+from pdcorrect.evaluation.measures import (
+    Case,
+    Measured,
+    Outcome,
+    TrajectoryMeasures,
+    measure,
+    read_cases,
+)
 from pdcorrect.evaluation.rollouts import Hybrid, roll_out, single_steps
 from pdcorrect.fem.problem import Problem
 

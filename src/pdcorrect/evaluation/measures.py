@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,12 +13,17 @@ from numpy.typing import NDArray
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
-from pdcorrect.data.schema import CONVERGED, PLAIN
-from pdcorrect.errors import ConvergenceError
-from pdcorrect.evaluation.cases import Case
-from pdcorrect.evaluation.physics import energies, stress_error
+from pdcorrect.data.config import EVALUATION
+from pdcorrect.data.folder import Damage, shard_paths, whole_files
+from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
+from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.simulate import rebuilt_problems
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.graph import velocities
+from pdcorrect.fem.problem import BASES, Problem
+from pdcorrect.fem.stress import stress
 from pdcorrect.metrics import (
+    EnergyBalance,
     angular_momentum,
     error_over_time,
     largest_displacement,
@@ -26,6 +34,178 @@ from pdcorrect.metrics import (
 )
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A simulation of a split and what is known of it.
+
+    Attributes
+    ----------
+    mesh, simulation : int
+        Numbers of the mesh in its split and of the simulation on it.
+    problems : mapping of str to Problem
+        Coarse models by the run they made, "plain" among them.
+    reference : (T+1, N, 3)
+        m.
+    runs : mapping of str to (T+1, N, 3)
+        Stored rollouts, m.
+    predictions : mapping of str to (T, N, 3)
+        Stored single steps from the reference's frames, m.
+    """
+
+    mesh: int
+    simulation: int
+    problems: Mapping[str, Problem]
+    reference: Array
+    runs: Mapping[str, Array]
+    predictions: Mapping[str, Array]
+    _energies: dict[str, EnergyBalance] = field(default_factory=dict, repr=False)
+
+    def reference_energies(self, base: str) -> EnergyBalance:
+        """Of the reference by a coarse model; kept, for all runs are compared with them."""
+        if base not in self._energies:
+            self._energies[base] = energies(self.problems[base], self.reference)
+        return self._energies[base]
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return len(self.reference) - 1
+
+    @property
+    def time_step(self) -> float:
+        """In s."""
+        return self.problems[PLAIN].time_step
+
+    @property
+    def cell_size(self) -> float:
+        """Of the coarse mesh, m."""
+        return self.problems[PLAIN].cell_size
+
+
+@dataclass(frozen=True, eq=False)
+class SplitCases:
+    """A split's simulations in float64; see `read_cases`."""
+
+    attributes: Mapping[str, str | int | float]
+    cases: tuple[Case, ...]
+    shards: Mapping[str, str]
+    damaged: Damage
+
+
+def read_cases(
+    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = (), *, skip_damaged: bool
+) -> SplitCases:
+    """All simulations of a split and their coarse models' problems.
+
+    Parameters
+    ----------
+    folder : path
+    split : str
+    bases : iterable of str
+        Coarse models besides the plain one.
+    skip_damaged : bool
+        Leave out files that are damaged.
+
+    Raises
+    ------
+    InputError
+        If the split is missing, of several data sets, or its problems cannot be rebuilt.
+    FileFormatError
+        If a file is damaged; with ``skip_damaged`` if all are.
+    """
+    damaged: Damage = {}
+    paths = whole_files(shard_paths(folder, split), damaged if skip_damaged else None)
+    wanted = [PLAIN, *(base for base in dict.fromkeys(bases) if base != PLAIN)]
+    shards: dict[str, str] = {}
+    cases: list[Case] = []
+    attributes: list[Mapping[str, str | int | float]] = []
+    for path in paths:
+        shard = read_shard(path)
+        attributes.append(shard.attributes)
+        shards[path.name] = stored_hashes(path)[1]
+        cases += _cases(shard, path, wanted)
+    if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
+        raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
+    return SplitCases(attributes[0], tuple(cases), shards, damaged)
+
+
+def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
+    for base in bases:
+        if base not in BASES:
+            raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
+    problems = {base: rebuilt_problems(shard, path, base) for base in bases}
+    for base in BASES:  # what is told of a stored run does not depend on the candidates
+        if base in shard.simulations[0].runs and base not in problems:
+            problems[base] = rebuilt_problems(shard, path, base)
+    out = []
+    for k, simulation in enumerate(shard.simulations):
+        reference = simulation.runs[REFERENCE].positions
+        if reference is None:
+            raise InputError(f"{path}: simulation {k} has no reference rollout.")
+        others = {name: run for name, run in simulation.runs.items() if name != REFERENCE}
+        rollouts = _float64({name: run.positions for name, run in others.items()})
+        out.append(
+            Case(
+                int(shard.attributes["number"]),
+                k,
+                {base: each[k] for base, each in problems.items()},
+                _from_rest(reference.astype(np.float64), shard.points),
+                {name: _from_rest(x, shard.points) for name, x in rollouts.items()},
+                _float64({name: run.predictions for name, run in others.items()}),
+            )
+        )
+    return out
+
+
+def _from_rest(positions: Array, rest: Array) -> Array:
+    """A stored rollout with the rest shape in frame 0, which storing has rounded."""
+    return np.concatenate([rest[None], positions[1:]])
+
+
+def _float64(arrays: Mapping[str, NDArray[np.generic] | None]) -> dict[str, Array]:
+    return {name: x.astype(np.float64) for name, x in arrays.items() if x is not None}
+
+
+_STRESS_FRAMES = 10
+
+
+def energies(problem: Problem, positions: Array) -> EnergyBalance:
+    """Energies of a rollout from rest, and the work of the loads, by a coarse model.
+
+    Velocities are backward differences of the positions, and loads act along the path as in
+    the solver: those that follow the body are sampled where a step starts.
+    """
+    h, speeds = problem.time_step, velocities(positions, problem.time_step)
+    work = [
+        float(np.vdot(problem.external_forces(t * h, (t + 1) * h, x), y - x))
+        for t, (x, y) in enumerate(pairwise(positions))
+    ]
+    none = np.zeros(len(positions))
+    return EnergyBalance(
+        kinetic=np.array([0.5 * np.vdot(v, problem.mass_times(v)) for v in speeds]),
+        elastic=np.array([problem.energy(x) for x in positions]),
+        external_work=np.concatenate([[0.0], np.cumsum(work)]),
+        clamp_work=none,
+        damping_loss=none,
+    )
+
+
+def stress_error(problem: Problem, positions: Array, reference: Array) -> float | None:
+    """Relative RMS difference of Cauchy stress at quadrature points, by rest volume.
+
+    Over about ten frames, evenly spaced, the last one among them.  None if a cell is flat or
+    the reference has no stress.
+    """
+    frames = np.unique(np.linspace(0, len(reference) - 1, _STRESS_FRAMES + 1).round()[1:])
+    difference = size = 0.0
+    for frame in frames.astype(int):
+        ours, truth = (stress(problem, x[frame]) for x in (positions, reference))
+        weights = truth.weights[..., None, None]
+        difference += float((weights * (ours.cauchy - truth.cauchy) ** 2).sum())
+        size += float((weights * truth.cauchy**2).sum())
+    return float(np.sqrt(difference / size)) if size and np.isfinite(difference) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem import tangent_kernels
+from pdcorrect.fem import kernels as tangent_kernels
 from pdcorrect.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError
-from pdcorrect.fem.conjugate_gradients import NotPositiveDefinite as NotPositiveDefinite
-from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.fem.multigrid import NotPositiveDefinite as NotPositiveDefinite
+from pdcorrect.fem.multigrid import conjugate_gradients
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "band", "cholespy", "splu", "amg"]

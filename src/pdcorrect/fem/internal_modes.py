@@ -6,10 +6,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdcorrect.fem.blocks import CHUNK, PARALLEL, deformation, nodal_forces, total
 from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
-from pdcorrect.fem.tangent_kernels import stiffness
+from pdcorrect.fem.kernels import CHUNK, PARALLEL, deformation, nodal_forces, stiffness, total
 
 Array = NDArray[np.float64]
 

@@ -2,23 +2,157 @@
 
 from __future__ import annotations
 
+import os
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
-from pdcorrect.fem.blocks import (
-    CHUNK,
-    PARALLEL,
-    block_shape,
-    deformation,
-    fill,
-    first_volume_lane,
-    gather_nodes,
-    nodal_forces,
-    take,
-    total,
-)
-from pdcorrect.fem.decomposition import signed_svd_lanes
+from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
+
+# GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
+# takes longer as soon as other processes want the cores (benchmarks, case threads).
+os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
+
+REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
+
+CHUNK = 16
+"""Cells that one thread takes at a time."""
+
+_LANES = 32
+"""Quadrature points that are decomposed together.
+
+Divisions and square roots take long to answer, but several can be under way: 32 take half the
+time of four times 8 (``benchmarks``, case kernel).
+"""
+
+_WIDTH = 8
+"""Lanes are filled up to a multiple of this, the numbers in the widest SIMD register."""
+
+
+@njit(**OPTIONS)
+def deformation(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-def]
+    """Diagonal I + sum_k u_k grad N_k, (9, Q), for nodal vectors u (N, 3); F for diagonal 1."""
+    for i in range(3):
+        for j in range(3):
+            for q in range(F.shape[1]):
+                F[3 * i + j, q] = diagonal if i == j else 0.0
+    for k in range(nodes.shape[0]):
+        node = nodes[k]
+        for i in range(3):
+            value = u[node, i]
+            for j in range(3):
+                for q in range(F.shape[1]):
+                    F[3 * i + j, q] += value * gradients[k, j, q]
+
+
+@njit(**REDUCE)
+def nodal_forces(P, gradients, sign, out):  # type: ignore[no-untyped-def]
+    """out[k, i] = sign sum_q P_ij dN_k/dx_j for P (9, Q), weights included."""
+    for k in range(out.shape[0]):
+        for i in range(3):
+            total = 0.0
+            for q in range(P.shape[1]):
+                total += (
+                    P[3 * i, q] * gradients[k, 0, q]
+                    + P[3 * i + 1, q] * gradients[k, 1, q]
+                    + P[3 * i + 2, q] * gradients[k, 2, q]
+                )
+            out[k, i] = sign * total
+
+
+@njit(**REDUCE)
+def total(a):  # type: ignore[no-untyped-def]
+    """Sum of a vector."""
+    out = 0.0
+    for i in range(a.shape[0]):
+        out += a[i]
+    return out
+
+
+@njit(**PARALLEL)
+def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
+    """out[n] = sum of values[slot] over the (cell, local node) slots of node n.
+
+    Parameters
+    ----------
+    start : (N + 1,), slots : (C K,)
+        Slots of each node, compressed rows.
+    values : (C K, 3), out : (N, 3)
+    """
+    for n in prange(len(start) - 1):
+        x, y, z = 0.0, 0.0, 0.0
+        for i in range(start[n], start[n + 1]):
+            slot = slots[i]
+            x += values[slot, 0]
+            y += values[slot, 1]
+            z += values[slot, 2]
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+
+
+@njit(**OPTIONS)
+def block_shape(points):  # type: ignore[no-untyped-def]
+    """Cells of ``points`` quadrature points in a block, and its lanes."""
+    cells = max(1, _LANES // points)
+    return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
+
+
+@njit(**OPTIONS)
+def put(one, j, cells, first, block):  # type: ignore[no-untyped-def]
+    """Copy cell j's lanes (n, Q) into a block's (n, lanes).
+
+    All cells' lanes without a volume term come before those with one.
+    """
+    points = one.shape[1]
+    low, high = j * first, cells * first + j * (points - first)
+    for i in range(one.shape[0]):
+        for q in range(first):
+            block[i, low + q] = one[i, q]
+        for q in range(points - first):
+            block[i, high + q] = one[i, first + q]
+
+
+@njit(**OPTIONS)
+def take(block, j, cells, first, one):  # type: ignore[no-untyped-def]
+    """The reverse of `put`."""
+    points = one.shape[1]
+    low, high = j * first, cells * first + j * (points - first)
+    for i in range(one.shape[0]):
+        for q in range(first):
+            one[i, q] = block[i, low + q]
+        for q in range(points - first):
+            one[i, first + q] = block[i, high + q]
+
+
+@njit(**OPTIONS)
+def fill(u, cells, gradients, weights, begin, end, first, one, F, w):  # type: ignore[no-untyped-def]
+    """Deformation gradients F (9, lanes) and weights w (2, lanes) of cells begin ... end - 1.
+
+    Lanes that no cell uses hold the identity and no weight.
+    """
+    size, _ = block_shape(one.shape[1])
+    for i in range(9):
+        for l in range(F.shape[1]):
+            F[i, l] = 1.0 if i % 4 == 0 else 0.0
+    w[:] = 0.0
+    for c in range(begin, end):
+        deformation(u, cells[c], gradients[c], 1.0, one)
+        put(one, c - begin, size, first, F)
+        put(weights[c], c - begin, size, first, w)
+
+
+@njit(**OPTIONS)
+def first_volume_lane(first, points, w):  # type: ignore[no-untyped-def]
+    """First lane of a block with a volume term; the number of lanes where there is none."""
+    size, lanes = block_shape(points)
+    start = size * first
+    for l in range(start, lanes):
+        if w[1, l] > 0.0:
+            return start
+    return lanes
 
 
 @njit(**PARALLEL)
@@ -114,3 +248,109 @@ def linearise_cells(  # type: ignore[no-untyped-def]
                 take(U, c - begin, size, first, left[c])
                 take(V, c - begin, size, first, right[c])
                 take(T, c - begin, size, first, tangent[c])
+
+
+@njit(**PARALLEL)
+def apply_linearised(  # type: ignore[no-untyped-def]
+    x, cells, gradients, left, right, tangent, by_cell, start, slots, out
+):
+    """Tangent times x (N, 3), out (N, 3); other arguments as `energy_and_forces`."""
+    count, lanes = cells.shape[0], tangent.shape[2]
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        D, A = np.empty((9, lanes)), np.empty((9, lanes))
+        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+            deformation(x, cells[c], gradients[c], 0.0, D)
+            _transform(left[c], D, right[c], A, True)
+            _tangent_product(tangent[c], A)
+            _transform(left[c], A, right[c], D, False)
+            nodal_forces(D, gradients[c], 1.0, by_cell[c])
+    gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
+
+
+@njit(**OPTIONS)
+def _transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
+    """Out = U^T A V (forward) or U A V^T, all (9, Q)."""
+    for i in range(3):
+        for j in range(3):
+            for q in range(A.shape[1]):
+                total = 0.0
+                for a in range(3):
+                    left = U[3 * a + i, q] if forward else U[3 * i + a, q]
+                    for b in range(3):
+                        right = V[3 * b + j, q] if forward else V[3 * j + b, q]
+                        total += left * A[3 * a + b, q] * right
+                out[3 * i + j, q] = total
+
+
+@njit(**OPTIONS)
+def _tangent_product(T, A):  # type: ignore[no-untyped-def]
+    """A <- tangent : A in the frame of the SVD, in place."""
+    for q in range(A.shape[1]):
+        x, y, z = A[0, q], A[4, q], A[8, q]
+        A[0, q] = T[0, q] * x + T[3, q] * y + T[4, q] * z
+        A[4, q] = T[3, q] * x + T[1, q] * y + T[5, q] * z
+        A[8, q] = T[4, q] * x + T[5, q] * y + T[2, q] * z
+        for pair in range(3):
+            i, j = pair // 2, 1 + (pair + 1) // 2
+            x, y = A[3 * i + j, q], A[3 * j + i, q]
+            A[3 * i + j, q] = T[6 + pair, q] * x + T[9 + pair, q] * y
+            A[3 * j + i, q] = T[6 + pair, q] * y + T[9 + pair, q] * x
+
+
+@njit(**PARALLEL)
+def cell_stiffness(cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
+    """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
+    count, width, lanes = cells.shape[0], cells.shape[1], tangent.shape[2]
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        A, P = np.empty((9, lanes)), np.empty((9, lanes))
+        K = np.empty((width, 3, width, 3))
+        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
+            stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
+            for k in range(width):
+                for l in range(width):
+                    for i in range(3):
+                        for j in range(3):
+                            high = K[k, i, l, j] if k >= l else K[l, j, k, i]
+                            out[c, k, l, i, j] = high
+
+
+@njit(**REDUCE)
+def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
+    """Lower triangle of one cell's tangent stiffness, out (L, 3, L, 3), N/m.
+
+    The stress P that a unit amplitude of function k in direction i causes does work
+    on all other functions.  A (9, Q) and P (9, Q) are scratch.
+    """
+    lanes = T.shape[1]
+    for k in range(gradients.shape[0]):
+        for i in range(3):
+            for a in range(3):
+                for b in range(3):
+                    for q in range(lanes):
+                        along = (
+                            V[b, q] * gradients[k, 0, q]
+                            + V[3 + b, q] * gradients[k, 1, q]
+                            + V[6 + b, q] * gradients[k, 2, q]
+                        )
+                        A[3 * a + b, q] = U[3 * i + a, q] * along  # U^T (e_i x grad N_k) V
+            _tangent_product(T, A)
+            _transform(U, A, V, P, False)
+            for l in range(k + 1):
+                for j in range(3):
+                    total = 0.0
+                    for q in range(lanes):
+                        total += (
+                            P[3 * j, q] * gradients[l, 0, q]
+                            + P[3 * j + 1, q] * gradients[l, 1, q]
+                            + P[3 * j + 2, q] * gradients[l, 2, q]
+                        )
+                    out[k, i, l, j] = total
+
+
+@njit(**OPTIONS)
+def add_blocks(target, blocks, data):  # type: ignore[no-untyped-def]
+    """data[target[i]] += blocks[i] for node blocks (n, 3, 3)."""
+    for i in range(len(target)):
+        for a in range(3):
+            for b in range(3):
+                data[target[i], a, b] += blocks[i, a, b]

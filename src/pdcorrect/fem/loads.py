@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import SceneError
-from pdcorrect.fem.fields import cofactor, tensor_cross, torsion_field, torsion_pull
+from pdcorrect.fem.clamps import Selector, cofactor, tensor_cross, torsion_field, torsion_pull
 from pdcorrect.fem.operators import Space, scatter
 from pdcorrect.fem.quadrature import FaceQuadrature
-from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import (
     BodyForce,
     Force,

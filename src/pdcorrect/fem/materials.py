@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.hyperelasticity import COROTATED, energy_code
-from pdcorrect.fem.selection import Selector
 from pdcorrect.scene import Material, Scene
 from pdcorrect.scene.materials import lame
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Real
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError, MeshError, SceneError
 from pdcorrect.fem.banded import BandOrder
-from pdcorrect.fem.clamps import Clamps, resolve_clamps
+from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
-from pdcorrect.fem.selection import Selector
-from pdcorrect.scene import Load, MeshFile, Scene, check_scene
+from pdcorrect.scene import Load, MeshFile, Scene, best_coarse, check_scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -306,3 +305,39 @@ def _check_size(scene: Scene, cells: int, refine: int) -> None:
 def _freeze(*arrays: NDArray[np.generic]) -> None:
     for array in arrays:
         array.flags.writeable = False
+
+
+Base = Literal["plain", "best", "total-mass"]
+
+BASES: tuple[str, ...] = get_args(Base)
+
+
+def coarse_model(scene: Scene, base: str = "plain", refine: int = 4) -> Problem:
+    """A scene on its coarse mesh, by the name that a corrector's training has for it.
+
+    Parameters
+    ----------
+    scene : Scene
+    base : {"plain", "best", "total-mass"}
+        As the scene says; with element and masses of `best_coarse`; or with its density scaled so
+        that it has the total mass of the scene refined.  The last is for ``mass = "per-node"``, by
+        which a mesh is the heavier the coarser it is; with the other rules it changes nothing
+        but for regions of another density that end inside of coarse cells.
+    refine : int
+        Of the mesh with that mass: 4 is what correctors were trained beside.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown.
+    SceneError, MeshError
+        See `discretise`.
+    """
+    if base not in BASES:
+        raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
+    if base == "best":
+        return discretise(best_coarse(scene))
+    plain = discretise(scene)
+    if base == "plain":
+        return plain
+    return plain.with_total_mass(float(discretise(scene, refine).mass.sum()))

@@ -22,9 +22,17 @@ from pdcorrect.figures.curves import (
     plot_error_over_time,
     plot_node_trajectories,
 )
-from pdcorrect.figures.files import Image, replacing, write_film, write_png
-from pdcorrect.figures.offscreen import check_offscreen
-from pdcorrect.figures.panels import Body, Painter, View, shown_points
+from pdcorrect.figures.panels import (
+    Body,
+    Image,
+    Painter,
+    View,
+    check_offscreen,
+    replacing,
+    shown_points,
+    write_film,
+    write_png,
+)
 from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
 from pdcorrect.trajectory import Trajectory
 

@@ -10,20 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, require_extra
-from pdcorrect.figures.files import replacing
+from pdcorrect.figures.panels import replacing
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+
 _FONT = 9
 """Of legends, points."""
+
 _STYLES = ("-", "--", "-.", ":")
+
 _ENERGIES = {
     "elastic_energy": "elastic [J]",
     "kinetic_energy": "kinetic [J]",
     "external_work": "work of the loads [J]",
 }
+
 _OTHER_WORK = {"clamp_work": "work of the clamps [J]", "damping_loss": "lost to damping [J]"}
 """Drawn where a run has any."""
 
@@ -191,5 +195,69 @@ def plot_error_against_time(points: Mapping[str, tuple[float, float]], output: s
         direction.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
         direction.set_major_formatter("{x:g}")
         direction.set_minor_formatter(ticker.NullFormatter())
+    _legend(figure, [axis])
+    return _save(figure, output)
+
+
+_BINS = 24
+
+_HALF = 50.0  # per cent
+
+
+def plot_omega(values: Mapping[str, Sequence[float]], output: str | Path) -> Path:
+    """Histograms over trajectories of Omega, per cent, one outline a model.
+
+    Raises
+    ------
+    InputError
+        If a model has no value, or there is no model.
+    """
+    if not values or not all(len(found) for found in values.values()):
+        raise InputError("Omega by model: expected one model or more, each with values.")
+    every = np.concatenate([np.asarray(found, dtype=np.float64) for found in values.values()])
+    low, high = float(every.min()), float(every.max())
+    edges = (
+        np.linspace(low - 0.5, high + 0.5, _BINS + 1)
+        if high - low < 1.0
+        else np.linspace(low, high, _BINS + 1)
+    )
+    figure, (axis,) = _axes(1, 4.0)
+    for index, (label, found) in enumerate(values.items()):
+        axis.hist(found, edges, histtype="step", label=label, **_style(index))
+    axis.axvline(0.0, color="0.5", linewidth=0.8)
+    axis.set_xlabel("share of the plain run's squared error removed [%]")
+    axis.set_ylabel("trajectories")
+    _legend(figure, [axis])
+    return _save(figure, output)
+
+
+def plot_validations(
+    histories: Mapping[str, tuple[Sequence[float], Sequence[float]]], output: str | Path
+) -> Path:
+    """Omega on the validation split, per cent, over the time of training, s, one line a training.
+
+    Zero is in the plot only where a value is below 50 %: what is near 100 is told apart then.
+
+    Parameters
+    ----------
+    histories : mapping of str to (seconds, omegas)
+        Of each validation.
+    output : path
+
+    Raises
+    ------
+    InputError
+        If there is no training, or one has no validation or not as many times as values.
+    """
+    lengths = [(len(seconds), len(omegas)) for seconds, omegas in histories.values()]
+    if not lengths or not all(0 < n == m for n, m in lengths):
+        raise InputError("Omega over time: expected trainings, each with times and values.")
+    figure, (axis,) = _axes(1, 4.5)
+    for index, (label, (seconds, omegas)) in enumerate(histories.items()):
+        axis.plot(seconds, omegas, marker="o", markersize=4, label=label, **_style(index))
+    if min(min(omegas) for _, omegas in histories.values()) < _HALF:
+        axis.axhline(0.0, color="0.5", linewidth=0.8)
+    axis.set_xlabel("time of training [s]")
+    axis.set_ylabel("Omega, mean on the validation split [%]")
     _legend(figure, [axis])
     return _save(figure, output)

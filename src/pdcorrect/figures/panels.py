@@ -5,25 +5,36 @@ All panels share a camera with parallel projection, so that lengths compare.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from pdcorrect.errors import require_extra
+from pdcorrect import _files as replacement
+from pdcorrect.errors import InputError, OutputError, require_extra
 from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 _TO_CAMERA = np.array([-0.55, -1.0, 0.5])
+
 _MARGIN = 0.04  # of the panel's width, kept free on each side
+
 _SHAPES = 0.42, 1.25  # smallest and largest height of a panel, in widths
+
 _OVERSAMPLING = 2
+
 _LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
 """Places (right, up, towards the camera) and strengths."""
+
 _PLAIN, _INK = "#7f9fc4", "#202020"
 
 
@@ -245,3 +256,103 @@ def _pyvista() -> Any:
     logger = require_extra("vtkmodules.vtkCommonCore", "view").vtkLogger
     logger.SetStderrVerbosity(logger.VERBOSITY_ERROR)
     return pyvista
+
+
+Image = NDArray[np.uint8]
+"""RGB picture, (height, width, 3)."""
+
+
+@contextlib.contextmanager
+def replacing(output: Path) -> Iterator[Path]:
+    """A name to write to, which becomes ``output`` when all is written."""
+    if output.is_dir():
+        raise OutputError(f"{output}: is a folder; give the name of a file in it.")
+    if not output.parent.is_dir():
+        raise OutputError(f"{output}: there is no folder {output.parent}; create it first.")
+    part = output.with_name(f"{output.stem}.part{output.suffix}")
+    try:
+        with replacement.replacing(output, part):
+            yield part
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be written ({error.strerror or error}).") from error
+
+
+def write_png(path: Path, page: Image) -> None:
+    """Write one picture."""
+    require_extra("PIL.Image", "view").fromarray(page).save(path, optimize=True)
+
+
+def write_film(path: Path, pages: Iterator[Image], fps: float) -> None:
+    """Write a GIF or MP4, by the suffix, with ``fps`` pictures a second."""
+    if not fps > 0:
+        raise InputError(f"fps = {fps}: expected more than 0.")
+    if path.suffix.lower() == ".gif":
+        _write_gif(path, list(pages), fps)
+        return
+    require_extra("imageio_ffmpeg", "view")
+    writer = require_extra("imageio.v2", "view").get_writer(
+        path, fps=fps, codec="libx264", quality=8, macro_block_size=2, ffmpeg_log_level="error"
+    )
+    with writer:
+        for page in pages:
+            writer.append_data(page)
+
+
+def _write_gif(path: Path, pages: list[Image], fps: float) -> None:
+    """All pages share one palette, so that nothing flickers."""
+    pil = require_extra("PIL.Image", "view")
+    palette = _palette(np.concatenate([pages[k] for k in {0, len(pages) // 2, len(pages) - 1}]))
+    levels = 4.0 * np.arange(64) + 2.0
+    cube = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
+    nearest = cKDTree(palette).query(cube)[1].astype(np.uint8)  # (64, 64, 64)
+    drawn = []
+    for page in pages:
+        image = pil.fromarray(nearest[tuple(np.moveaxis(page >> 2, -1, 0))])
+        image.putpalette(palette.astype(np.uint8).tobytes())
+        drawn.append(image)
+    duration = max(20, round(1000 / fps))  # ms; browsers slow down faster ones
+    drawn[0].save(
+        path, save_all=True, append_images=drawn[1:], duration=duration, loop=0, optimize=False
+    )
+
+
+def _palette(sample: Image) -> NDArray[np.float64]:
+    """White and 255 other colours (256, 3) for a picture."""
+    pil = require_extra("PIL.Image", "view")
+    # each colour once, to 8 levels, however often it is used: small things keep theirs
+    colours = np.unique(sample.reshape(-1, 3) & 0xF8, axis=0) | 4
+    chosen = pil.fromarray(colours[None]).quantize(255, kmeans=3).getpalette()
+    palette = np.full((256, 3), 255.0)
+    palette[1 : 1 + len(chosen) // 3] = np.reshape(chosen, (-1, 3))[:255]
+    return palette
+
+
+_PROBE = """
+import pyvista as pv
+plotter = pv.Plotter(off_screen=True, window_size=(64, 64))
+plotter.add_mesh(pv.Cube(), color="red")
+image = plotter.screenshot(return_img=True)
+assert image.reshape(-1, 3).std() > 0
+window = plotter.render_window
+lines = window.ReportCapabilities().splitlines() if window else []
+found = [line.split(":", 1)[1].strip() for line in lines if "renderer string" in line]
+print(pv.__version__, type(window).__name__, found[0] if found else "")
+"""
+
+
+def check_offscreen(timeout: float = 120.0) -> str:
+    """Draw a cube in another process, which may crash: "ok (...)" or what to install."""
+    remedy = (
+        "install EGL with `apt-get install libegl1 libgl1` (Debian, Ubuntu) or use a VTK built "
+        "with OSMesa"
+    )
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer in {timeout:g} s; {remedy}"
+    if probe.returncode == 0:
+        return f"ok ({' '.join(probe.stdout.split())})"
+    last = probe.stderr.strip().splitlines()[-1:] or [f"exit status {probe.returncode}"]
+    return f"failed ({last[0]}); {remedy}"

@@ -9,10 +9,12 @@ mode: a killed writer leaves it readable.
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -24,10 +26,62 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import part_of, replacing
 from pdcorrect.errors import OutputError
-from pdcorrect.io.disk_space import Reserve, abandon
 from pdcorrect.io.superblock import read_superblock
 
+_UNSUPPORTED = (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS)
+
+
+class Reserve:
+    """Keeps a file longer than what has been written to it so far."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._end = 0
+
+    def ensure(self, used: int, need: int) -> None:
+        """Make room for ``need`` bytes after the ``used`` ones.
+
+        Raises
+        ------
+        OSError
+            If there is none.
+        """
+        allocate = getattr(os, "posix_fallocate", None)  # not on every system
+        if used + need <= self._end or allocate is None:
+            return
+        descriptor = os.open(self._path, os.O_RDWR)
+        try:
+            allocate(descriptor, used, need)
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                raise
+        finally:
+            os.close(descriptor)
+        self._end = used + need
+
+    def release(self, used: int) -> None:
+        """Cut off what was not needed of the closed file."""
+        if self._end and self._path.stat().st_size > used:
+            os.truncate(self._path, used)
+        self._end = 0
+
+
+def abandon(file: Any, path: Path) -> None:
+    """Close an h5py file that can no longer be written, without changing it on the disk.
+
+    HDF5 is given a scratch copy to finish its writing on.  If there is no room
+    for one either, the file stays open.
+    """
+    with contextlib.suppress(Exception), tempfile.TemporaryFile() as scratch:
+        with path.open("rb") as original:
+            shutil.copyfileobj(original, scratch)
+        scratch.flush()
+        os.dup2(scratch.fileno(), file.id.get_vfd_handle())
+        file.close()
+
+
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
+
 _FILL: dict[str, Any] = {"f": np.nan, "i": -1, "S": b""}
 
 

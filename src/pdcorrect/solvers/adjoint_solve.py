@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.assembly import Assembly
-from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
 
 Array = NDArray[np.float64]

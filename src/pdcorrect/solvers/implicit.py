@@ -17,8 +17,7 @@ from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
 from pdcorrect.solvers.integrators import integrator as make_integrator
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve
-from pdcorrect.solvers.newton_loop import newton_cg
+from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
 from pdcorrect.solvers.step import (
     GlobalSolver,
     StepObjective,

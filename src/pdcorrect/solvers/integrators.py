@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
 from pdcorrect.solvers.linear import Linear, by_component

@@ -9,12 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.conjugate_gradients import Solution, conjugate_gradients
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite
+from pdcorrect.fem.multigrid import Solution, conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve, largest_displacement
-from pdcorrect.solvers.newton_loop import Direction, newton_loop
+from pdcorrect.solvers.minimise import (
+    Direction,
+    MinimiserOptions,
+    Minimum,
+    Solve,
+    largest_displacement,
+    newton_loop,
+)
 from pdcorrect.solvers.step import HessianOperator, StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory, TangentSolver
 

@@ -15,7 +15,7 @@ from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.first_hessian import TrueHessian
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
-from pdcorrect.solvers.lbfgs import MinimiserOptions, Minimum, Solve, minimise
+from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, minimise
 from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory
 from pdcorrect.state import State, Status, StepResult

@@ -20,7 +20,7 @@ from pydantic.config import JsonDict
 from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.corrector.config import PRESETS, CorrectorConfig, changed
 from pdcorrect.data.config import TRAINING, VALIDATION
-from pdcorrect.fem.coarse_models import Base
+from pdcorrect.fem.problem import Base
 
 _FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]

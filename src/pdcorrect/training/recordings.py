@@ -13,13 +13,12 @@ import torch
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import Folders, folders_of, shard_paths
-from pdcorrect.data.scene_mesh import discretise_stored
+from pdcorrect.data.importing import discretise_stored
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
 from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
-from pdcorrect.fem.coarse_models import Base
-from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.problem import Base, Problem
 from pdcorrect.scene import Scene, best_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 

@@ -17,8 +17,7 @@ from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.coarse_models import Base
-from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.problem import Base, Problem
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
 from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 

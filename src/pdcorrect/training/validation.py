@@ -19,7 +19,7 @@ from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.fem.coarse_models import Base
+from pdcorrect.fem.problem import Base
 from pdcorrect.training.recordings import Recording, rounding
 from pdcorrect.training.scenes import SceneGroup
 from pdcorrect.training.world import World

@@ -20,10 +20,9 @@ from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import TRAINING
 from pdcorrect.data.folder import Folders
-from pdcorrect.data.reader import CACHE_BYTES, TrajectoryDataset, TrajectoryLoader
-from pdcorrect.data.sampling import ShardShuffle
+from pdcorrect.data.reader import CACHE_BYTES, ShardShuffle, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.errors import InputError
-from pdcorrect.fem.coarse_models import Base
+from pdcorrect.fem.problem import Base
 from pdcorrect.training.losses import BaseErrors
 from pdcorrect.training.recordings import Recording, base_errors
 from pdcorrect.training.resident import ResidentWindows, StoredWindows

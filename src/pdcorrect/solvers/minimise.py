@@ -22,22 +22,28 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.conjugate_gradients import conjugate_gradients
+from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.state import Status
 
 Array = NDArray[np.float64]
+
 Solve = Callable[[Array], Array]
 
 ARMIJO = 1e-4
+
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
+
 BACKTRACKS = 30
+
 _ESTIMATE_STEPS = 1000
+
 NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 
 Otherwise stiff bodies would not move at all where the motion is below the tolerance.
 """
+
 FIRST_CHECK = 0.15
 """Length of the loop's own step, of the tolerance, at which the estimate is first made.
 
@@ -302,3 +308,62 @@ def newton_step(
     )
     exact = found.converged and found.convex
     return found.x, largest_displacement(found.x) if exact else math.inf
+
+
+_INNER_STEPS = 400
+
+
+Direction = Callable[[Array, Array], tuple[Array, bool]]
+"""(p, gradient) -> (minus the Newton step, whether the exact, positive Hessian gave it)."""
+
+
+def newton_loop(
+    objective: Objective, start: Array, direction: Direction, options: MinimiserOptions
+) -> Minimum:
+    """Minimise ``objective`` from ``start`` (N, 3) along the steps of ``direction``.
+
+    Converged when a Newton step of the exact Hessian is shorter than the
+    tolerance; ``options.history`` is not used.
+    """
+    p = start
+    value, gradient = objective.value_and_gradient(p)
+    evaluations, estimate, status = 1, math.inf, Status.ITERATION_LIMIT
+    for iteration in range(options.max_iterations + 1):
+        if not math.isfinite(value):
+            status = Status.NOT_FINITE
+            break
+        step, exact = direction(p, gradient)
+        estimate = largest_displacement(step) if exact else math.inf
+        if estimate <= options.tolerance:
+            status = Status.CONVERGED
+            break
+        if iteration == options.max_iterations:
+            break
+        found = line_search(objective, p, value, gradient, step)
+        evaluations += found.evaluations
+        if found.step == 0.0:
+            status = Status.LINE_SEARCH
+            break
+        p, value, gradient = found.positions, found.value, found.gradient
+    return Minimum(p, value, gradient, status, iteration, evaluations, estimate)
+
+
+def newton_cg(
+    objective: Objective, start: Array, solve: Solve, options: MinimiserOptions
+) -> Minimum:
+    """`newton_loop` with conjugate gradients preconditioned by ``solve``.
+
+    Where these meet negative curvature, the direction found so far is used, or
+    minus the preconditioned gradient at the first step.
+    """
+    return newton_loop(
+        objective, start, lambda p, gradient: _direction(objective, p, gradient, solve), options
+    )
+
+
+def _direction(objective: Objective, p: Array, gradient: Array, solve: Solve) -> tuple[Array, bool]:
+    """The (truncated) Newton direction, and whether it is one of the exact, positive Hessian."""
+    found = conjugate_gradients(
+        objective.hessian_operator(p), -gradient, solve, tolerance=1e-3, max_steps=_INNER_STEPS
+    )
+    return found.x, found.converged and found.convex
