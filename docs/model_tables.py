@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import statistics
+import tomllib
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import Any
 
-from records import RECORDS, Rows, interval, number, percent, read
+from records import RECORDS, ROOT, Rows, interval, number, percent, read
 
 MODELS = (
     "impulse-as-published", "stretch-as-published", "torsion-as-published",
@@ -16,9 +16,18 @@ MODELS = (
 EXACT = MODELS[3:]
 THESIS = {"impulse": 95.9, "stretch": 99.1, "torsion": 91.3}
 """Mean Omega of the thesis's own models, of its own meshes and loads (table 7.1)."""
+RECIPES = {
+    "impulse-as-published": "impulse-more/through-windows-longer",
+    "stretch-as-published": "stretch-more/through-more",
+    "torsion-as-published": "torsion-as-published/through",
+    "impulse-exact": "impulse-exact/through-longer",
+    "stretch-exact": "stretch-exact/through-further",
+    "torsion-exact": "torsion-more/best-four",
+}
+"""The last recipe of each model."""
 RUNS = {
     "plain": "plain coarse mesh",
-    "total-mass": "coarse mesh with the reference's total mass",
+    "total-mass": "reference's total mass",
     "best": "best coarse model",
     "intermediate": "intermediate mesh",
     "corrected": "corrected",
@@ -49,19 +58,48 @@ def released() -> Rows:
     for model in (*MODELS, "tiny"):
         record = record_of(model)
         omega = record["runs"]["corrected"]["omega"]
-        sets = [each["name"] for each in data_sets(model)]
         rows.append([
-            f"[`{model}`]({model}/README.md)", base_of(record),
-            ", ".join(f"`{name}`" for name in sets),
+            f"[`{model}`]({model}/README.md)", base_of(record), f"{minutes(model):.0f}",
             percent(omega["mean"]), percent(omega["smallest"]),
         ])  # fmt: skip
-    return ("model", "corrects", "trained on", "Ω mean", "Ω worst"), rows
+    return ("model", "corrects", "training, min", "Ω mean", "Ω worst"), rows
 
 
-def data_sets(model: str) -> list[dict[str, Any]]:
+def minutes(model: str) -> float:
+    """Of training, as all recipes that led to a model ask for."""
+    if model in RECIPES:
+        return sum(seconds_of(name) for name in chain(RECIPES[model])) / 60.0
     record = read(f"models/{model}/model.json")["record"]
-    found: list[dict[str, Any]] = record["training"].get("data_sets", [])
-    return found or [{"name": name} for name in record["dataset"].split("+")]
+    return float(record["training"]["seconds"]) / 60.0
+
+
+def recipe_of(name: str) -> dict[str, Any]:
+    return tomllib.loads((ROOT / f"models/recipes/{name}.toml").read_text(encoding="utf-8"))
+
+
+def start_of(name: str) -> str | None:
+    """The recipe whose model a recipe starts from."""
+    start = recipe_of(name).get("start_from")
+    return None if start is None else start.removeprefix("trainings/").removesuffix("/model")
+
+
+def chain(name: str) -> list[str]:
+    """A recipe and all that it goes on with, first to last."""
+    start = start_of(name)
+    return [*(chain(start) if start else []), name]
+
+
+def seconds_of(name: str) -> float:
+    return sum(stage["seconds"] for stage in recipe_of(name)["stages"])
+
+
+def recipes() -> Rows:
+    """The recipes that led to each model, first to last."""
+    rows = []
+    for model, last in RECIPES.items():
+        each = [f"`{name}` ({seconds_of(name):.0f} s)" for name in chain(last)]
+        rows.append([f"`{model}`", ", ".join(each)])
+    return ("model", "recipes, each going on with the one before"), rows
 
 
 def card(model: str) -> Rows:
@@ -73,11 +111,10 @@ def card(model: str) -> Rows:
             found, omega = runs[run], runs[run]["omega"]
             spread = "–" if run == "plain" else interval(omega["interval"])
             rows.append([
-                label, percent(omega["mean"]), spread, percent(omega["median"]),
-                percent(omega["smallest"]), number(1e3 * found["rms_error"]),
-                number(found["stress_error"]),
+                label, percent(omega["mean"]), spread, percent(omega["smallest"]),
+                number(1e3 * found["rms_error"]), number(found["stress_error"]),
             ])  # fmt: skip
-    return ("run", "Ω mean", "95 %", "median", "worst", "RMS, mm", "stress error, %"), rows
+    return ("run", "Ω mean", "95 %", "worst", "RMS, mm", "stress error, %"), rows
 
 
 def results() -> Rows:
@@ -213,20 +250,11 @@ def other_bodies() -> Rows:
     return head, rows
 
 
-def seeds() -> tuple[float, float]:
-    """Mean and standard deviation of mean Omega over three seeds of one recipe."""
-    each = [
-        t["omega"]["mean"]
-        for t in read("models/withdrawn.json")["trainings"]
-        if t["study"] == "seeds"
-    ]
-    return statistics.mean(each), statistics.stdev(each)
-
-
 def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
-        "models": released, "results": results, "losses": losses, "time-error": time_error,
+        "models": released, "recipes": recipes, "results": results, "losses": losses,
+        "time-error": time_error,
         "further-splits": further_splits, "baselines": baselines, "withdrawn": withdrawn,
         "other-bodies": other_bodies,
         "recipes-compared": partial(trainings, "recipes"),

@@ -7,7 +7,7 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
     python docs/tables.py --check   # exit 1 if a page would change
 
 A table is a function without arguments that returns the header's cells and the rows' cells; those
-of models are in `model_tables`, and what all use in `records`.
+of models are in `model_tables`, those of pages in `page_tables`, and what all use in `records`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import model_tables
+import page_tables
 from records import RECORDS, ROOT, Rows, number, read
 
 _BLOCK = re.compile(r"(<!-- table: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -59,6 +60,7 @@ def _millimetres(metres: float | None, reference: bool) -> str:
 TABLES: dict[str, Callable[[], Rows]] = {
     "demo": demo,
     **dict(model_tables.tables()),
+    **dict(page_tables.tables()),
 }
 
 
@@ -75,6 +77,8 @@ def filled(text: str) -> str:
     """``text`` with all its tables written anew."""
 
     def block(match: re.Match[str]) -> str:
+        if match[2] not in TABLES:
+            raise KeyError(f"no table {match[2]!r}: expected one of {', '.join(TABLES)}")
         return match[1] + "\n" + markdown(*TABLES[match[2]]()) + "\n" + match[3]
 
     return _BLOCK.sub(block, text)
@@ -89,16 +93,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Write the tables of the documentation.")
     parser.add_argument("--check", action="store_true", help="change nothing; exit 1 if needed")
     check = parser.parse_args(arguments).check
-    changed = False
+    changed = failed = False
     for page in pages():
         old = page.read_text(encoding="utf-8")
-        new = filled(old)
+        try:
+            new = filled(old)
+        except KeyError as error:
+            print(f"{page.relative_to(ROOT)}: {error.args[0]}", file=sys.stderr)
+            failed = True
+            continue
         if new != old:
             changed = True
             print(f"{'out of date' if check else 'written'}: {page.relative_to(ROOT)}")
             if not check:
                 page.write_text(new, encoding="utf-8")
-    return 1 if check and changed else 0
+    return 1 if failed or (check and changed) else 0
 
 
 if __name__ == "__main__":

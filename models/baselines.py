@@ -19,8 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from program import run_script
-from run_record import origin
+from program import origin, run_script
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
@@ -31,7 +30,7 @@ from pdcorrect.corrector.batch_hybrid import BatchHybridResult
 from pdcorrect.data.config import EVALUATION, TRAINING
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.cases import Case, read_cases
+from pdcorrect.evaluation.measures import Case, read_cases
 from pdcorrect.evaluation.evaluation import Candidate, evaluate
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.evaluation.tables import markdown, write_evaluation

@@ -170,7 +170,7 @@ class Machine:
         models = [str(model) for model in job.models if model.is_dir()]
         with (self._logs / f"{job.name}.log").open("ab") as log:
             job.process = subprocess.Popen(
-                [sys.executable, "-m", "pdcorrect.cli", name, *models, *options, *limit],
+                [sys.executable, "-m", "pdcorrect.cli.main", name, *models, *options, *limit],
                 stdout=log, stderr=subprocess.STDOUT, env=environment, cwd=self._folder,
             )  # fmt: skip
 

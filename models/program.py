@@ -1,18 +1,22 @@
-"""How the scripts here end: by one sentence and a status where a user can mend what is wrong."""
+"""What the scripts here share: how they end, and what they record of their origin."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectError
+from pdcorrect._environment import environment
+from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
 
 FAILED, BAD_INPUT = 1, 2
 """Exit statuses, as of the program ``pdcorrect``."""
 
 
 def run_script(main: Callable[[], None]) -> None:
-    """Run a script; errors of input, and what it refuses itself, are told without a traceback."""
+    """Run a script; wrong input and failures end it by one sentence and a status."""
     try:
         main()
     except (ConvergenceError, OutputError) as error:
@@ -29,18 +33,14 @@ def run_script(main: Callable[[], None]) -> None:
         _stop(error.code, BAD_INPUT)
 
 
-def pair_of(text: str) -> tuple[str, str]:
-    """Model and configuration of an argument MODEL=CONFIG.
-
-    Raises
-    ------
-    InputError
-        If one of them is missing.
-    """
-    model, _, config = text.partition("=")
-    if not model or not config:
-        raise InputError(f"{text!r}: expected MODEL=CONFIG, a model and a data set's config.toml.")
-    return model, config
+def origin() -> dict[str, Any]:
+    """When, by which command and on what the program runs."""
+    script = Path(sys.argv[0]).name
+    return {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": " ".join(["python", f"models/{script}", *sys.argv[1:]]),
+        "environment": environment(),
+    }
 
 
 def _stop(message: object, status: int) -> None:

@@ -34,31 +34,30 @@ from typing import Any, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from program import run_script
-from run_record import origin
+from program import origin, run_script
 from safetensors.torch import save_file
 from torch import Tensor
 
 from pdcorrect import metrics
 from pdcorrect.batch.states import BatchState
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.corrector.batch_step import BatchParts
+from pdcorrect.corrector.batch_hybrid import BatchParts
 from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.missing import check_whole
+from pdcorrect.data.folder import check_whole
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.evaluation.cases import Case, read_cases
+from pdcorrect.evaluation.measures import Case, read_cases
 from pdcorrect.evaluation.evaluation import Candidate, evaluate
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.evaluation.tables import markdown, write_evaluation
-from pdcorrect.fem.coarse_models import Base
-from pdcorrect.replacement import make_folder
+from pdcorrect.fem.problem import Base
+from pdcorrect._files import make_folder
 from pdcorrect.state import Status
 from pdcorrect.training.config import Stage
 from pdcorrect.training.fitting import fit_normaliser
