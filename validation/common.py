@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from harness import Outcome as Outcome
+from harness import Record as Record
+from harness import Table as Table
 from numpy.typing import NDArray
 
 import pdcorrect as pc
 from pdcorrect.fem.mesh import voxel_mesh
 from pdcorrect.fem.mesh_files import write_vtu
-from pdcorrect.validation.cases import ValidationCase
-from pdcorrect.validation.outcome import Outcome as Outcome
-from pdcorrect.validation.outcome import Picture as Picture
-from pdcorrect.validation.outcome import Table as Table
-from pdcorrect.validation.page import shown_figure
-from pdcorrect.validation.running import run_case
 
 Array = NDArray[np.float64]
 Figures = dict[str, float]
@@ -38,8 +36,6 @@ SMALL = 1e-4
 
 _TOLERANCE = 1e-8
 """Of the coarse cell size; Newton's last step is shorter."""
-
-RESULTS = Path(__file__).parent / "results"
 
 
 def mapped_block(
@@ -90,31 +86,37 @@ def nearest(problem: pc.Problem, point: tuple[float, float, float]) -> int:
 
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+MARKS = "osD^vP*"
 
 
-def plot(
-    path: Path,
-    curves: Mapping[str, tuple[Sequence[float] | Array, Sequence[float] | Array]],
-    labels: tuple[str, str],
-    scales: tuple[str, str] = ("linear", "linear"),
-    marks: bool = False,
-) -> None:
-    """Curves (x, y) by name in one plot with a legend above; ``scales`` linear or log."""
+def panels(width: float, height: float, count: int = 1, **options: Any) -> tuple[Any, Any]:
+    """A figure of so many inches and its axes side by side, one or an array of them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    axis = figure.subplots()
-    for k, (name, (x, y)) in enumerate(curves.items()):
-        style = {"color": COLOURS[k % len(COLOURS)], "linestyle": ("-", "--", "-.", ":")[k % 4]}
-        axis.plot(x, y, label=name, marker="o" if marks else "", linewidth=1.8, **style)
-    axis.set(xlabel=labels[0], ylabel=labels[1], xscale=scales[0], yscale=scales[1])
-    axis.grid(alpha=0.3)
+    return figure, figure.subplots(1, count, **options)
+
+
+def save(figure: Any, path: Path, legend_of: Any = None, columns: int = 5) -> None:
+    """Write a figure, with a legend above it, as a PNG of few colours, so that it stays small."""
+    from PIL import Image
+
+    if legend_of is not None:
+        handles = legend_of.get_legend_handles_labels()
+        figure.legend(*handles, loc="outside upper center", ncols=columns, frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=90, format="png")
+    with Image.open(buffer) as picture:
+        picture.convert("RGB").quantize(32, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def plain(axis: Any, axes: str = "both") -> None:
+    """A grid and no frame."""
+    axis.set_axisbelow(True)
+    axis.grid(alpha=0.3, which="both", axis=axes)
     axis.spines[["top", "right"]].set_visible(False)
-    columns = {"ncols": min(3, len(curves)), "frameon": False, "fontsize": 9}
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", **columns)
-    figure.savefig(path, dpi=150)
 
 
 def axis_of_meshes(axis: Any, title: str, label: str, counts: Sequence[int]) -> None:
@@ -122,31 +124,10 @@ def axis_of_meshes(axis: Any, title: str, label: str, counts: Sequence[int]) -> 
     axis.set(xscale="log", title=title, xlabel=label)
     axis.set_xticks(counts, [str(n) for n in counts])
     axis.minorticks_off()
-    axis.grid(alpha=0.3)
-    axis.spines[["top", "right"]].set_visible(False)
+    plain(axis)
 
 
-def plain_log_axes(axis: Any, labels: tuple[str, str]) -> None:
-    """Logarithmic axes with plain numbers at 1, 2 and 5 of each decade, a grid and no frame."""
-    axis.set(xscale="log", yscale="log", xlabel=labels[0], ylabel=labels[1])
-    for side in (axis.xaxis, axis.yaxis):
-        side.set_major_formatter("{x:g}")
-        side.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
-    axis.grid(alpha=0.3, which="both")
-    axis.spines[["top", "right"]].set_visible(False)
-
-
-def main(file: str) -> int:
-    """Run the case of a file in full, write its result to `RESULTS`; 1 if a figure is outside."""
-    case = ValidationCase(Path(file).resolve().parent)
-    command = f"python validation/{case.name}/run.py"
-    record = run_case(case, RESULTS, again=True, command=command)
-    for name, value in record.figures.items():
-        aim = case.expected.get(name)
-        goal = f"{aim.describe()}  {aim.source}" if aim else ""
-        mark = "  OUTSIDE" if name in record.outside else ""
-        print(f"{name}  {shown_figure(value)}  {goal}{mark}")
-    for name in record.outside:
-        print(f"outside the tolerance or missing: {name}")
-    print(record.error, end="")
-    return 0 if record.passed else 1
+def log_axis(axis: Any) -> None:
+    """Plain numbers at 1, 2 and 5 of each decade of a logarithmic axis."""
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")

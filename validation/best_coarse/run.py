@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
+import numpy as np
 
 import pdcorrect as pc
 from pdcorrect.fem.loads import Amplitude, NodalLoad, torsion_field
@@ -410,47 +407,38 @@ SHOWN = {
 """Models of the picture, by name; with the averaged mass but the first and last."""
 
 
-def draw(figures: common.Figures, path: Path) -> None:
+def draw(record: common.Record, path: Path) -> None:
     """RMS error of each model over the plain mesh's, in each motion."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 6.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axis = figure.subplots()
+    figure, axis = common.panels(9, 5.6)
     rows = np.arange(len(MOTIONS))
     for k, (name, model) in enumerate(SHOWN.items()):
-        omegas = np.array([figures[f"{motion}, {model.label}"] for motion in MOTIONS], float)
-        style = {"color": common.COLOURS[k], "marker": "osD^vP"[k], "label": name}
+        omegas = np.array([record.figures[f"{motion}, {model.label}"] for motion in MOTIONS], float)
         left = np.sqrt(1.0 - omegas / 100.0)
-        axis.plot(left, rows + 0.1 * (k - 2.5), linestyle="", markersize=6, **style)
+        place = rows + 0.1 * (k - 2.5)
+        axis.plot(left, place, common.MARKS[k], color=common.COLOURS[k], label=name)
     axis.axvline(1.0, color="0.4", linewidth=0.8)
     axis.set(xscale="log", xlabel="RMS error over the plain mesh's")
-    axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "25" else "")
+    common.log_axis(axis.xaxis)
     axis.set_yticks(rows, list(MOTIONS))
     axis.invert_yaxis()
-    axis.grid(alpha=0.3, which="both", axis="x")
-    axis.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=3, frameon=False)
-    figure.savefig(path, dpi=150)
+    common.plain(axis, "x")
+    common.save(figure, path, axis, 3)
 
 
-CAPTION = (
-    "RMS error over the plain mesh's of other models on the coarse mesh, and of one on 2×2×2 cells "
-    "a cell, in each motion (marks of one motion stand below each other)."
-)
+def finding(record: common.Record) -> str:
+    """Of the best coarse model, over all motions."""
+    pooled, least = (
+        record.figures[f"{w}, {BEST.label}"] for w in ("pooled", "least against defaults")
+    )
+    return (
+        f"The best coarse model removes {pooled:.0f} % of the plain mesh's squared error, and is "
+        f"better than a scene's defaults in every motion (least {least:.0f} %)."
+    )
 
 
 def case(quick: bool) -> common.Outcome:
-    """The case's outcome; the picture needs all figures."""
+    """The case's outcome."""
     if not quick:
-        figures = compute()
-        picture = common.Picture("motions", CAPTION, lambda path: draw(figures, path))
-        return common.Outcome(figures, pictures=(picture,))
+        return common.Outcome(compute())
     figures = shares("short beam, bend", (BEST,))
     return common.Outcome(figures | {f"zero modes, {m}": zero_modes(m) for m in MODES})
-
-
-if __name__ == "__main__":
-    sys.exit(common.main(__file__))

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from typing import Any
 
+import common
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from scipy.optimize import brentq
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
-import common
 
 import pdcorrect as pc
 
@@ -186,45 +182,16 @@ def quick_figures() -> common.Figures:
     return figures | {"torsion, free to warp, hex27 4x4": torsion("hex27", 4, True, SIDE)}
 
 
-PANELS = ("end shear", "gravity", "frequency 1", "frequency 3", "torsion, free to warp")
-
-
-def draw(figures: common.Figures, path: Path) -> None:
-    """Ratios to beam theory against cells through the thickness, a panel a load."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(PANELS))
-    for axis, what in zip(panels, PANELS, strict=True):
-        for k, (element, (colour, mark)) in enumerate(common.ELEMENT_STYLES.items()):
-            ratios = [figures[f"{what}, {element} {n}x{n}"] for n in MESHES]
-            places = [n * (1.0 + 0.03 * (k - 2)) for n in MESHES]  # beside each other
-            axis.plot(places, ratios, color=colour, marker=mark, markersize=5, label=element)
-        axis.axhline(1.0, color="0.4", linewidth=0.8)
-        common.axis_of_meshes(axis, what, "cells through the thickness", MESHES)
-    panels[0].set_ylabel("ratio to beam theory")
-    figure.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False
+def finding(record: common.Record) -> str:
+    """Of bending with one and torsion with two cells through the thickness."""
+    one, locked = (record.figures[f"end shear, {e} 1x1"] for e in ("hex8-bubble", "hex8"))
+    twist = record.figures["torsion, free to warp, hex27 4x4"]
+    return (
+        f"Deflection over theory with one cell through the thickness: hex8-bubble {one:.3f}, "
+        f"hex8 {locked:.3f} (it locks). Torsion: hex27 {twist:.3f} with four cells."
     )
-    figure.savefig(path, dpi=150)
-
-
-CAPTION = (
-    "Deflections, frequencies and torsional stiffness over beam theory's against the number of "
-    "cells through the thickness; marks of one number of cells stand side by side."
-)
 
 
 def case(quick: bool) -> common.Outcome:
-    """The case's outcome; the picture needs all figures."""
-    if quick:
-        return common.Outcome(quick_figures())
-    figures = compute()
-    picture = common.Picture("ratios", CAPTION, lambda path: draw(figures, path))
-    return common.Outcome(figures, pictures=(picture,))
-
-
-if __name__ == "__main__":
-    sys.exit(common.main(__file__))
+    """The case's outcome."""
+    return common.Outcome(quick_figures() if quick else compute())

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import common
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parent))
-import common
-from drawing import draw
-from rows import FAMILIES, FITTED, Measured, Row, front, nearest, quickest, rivals
-
 import pdcorrect as pc
+from pdcorrect._environment import home_folder
 from pdcorrect.data.config import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.home import home_folder
 
 MOTIONS, SETTINGS = ("impulse", "stretch", "torsion"), ("as-published", "exact")
 FRAMES = 30
@@ -29,30 +23,49 @@ FINEST = {"as-published": 4, "exact": 8}
 """Cut of the reference's cells: that of the thesis, and one finer than the data set's."""
 TOLERANCES = (1e-2, 1e-3, 1e-6)
 """Of the coarse cell size, beside the scene's own."""
-ALL_MOTIONS = "all-as-published-total-mass"
-MODELS: Mapping[tuple[str, str], Sequence[str]] = {
-    ("impulse", "as-published"): (
-        "impulse-as-published",
-        "impulse-as-published-total-mass",
-        ALL_MOTIONS,
-    ),
-    ("impulse", "exact"): ("impulse-exact",),
-    ("stretch", "as-published"): (
-        "stretch-as-published",
-        "stretch-as-published-total-mass",
-        ALL_MOTIONS,
-    ),
-    ("stretch", "exact"): ("stretch-exact",),
-    ("torsion", "as-published"): (
-        "torsion-as-published",
-        "torsion-as-published-total-mass",
-        ALL_MOTIONS,
-    ),
-    ("torsion", "exact"): ("torsion-exact", "torsion-exact-compact"),
-}
-"""Released correctors that were trained on such scenes, by motion and setting."""
-ROWS = {"plain": "plain", "best": "best", "total-mass": "right mass"}
-"""Methods that correctors are added to, by the name of their base."""
+MODELS = {(motion, setting): f"{motion}-{setting}" for motion in MOTIONS for setting in SETTINGS}
+"""The released corrector that was trained on such scenes."""
+FITTED = "fitted stiffness"
+"""Fitted to the very scene: shown, but no one's rival."""
+NEARER = 0.99
+"""Of the error of what is quicker: more is no gain."""
+FAMILIES = ("coarse mesh, 8-node elements", "coarse mesh, other elements", "finer mesh",
+            "other tolerance", "Newton", "hybrid")  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a method reached: nodes, ms a frame, RMS error in m on the coarse nodes."""
+
+    name: str
+    family: str
+    nodes: int
+    milliseconds: float
+    error: float
+
+
+def quickest(rows: Sequence[Row], error: float) -> Row:
+    """With at most so much error."""
+    return min((r for r in rows if r.error <= error), key=lambda r: r.milliseconds)
+
+
+def nearest(rows: Sequence[Row], milliseconds: float) -> Row:
+    """In at most so much time."""
+    return min((r for r in rows if r.milliseconds <= milliseconds), key=lambda r: r.error)
+
+
+def front(rows: Sequence[Row]) -> list[Row]:
+    """Those that nothing quicker is as near as, to `NEARER`, quickest first."""
+    out: list[Row] = []
+    for row in sorted(rivals(rows), key=lambda r: (r.milliseconds, r.error)):
+        if not out or row.error < NEARER * out[-1].error:
+            out.append(row)
+    return out
+
+
+def rivals(rows: Sequence[Row]) -> list[Row]:
+    """All but what was fitted to the scene."""
+    return [row for row in rows if row.name != FITTED]
 
 
 @dataclass(frozen=True)
@@ -154,8 +167,8 @@ class Comparison:
             step = every * self.points.time_step
             make = partial(self._newton, best, step)
             yield f"best, Newton, {every:g} h", Method(newton, make, every)
-        for name in MODELS.get((self.motion, self.setting), ()):
-            yield f"hybrid, {name}", Method("hybrid", partial(self._hybrid, name))
+        name = MODELS[self.motion, self.setting]
+        yield f"hybrid, {name}", Method("hybrid", partial(self._hybrid, name))
 
     def _pd(self, make: Callable[..., pc.Problem], **options: Any) -> Callable[[], Any]:
         return lambda: pc.ProjectiveDynamics(make(**options))
@@ -164,7 +177,7 @@ class Comparison:
         return pc.Newton(make(), time_step=step)
 
     def _hybrid(self, name: str) -> Any:
-        return pc.hybrid_of(self.scene, released(name))
+        return pc.hybrid_of(self.scene, home_folder("models") / name)
 
     def _right_mass(self) -> pc.ProjectiveDynamics:
         mass = self.reference.problem.mass.sum()
@@ -187,12 +200,6 @@ class Comparison:
         return stepper(float(found.x))
 
 
-@cache
-def released(name: str) -> Any:
-    """A corrector of `models/`."""
-    return pc.load_model(home_folder("models") / name)
-
-
 def median_step(run: pc.Trajectory) -> float:
     """Wall-clock seconds of a step."""
     return float(np.median(run.stats["seconds"]))
@@ -212,63 +219,51 @@ def measure(motion: str, setting: str, quick: bool) -> common.Outcome:
     rows = [comparison.row(name, method) for name, method in comparison.methods()]
     run = comparison.reference
     last = Row("reference", FAMILIES[2], len(run.problem.positions), 1e3 * median_step(run), 0.0)
-    caption = (
-        f"{motion}, {setting}: error against time for {comparison.frames} frames; distances from "
-        f"{comparison.finest}×{comparison.finest}×{comparison.finest} cells a cell."
-    )
-    return outcome(Measured(motion, setting, rows, last, scale), quick, caption)
+    return outcome(f"{motion}, {setting}", rows, last, scale)
 
 
-def outcome(measured: Measured, quick: bool, caption: str) -> common.Outcome:
-    """What a scene says."""
-    rows, scale = measured.rows, measured.scale
-    label = f"{measured.motion}, {measured.setting}"
+def outcome(label: str, rows: Sequence[Row], reference: Row, scale: float) -> common.Outcome:
+    """What a scene's rows say; ``scale`` is the largest displacement, m."""
     by_name = {row.name: row for row in rows}
     plain, middle = by_name["plain"], by_name["plain 2×2×2"]
-    as_near = quickest(rivals(rows), middle.error)
-    as_quick = nearest(rivals(rows), 1.1 * middle.milliseconds)
     figures: dict[str, float] = {
         f"{label}, largest displacement, mm": 1e3 * scale,
         f"{label}, plain, error, per cent": 100.0 * plain.error / scale,
         f"{label}, best, error over plain's": by_name["best"].error / plain.error,
         f"{label}, intermediate mesh, omega": 100.0 * (1.0 - (middle.error / plain.error) ** 2),
     }
-    if not quick:  # times of a few frames say nothing
+    tables = [methods_table(label, [*rows, reference], scale)]
+    hybrids = [row for row in rows if row.family == "hybrid"]
+    if hybrids:  # times of a quick run's few frames say nothing
+        as_near = quickest(rivals(rows), middle.error)
+        as_quick = nearest(rivals(rows), 1.1 * middle.milliseconds)
         speed_up = middle.milliseconds / as_near.milliseconds
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
-    models = MODELS.get((measured.motion, measured.setting), ())
-    hybrids = [by_name[f"hybrid, {name}"] for name in models if f"hybrid, {name}" in by_name]
+        untrained = [r for r in [*rivals(rows), reference] if r not in hybrids]
+        tables += [winners(label, as_near, as_quick), beside(label, hybrids, untrained)]
     for row in hybrids:
-        base = by_name[ROWS[released(row.name.removeprefix("hybrid, ")).base]]
+        base = by_name["best" if label.endswith("exact") else "plain"]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
     for name in ("plain", "best"):
         if f"{name}, 1e-06" in by_name:
             tight, newton = by_name[f"{name}, 1e-06"], by_name[f"{name}, Newton"]
             figures[f"{label}, {name}, PD's error over Newton's"] = tight.error / newton.error
-    tables = [methods_table(measured), winners(label, as_near, as_quick)]
-    if hybrids:
-        untrained = [r for r in [*rivals(rows), measured.reference] if r not in hybrids]
-        tables.append(beside(label, hybrids, untrained))
-    picture = f"{measured.motion}-{measured.setting}"
-    return common.Outcome(
-        figures, tuple(tables),
-        (common.Picture(picture, caption, lambda path: draw(path, rows, scale)),),
-    )  # fmt: skip
+    return common.Outcome(figures, tuple(tables))
 
 
 HEADS = ("method", "kind", "nodes", "ms a frame", "RMS error, mm", "per cent", "front")
 
 
-def methods_table(measured: Measured) -> common.Table:
+def methods_table(label: str, rows: Sequence[Row], scale: float) -> common.Table:
     """All rows, quickest first."""
-    on_front = {row.name for row in front(measured.rows)}
+    on_front = {row.name for row in front(rows[:-1])}
     body = tuple(
         (r.name, r.family, float(r.nodes), r.milliseconds, 1e3 * r.error,
-         100.0 * r.error / measured.scale, "yes" if r.name in on_front else "")
-        for r in sorted([*measured.rows, measured.reference], key=lambda r: r.milliseconds)
+         100.0 * r.error / scale, "yes" if r.name in on_front else "")
+        for r in sorted(rows, key=lambda r: r.milliseconds)
     )  # fmt: skip
-    return common.Table(f"{measured.motion}, {measured.setting}", HEADS, body)
+    return common.Table(label, HEADS, body)
 
 
 def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
@@ -276,6 +271,9 @@ def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
     heads = ("scene", "as near, quickest", "ms a frame", "as quick, nearest", "RMS error, mm")
     row = (label, as_near.name, as_near.milliseconds, as_quick.name, 1e3 * as_quick.error)
     return common.Table("Beside the intermediate mesh (plain 2×2×2)", heads, (row,))
+
+
+BESIDE = "Hybrids beside what needs no training"
 
 
 def beside(label: str, hybrids: Sequence[Row], untrained: Sequence[Row]) -> common.Table:
@@ -291,14 +289,40 @@ def beside(label: str, hybrids: Sequence[Row], untrained: Sequence[Row]) -> comm
             label, row.name.removeprefix("hybrid, "), near.name,
             near.milliseconds / row.milliseconds, quick.name, row.error / quick.error,
         ))  # fmt: skip
-    return common.Table("Hybrids beside what needs no training", heads, tuple(body))
+    return common.Table(BESIDE, heads, tuple(body))
 
 
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
     """A part for each scene; quick runs have one."""
-    pairs = [("torsion", "exact")] if quick else [(m, s) for m in MOTIONS for s in SETTINGS]
+    pairs = [("torsion", "exact")] if quick else list(MODELS)
     return {f"{m}, {s}": partial(measure, m, s, quick) for m, s in pairs}
 
 
-if __name__ == "__main__":
-    sys.exit(common.main(__file__))
+def draw(record: common.Record, path: Path) -> None:
+    """Error against time in the exact scenes, with the Pareto front."""
+    figure, panels = common.panels(12, 4.4, len(MOTIONS))
+    for axis, motion in zip(panels, MOTIONS, strict=True):
+        rows = [row for row in record.table(f"{motion}, exact")["rows"] if row[0] != "reference"]
+        best = [(row[3], row[5]) for row in rows if row[6]]
+        axis.step(*zip(*best, strict=True), where="post", color="0.6", label="Pareto front")
+        for k, family in enumerate(FAMILIES):
+            points = [(r[3], r[5]) for r in rows if r[1] == family and r[0] != FITTED]
+            style = {"marker": common.MARKS[k], "color": common.COLOURS[k], "label": family}
+            axis.scatter(*zip(*points, strict=True), 40, zorder=3, **style)
+        axis.set(xscale="log", yscale="log", title=f"{motion}, exact", xlabel="ms a frame")
+        common.log_axis(axis.xaxis)
+        common.log_axis(axis.yaxis)
+        common.plain(axis)
+    panels[0].set_ylabel("RMS error, % of the largest displacement")
+    common.save(figure, path, panels[0], 7)
+
+
+def finding(record: common.Record) -> str:
+    """The hybrids of the exact scenes beside what is as quick or as near without training."""
+    rows = [row for row in record.table(BESIDE)["rows"] if row[0].endswith("exact")]
+    times, errors = [row[3] for row in rows], [1.0 / row[5] for row in rows]
+    return (
+        f"In three exact scenes, kind to the hybrids, they are {min(errors):.0f} to "
+        f"{max(errors):.0f} times as near as anything untrained in their time; what is as near "
+        f"takes {min(times):.0f} to {max(times):.0f} times as long."
+    )

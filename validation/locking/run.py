@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 import common
+import numpy as np
 
 POISSONS = (0.3, 0.4, 0.45, 0.49, 0.499, 0.4999)
 SLENDERNESSES = (2, 5, 10, 20, 50)
+SHAPES = {"bricks": 0.0, "trapezoids": 0.1, "parallelograms": -0.1}
 CELLS = 10
 """Along the slender beams, whatever their length: the cells stretch with it."""
 
@@ -87,8 +85,7 @@ def distortion(elements: Sequence[str]) -> common.Figures:
     """MacNeal and Harder's slender beam (6 x 0.1 x 0.2) of six cells, over beam theory."""
     figures: common.Figures = {}
     material = {"young": 1e7, "poisson": 0.3}
-    shapes = {"bricks": 0.0, "trapezoids": 0.1, "parallelograms": -0.1}
-    for name, skew in shapes.items():
+    for name, skew in SHAPES.items():
         for element in elements:
             for direction, theory in ((2, 0.1081), (1, 0.4321)):
                 plane = "in plane" if direction == 2 else "out of plane"
@@ -102,61 +99,52 @@ def compute(elements: Sequence[str] = common.ELEMENTS) -> common.Figures:
     return volumetric(elements) | shear(elements) | distortion(elements)
 
 
-def draw(figures: common.Figures, path: Path) -> None:
+def draw(record: common.Record, path: Path) -> None:
     """Ratios against Poisson's ratio, slenderness and the cells' shape."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, middle, right = figure.subplots(1, 3, sharey=True)
+    figures = record.figures
+    figure, (left, middle, right) = common.panels(11, 3.9, 3, sharey=True)
     for k, (element, (colour, mark)) in enumerate(common.ELEMENT_STYLES.items()):
         style = {"color": colour, "marker": mark, "markersize": 6, "label": element}
-        compressible = [1 - 2 * nu for nu in POISSONS]
         values = [figures[f"volumetric, nu {nu:g}, {element}"] for nu in POISSONS]
-        left.semilogx(compressible, values, **style)
+        left.semilogx([1 - 2 * nu for nu in POISSONS], values, **style)
         values = [figures[f"shear, L/h {s}, {element}"] for s in SLENDERNESSES]
         middle.semilogx(SLENDERNESSES, values, **style)
-        values = [figures[f"distortion, {s}, in plane, {element}"] for s in _SHAPES]
+        values = [figures[f"distortion, {s}, in plane, {element}"] for s in SHAPES]
         right.bar(np.arange(3) + 0.16 * (k - 2), values, 0.15, color=colour)
     left.invert_xaxis()
     left.set_xticks([1 - 2 * nu for nu in POISSONS], [f"{nu:g}" for nu in POISSONS])
     middle.set_xticks(SLENDERNESSES, [str(s) for s in SLENDERNESSES])
-    right.set_xticks(range(3), _SHAPES)
-    for axis, title, label in (
-        (left, "4×1×1 cantilever, 8×2×2 cells", "Poisson's ratio"),
-        (middle, "10×1×1 cells, Poisson's ratio 0.3", "length over thickness"),
-        (right, "MacNeal–Harder beam, 6×1×1 cells", "shape of the cells"),
-    ):
+    right.set_xticks(range(3), list(SHAPES))
+    left.set(title="4×1×1 cantilever, 8×2×2 cells", xlabel="Poisson's ratio")
+    middle.set(title="10×1×1 cells, Poisson's ratio 0.3", xlabel="length over thickness")
+    right.set(title="MacNeal-Harder beam, 6×1×1 cells", xlabel="shape of the cells")
+    for axis in (left, middle, right):
         axis.minorticks_off()
-        axis.set_title(title, fontsize=11)
-        axis.set_xlabel(label)
         axis.axhline(1.0, color="black", linewidth=0.8)
-        axis.set_axisbelow(True)
-        axis.grid(alpha=0.3)
-        axis.spines[["top", "right"]].set_visible(False)
-    left.set_ylim(0.0, 1.5)
-    left.set_ylabel("tip deflection / reference")
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=5, frameon=False)
-    figure.savefig(path, dpi=150)
+        common.plain(axis)
+    left.set(ylim=(0.0, 1.5), ylabel="tip deflection / reference")
+    common.save(figure, path, left)
 
 
-_SHAPES = ("bricks", "trapezoids", "parallelograms")
-
-
-CAPTION = "Deflection over reference against Poisson's ratio, slenderness and shape of the cells."
+def finding(record: common.Record) -> str:
+    """Of thin, nearly incompressible and distorted cells."""
+    thin, soft, distorted = (
+        record.figures[name]
+        for name in (
+            "shear, L/h 50, hex8-bubble",
+            "volumetric, nu 0.4999, hex8-bubble-mean",
+            "distortion, trapezoids, in plane, hex8-bubble-mean",
+        )
+    )
+    return (
+        f"Over the reference: {thin:.2f} by hex8-bubble in thin cells, {soft:.2f} by "
+        f"hex8-bubble-mean near ν = 0.5, but {distorted:.2f} on trapezoids, where only hex27 holds."
+    )
 
 
 def case(quick: bool) -> common.Outcome:
-    """The case's outcome; the picture needs all figures."""
-    if quick:
-        figures = shear(("hex8", "hex8-bubble", "hex8-bubble-mean"), (50,))
-        return common.Outcome(figures | distortion(("hex8-bubble", "hex27")))
-    figures = compute()
-    picture = common.Picture("locking", CAPTION, lambda path: draw(figures, path))
-    return common.Outcome(figures, pictures=(picture,))
-
-
-if __name__ == "__main__":
-    sys.exit(common.main(__file__))
+    """The case's outcome."""
+    if not quick:
+        return common.Outcome(compute())
+    figures = shear(("hex8", "hex8-bubble", "hex8-bubble-mean"), (50,))
+    return common.Outcome(figures | distortion(("hex8-bubble", "hex27")))

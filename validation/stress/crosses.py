@@ -1,4 +1,4 @@
-"""A cross that the torsion models know, in what they were trained on and far outside it.
+"""A cross that the torsion model knows, in what they were trained on and far outside it.
 
 Body, material and load are drawn as those of `datasets/torsion-exact`, by another seed: the
 cross is none of that data set's.
@@ -77,67 +77,33 @@ WEIGHT = {"kind": "gravity", "acceleration": [3.5, 4.7, -7.9]}
 _moved = partial(Scenario, goal="motion", known=True, finer=2, solvers=KNOWN_SOLVERS)
 _calmed = partial(Scenario, goal="rest", known=True, solvers=KNOWN_SOLVERS)
 
+# fmt: off
 CROSSES = (
-    _moved(
-        "cross ordinary", "under a load as in training", cross(40), finer=4, shown=(0, 10, 20, 40)
-    ),
-    _moved("cross long", "the same, five times as long", cross(200), shown=(0, 60, 120, 200)),
+    _moved("cross ordinary", "under a load as in training", cross(40), finer=4),
+    _moved("cross long", "the same, five times as long", cross(200)),
     _moved("cross load 10", "ten times the load", cross(30, 10.0)),
     _moved("cross load 100", "a hundred times the load", cross(15, 100.0)),
-    *(
-        _moved(
-            f"cross reversal {load:g}",
-            f"{words}, which turns round at every step",
-            cross(40, load),
-            forces=turning,
-        )
-        for load, words in ((1.0, "the load as in training"), (10.0, "ten times the load"))
-    ),
-    _moved(
-        "cross weight",
-        "gravity besides, across and along it",
-        cross(40, more_loads=[WEIGHT]),
-        quick=True,
-    ),
-    _moved(
-        "cross kick",
-        "struck: a bending motion at 20 m/s, faster than waves in it",
-        cross(30),
-        velocity=bending(20.0),
-    ),
-    _moved(
-        "cross E 1e3",
-        "a thousand times stiffer, under a thousand times the load",
-        cross(40, 1e3, material=scaled("young", 1e3)),
-    ),
-    _moved(
-        "cross E 1e-3",
-        "a thousand times softer, under the same load",
-        cross(30, material=scaled("young", 1e-3)),
-    ),
-    _moved(
-        "cross density 1e3",
-        "a thousand times heavier, under a hundred times the load",
-        cross(40, 100.0, material=scaled("density", 1e3)),
-    ),
+    *(_moved(f"cross reversal {load:g}", f"{words}, which turns round at every step",
+             cross(40, load), forces=turning)
+      for load, words in ((1.0, "the load as in training"), (10.0, "ten times the load"))),
+    _moved("cross weight", "gravity besides, across and along it", cross(40, more_loads=[WEIGHT])),
+    _moved("cross kick", "struck: a bending motion at 20 m/s, faster than waves in it", cross(30),
+           velocity=bending(20.0)),
+    _moved("cross E 1e3", "a thousand times stiffer, under a thousand times the load",
+           cross(40, 1e3, material=scaled("young", 1e3))),
+    _moved("cross E 1e-3", "a thousand times softer, under the same load",
+           cross(30, material=scaled("young", 1e-3))),
+    _moved("cross density 1e3", "a thousand times heavier, under a hundred times the load",
+           cross(40, 100.0, material=scaled("density", 1e3))),
     _moved("cross nu 0.499", "nearly incompressible", cross(40, material={"poisson": 0.499})),
     _moved("cross h 10", "by steps ten times as long", cross(15, step=10 * STEP)),
-    _moved(
-        "cross h 0.01",
-        "struck as above, by steps of a hundredth",
-        cross(200, step=0.01 * STEP),
-        velocity=bending(20.0),
-    ),
+    _moved("cross h 0.01", "struck as above, by steps of a hundredth",
+           cross(200, step=0.01 * STEP), velocity=bending(20.0)),
     _calmed("cross plane", "squashed to a plane", calm(), start=squashed((1, 1, 0))),
-    _calmed(
-        "cross random 0.5", "nodes displaced by up to half a cell", calm(), start=scattered(0.5)
-    ),
+    _calmed("cross random 0.5", "nodes displaced by up to half a cell", calm(),
+            start=scattered(0.5)),
     _calmed("cross random 5", "by up to 5 cells", calm(), start=scattered(5.0)),
     _calmed("cross twisted", "let go twisted by 720 degrees", calm(), start=twisted),
-    _calmed(
-        "cross turned",
-        "its far end held, too, turned twice and back",
-        calm(clamps=[HELD, {"region": END, "motion": TURN}]),
-        shown=(0, 12, 24, 800),
-    ),
+    _calmed("cross turned", "its far end held, too, turned twice and back",
+            calm(clamps=[HELD, {"region": END, "motion": TURN}])),
 )

@@ -15,16 +15,13 @@ import pdcorrect as pc
 Array = np.ndarray
 NO_GATE = "no gate"
 """A corrector without a gate, which shows what the gate is for: nothing is expected of it."""
-MODELS = {
-    "hybrid": "tiny", "hybrid torsion": "torsion-exact", "hybrid compact": "torsion-exact-compact",
-    NO_GATE: "torsion-exact",
-}  # fmt: skip
+MODELS = {"hybrid": "tiny", "hybrid torsion": "torsion-exact", NO_GATE: "torsion-exact"}
 """Correctors by solver."""
 SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid", "hybrid torsion")
 """Projective dynamics on the plain and on the best coarse mesh, Newton and the batch stepper on
 the plain one, and correctors with their gate on the best."""
-KNOWN_SOLVERS = ("PD", "PD best", "Newton", "hybrid torsion", "hybrid compact", NO_GATE)
-"""Those of bodies that the torsion models know."""
+KNOWN_SOLVERS = ("PD", "PD best", "Newton", "hybrid torsion", NO_GATE)
+"""Those of bodies that the torsion model knows."""
 
 TIGHT = 1e-8
 """Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""

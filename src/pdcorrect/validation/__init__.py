@@ -1,1 +1,0 @@
-"""Validation cases: found, run, judged by figures written down before, and reported."""

@@ -1,0 +1,124 @@
+"""The report of cases: short Markdown with figures, and an HTML page with every judged figure.
+
+python validation/report.py
+
+writes ``validation/report.md`` and ``validation/figures`` anew from the records in
+``validation/results``; `pdcorrect validate` writes the same and ``index.html`` into its output.
+"""
+
+from __future__ import annotations
+
+import html
+import importlib.util
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import harness
+
+from pdcorrect._files import make_folder, write_text
+
+Sections = Sequence[tuple[harness.Case, harness.Record]]
+HERE = Path(__file__).parent
+
+
+def write(sections: Sections, folder: Path, page: bool = True) -> Path:
+    """Draw the figures, write ``report.md`` and, if asked for, ``index.html``; gives the last.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    told = [(case, record, figure(case, record, folder)) for case, record in sections]
+    write_text(folder / "report.md", "\n".join(markdown(told)))
+    if not page:
+        return folder / "report.md"
+    write_text(folder / "index.html", "\n".join(as_html(told)))
+    return folder / "index.html"
+
+
+def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
+    """Draw a case's figure from its record; its path in the folder, "" if it has none."""
+    drawable = hasattr(case.module, "draw") and not (record.quick or record.error)
+    if not drawable or importlib.util.find_spec("matplotlib") is None:
+        return ""
+    case.module.draw(record, make_folder(folder / "figures") / f"{case.name}.png")
+    return f"figures/{case.name}.png"
+
+
+def finding(case: harness.Case, record: harness.Record) -> str:
+    """The case's sentence about a full record, from its figures."""
+    if record.quick or record.error or not hasattr(case.module, "finding"):
+        return ""
+    return str(case.module.finding(record))
+
+
+Told = Sequence[tuple[harness.Case, harness.Record, str]]
+
+
+def conditions(told: Told) -> str:
+    """When and on what all this was made."""
+    dates = sorted({record.date for _, record, _ in told})
+    period = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never"
+    keys = ("processor", "threads", "dtype")
+    machines = {", ".join(r.environment.get(k, "") for k in keys) for _, r, _ in told}
+    return f"Measured {period} on {'; '.join(sorted(machines))}."
+
+
+def markdown(told: Told) -> Iterator[str]:
+    """A paragraph a case: question, verdict, finding, figure."""
+    yield from ("# Validation report", "", conditions(told), "")
+    for case, record, path in told:
+        yield from (f"## {case.title}", "", case.question, "")
+        yield f"**{harness.verdict(case, record).capitalize()}.** {finding(case, record)}".rstrip()
+        yield from ("", f"![{case.title}]({path})", "") if path else ("",)
+
+
+_STYLE = """body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto }
+table { border-collapse: collapse; font-size: 0.9rem } th { text-align: left }
+th, td { padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #ddd; vertical-align: top }
+.fail, .outside { background: #f6d3cd } .known { background: #fbeec9 } img { max-width: 100% }"""
+
+
+def as_html(told: Told) -> Iterator[str]:
+    """The same with all tables and all figures that were judged."""
+    yield f'<!doctype html><html lang="en"><head><meta charset="utf-8"><style>{_STYLE}</style>'
+    yield "<title>pdcorrect: validation report</title></head><body><h1>Validation report</h1>"
+    yield f"<p>{html.escape(conditions(told))}</p>"
+    for case, record, path in told:
+        verdict = harness.verdict(case, record)
+        yield f"<h2>{html.escape(case.title)}</h2><p>{html.escape(case.question)}</p>"
+        yield f'<p class="{verdict.split(":")[0]}">{html.escape(verdict)}</p>'
+        yield f"<p>{html.escape(finding(case, record))}</p>"
+        yield f"<pre>{html.escape(record.error)}</pre>" if record.error else ""
+        yield f'<p><img src="{path}" alt="{html.escape(case.title)}"></p>' if path else ""
+        for table in record.tables:
+            yield f"<h3>{html.escape(table['name'])}</h3>"
+            yield from _table(table["headings"], table["rows"])
+        yield f"<details{' open' if record.outside else ''}><summary>Judged figures</summary>"
+        yield from _table(harness.JUDGED, harness.judged(case, record))
+        yield "</details>"
+    yield "</body></html>"
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[Any]]) -> Iterator[str]:
+    yield "<table><tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in headings) + "</tr>"
+    for row in rows:
+        cells = [harness.shown(cell) for cell in row]
+        kind = cells[-1].split()[0] if cells[-1] in ("outside", "known failure") else ""
+        told = "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+        yield f'<tr class="{kind}">{told}</tr>'
+    yield "</table>"
+
+
+def main() -> None:
+    """Write the report of the records that are kept in the repository."""
+    cases = harness.find_cases(folder=HERE)
+    records = [harness.load(HERE / "results" / f"{case.name}.json") for case in cases]
+    found = [(c, r) for c, r in zip(cases, records, strict=True) if r is not None]
+    print(write(found, HERE, page=False))
+
+
+if __name__ == "__main__":
+    main()
