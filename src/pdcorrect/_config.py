@@ -143,7 +143,8 @@ def as_toml(value: object) -> str:
 def explained(error: ValidationError, model: type[BaseModel]) -> str:
     """One paragraph: each wrong key, its value, and what was expected."""
     tables = list(_tables(model.model_json_schema()))
-    return " ".join(dict.fromkeys(_sentence(item, tables) for item in error.errors()))
+    sentences = dict.fromkeys(_sentence(item, tables) for item in error.errors())
+    return " ".join(" ".join(sentences).split())
 
 
 _Table = tuple[str, str, frozenset[str]]
@@ -172,12 +173,19 @@ def _sentence(item: ErrorDetails, tables: list[_Table]) -> str:
 
 
 def _key(location: tuple[int | str, ...], tables: list[_Table], unknown: bool) -> str:
-    """A key as the user wrote it, ``loads[0].kind``: pydantic also names union members."""
+    """A key as the user wrote it, ``loads[0].force``: pydantic also names union members."""
     known = frozenset().union(*(keys for _, _, keys in tables))
-    kept = [part for part in location[:-1] if isinstance(part, int) or part in known]
-    if location and (unknown or isinstance(location[-1], int) or location[-1] in known):
-        kept.append(location[-1])
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in kept)
+    tagged = {header.strip("[]") for header, choice, _ in tables if choice}
+    text, names, tag_is_next = "", "", False
+    for place, part in enumerate(location, 1):
+        if isinstance(part, int):
+            text += f"[{part}]"
+        elif tag_is_next:
+            tag_is_next = False
+        elif part in known or (unknown and place == len(location)):
+            text += f".{part}"
+            names = f"{names}.{part}".lstrip(".")
+            tag_is_next = names in tagged
     return text.lstrip(".")
 
 
@@ -196,6 +204,8 @@ def _advice(name: str, key: str, tables: list[_Table]) -> str:
     kinds = dict.fromkeys(choice for h, choice, _ in homes if h.strip("[]") == own and choice)
     if kinds:
         return f"it goes with {' or '.join(kinds)}."
+    below = [table for table in homes if own and table[0].strip("[]").startswith(own)]
+    homes = below or homes
     if homes:
         return f"it belongs to {' or '.join(dict.fromkeys(h or 'the top' for h, _, _ in homes))}."
     for here in (True, False):

@@ -1,6 +1,6 @@
 """Elastic energy, forces and tangents of many bodies at once.
 
-Bodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
+DistinctBodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
 first, then, from a common place on, its internal modes, cell by cell.  Cells and nodes that
 a body does not have carry no weight and stay at zero.  What is known at quadrature points
 is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
@@ -20,7 +20,7 @@ from torch import Tensor
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.sharing import Bodies, with_rows
+from pdcorrect.batch.sharing import DistinctBodies, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 
@@ -62,7 +62,7 @@ class CellBatch:
     Attributes
     ----------
     sizes : Sizes
-    bodies : Bodies
+    bodies : DistinctBodies
         Of the scenes.
     node_counts : list of int
     present_nodes, present_cells : (B, N), (B, C) bool
@@ -82,7 +82,7 @@ class CellBatch:
             width,
             points,
         )
-        self.bodies = Bodies.of(problems)
+        self.bodies = DistinctBodies.of(problems)
         distinct = self.bodies.distinct
         self._owners = torch.as_tensor(self.bodies.owners, device=device)
         self.node_counts = [len(p.positions) for p in problems]
@@ -123,7 +123,7 @@ class CellBatch:
             self, rows,
             "rest", "present_nodes", "present_cells", "_gradients", "_owners", "_corners",
             sizes=n._replace(scenes=len(rows)),
-            bodies=Bodies(self.bodies.distinct, self.bodies.owners[numbers]),
+            bodies=DistinctBodies(self.bodies.distinct, self.bodies.owners[numbers]),
             node_counts=[self.node_counts[i] for i in numbers],
             mode_counts=[self.mode_counts[i] for i in numbers],
             _slots=slots.reshape(-1, self._slots.shape[1]),

@@ -5,7 +5,7 @@
 turned with the body (`pdcorrect.solvers.first_hessian`), which has three unknowns a node
 and so nine times the entries.  All three have dense inverses (`DenseInverse`).
 "multigrid" is the same Hessian as "rest", inverted approximately by a cycle of multigrid
-(`Multigrid`), for meshes that are refined.  Internal modes are eliminated cell by cell.
+(`BatchMultigrid`), for meshes that are refined.  Internal modes are eliminated cell by cell.
 Scenes that share mesh, material and clamps share what is stored for them.
 """
 
@@ -31,7 +31,7 @@ from pdcorrect.batch.elimination import (
     summed_blocks,
 )
 from pdcorrect.batch.gpu import as_kernel
-from pdcorrect.batch.multigrid import Multigrid
+from pdcorrect.batch.multigrid import BatchMultigrid
 from pdcorrect.batch.sharing import Sharing, with_rows
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
@@ -183,9 +183,9 @@ class FirstHessian:
         blocks = [_blocks(p, factors[1], kind) for p in distinct]
         self._modes = Elimination(cells, blocks, owners, problems[0].cells.shape[1], width)
         del blocks
-        self._solver: DenseInverse | Multigrid
+        self._solver: DenseInverse | BatchMultigrid
         if kind == "multigrid":
-            self._solver = Multigrid(
+            self._solver = BatchMultigrid(
                 self._sharing, self._modes.blocks, factors[0], storage, cells.device
             )
             regular = self._solver.regular

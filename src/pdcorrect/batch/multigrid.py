@@ -43,7 +43,7 @@ class Grid:
     coarse : int
         Nodes of the largest next coarser level.
     sharing, storage, device
-        See `Multigrid`.
+        See `BatchMultigrid`.
 
     Attributes
     ----------
@@ -267,7 +267,7 @@ _ROUNDING = 1e-9
 """Of the largest nodal mass: to which masses of cells and of the problem count as equal."""
 
 
-class Multigrid:
+class BatchMultigrid:
     """R -> B r on nodal fields (B, N, 3), zero where clamped; B is about A^-1.
 
     Parameters
@@ -318,7 +318,7 @@ class Multigrid:
         ]
         self.bytes = self._coarsest.bytes + sum(grid.bytes for grid in self._grids)
 
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Multigrid:
+    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> BatchMultigrid:
         """Of some scenes, with the matrices that they have."""
         return with_rows(
             self, rows, _coarsest=self._coarsest.narrowed(sharing, kept),

@@ -20,7 +20,7 @@ from pdcorrect.state import State, Status, StepResult
 _WORTH_IT = (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
 
 
-class OneByOne:
+class SingleRetry:
     """Steps single scenes with `ProjectiveDynamics` and its fallbacks, on the CPU.
 
     Parameters

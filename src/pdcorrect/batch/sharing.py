@@ -17,7 +17,7 @@ from pdcorrect.fem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
-class Bodies:
+class DistinctBodies:
     """The problems of a batch without their loads, each once.
 
     What depends on nothing else is computed once a body.
@@ -34,7 +34,7 @@ class Bodies:
     owners: NDArray[np.int64]
 
     @classmethod
-    def of(cls, problems: Sequence[Problem]) -> Bodies:
+    def of(cls, problems: Sequence[Problem]) -> DistinctBodies:
         """Known by the objects that `Problem.with_loads` shares; numbers are not compared."""
         seen: dict[tuple[object, ...], int] = {}
         distinct: list[Problem] = []
@@ -68,7 +68,7 @@ class Sharing:
     def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
         seen: dict[bytes, int] = {}
         self.distinct: list[Problem] = []
-        bodies = Bodies.of(problems)
+        bodies = DistinctBodies.of(problems)
         kinds = []
         for problem in bodies.distinct:
             key = _key(problem)

@@ -32,7 +32,7 @@ from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
-from pdcorrect.batch.retry import OneByOne
+from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.sharing import Sharing
 from pdcorrect.batch.stage import BatchStage, BatchStaging
 from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
@@ -142,7 +142,7 @@ class BatchStepper:
         self._lock = threading.RLock()
         self._minimiser: BatchMinimiser | None = None
         self._inverse: FirstHessian | None = None
-        self._one_by_one = OneByOne(self.cells, self.tolerances, self.time_step, self.integrator)
+        self._one_by_one = SingleRetry(self.cells, self.tolerances, self.time_step, self.integrator)
 
     def __getstate__(self) -> dict[str, Any]:
         left = ("_lock", "_minimiser", "_inverse", "_one_by_one")

@@ -57,7 +57,7 @@ def generate(
     The files do not depend on the number of workers.  Exit status 1 if some that were asked for
     are still missing.
     """
-    from pdcorrect.data.config import DatasetConfig
+    from pdcorrect.data.configuration import DatasetConfig
     from pdcorrect.data.generate import generate as run
     from pdcorrect.data.workers import Workers
 
@@ -221,7 +221,7 @@ def import_(
     ] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
-    from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+    from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
     from pdcorrect.data.import_files import import_trajectories
 
     if "/" in split or split in ("", ".", ".."):

@@ -53,9 +53,9 @@ def train(
     import time
 
     started = time.monotonic()
-    from pdcorrect.training.config import TrainingConfig
+    from pdcorrect.training.distributed import joined
+    from pdcorrect.training.recipe import TrainingConfig
     from pdcorrect.training.training import MODEL, Training
-    from pdcorrect.training.world import joined
 
     loaded = TrainingConfig.load(config)
     if evaluate is not None:

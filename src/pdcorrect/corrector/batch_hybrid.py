@@ -21,8 +21,8 @@ from pdcorrect.corrector.batch_bodies import BatchBodies, check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.decision import corrected_step
-from pdcorrect.corrector.features import View
-from pdcorrect.corrector.gate import Gate, Measured, check_gate
+from pdcorrect.corrector.features import FeatureView
+from pdcorrect.corrector.gate import Gate, GateMeasures, check_gate
 from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Values, Velocity, check_velocity, moved
 from pdcorrect.corrector.recorded import (
@@ -52,10 +52,12 @@ class BatchParts:
         self.placement = corrector.config.placement
         self.measures = RecordedMeasures(stepper) if recorded else None
 
-    def view(self, before: BatchState, coarse: Tensor | None, previous: Tensor | None) -> View:
+    def view(
+        self, before: BatchState, coarse: Tensor | None, previous: Tensor | None
+    ) -> FeatureView:
         """What the network sees of a step."""
         self.check_previous(previous)
-        return View(self.nodes.graph, self.nodes.snapshot(before, coarse, previous))
+        return FeatureView(self.nodes.graph, self.nodes.snapshot(before, coarse, previous))
 
     def check_previous(self, previous: Tensor | None) -> None:
         """Refuse a correction of other bodies."""
@@ -125,7 +127,7 @@ class BatchCoarseStep:
         """See `CoarseStep`."""
         return values
 
-    def view(self, answer: BatchResult | None) -> View:
+    def view(self, answer: BatchResult | None) -> FeatureView:
         """See `CoarseStep`."""
         proposed = None if answer is None else answer.state.positions
         view = self._parts.view(self._state, proposed, self._previous)
@@ -147,7 +149,7 @@ class BatchCoarseStep:
         """See `CoarseStep`; only the state is another one."""
         return replace(answer, state=self._parts.moved(self._state, answer.state, correction))
 
-    def measured(self, answer: BatchResult) -> Measured:
+    def measured(self, answer: BatchResult) -> GateMeasures:
         """See `CoarseStep`."""
         state = answer.state
         assert self._loads is not None, "the network was asked before"
@@ -155,7 +157,7 @@ class BatchCoarseStep:
             work = dot(self._loads, state.positions - self._state.positions)
             return self._with_work(state, self._configuration(answer), work)
 
-    def before(self) -> Measured | None:
+    def before(self) -> GateMeasures | None:
         """See `CoarseStep`; None with internal modes, which states of batches do not have."""
         if self._stepper.cells.sizes.modes:
             return None
@@ -167,12 +169,12 @@ class BatchCoarseStep:
         """See `CoarseStep`."""
         return chosen(which, one, other)
 
-    def _with_work(self, state: BatchState, y: Tensor, work: Tensor) -> Measured:
+    def _with_work(self, state: BatchState, y: Tensor, work: Tensor) -> GateMeasures:
         recorded, motion = self._parts.measures, (state.positions, state.velocities, y)
         if recorded is not None:
             return recorded(*motion, work)
         stored, ratios = stored_and_ratios(self._stepper, *motion)
-        return Measured(ratios, stored, work)
+        return GateMeasures(ratios, stored, work)
 
     def _configuration(self, answer: BatchResult) -> Tensor:
         """The end of the step, (B, U, 3)."""
@@ -325,7 +327,7 @@ class HybridLayer(WithNodes, nn.Module):
     steps : PDLayer
         The coarse step; its ``statuses`` are those of the last call.
     watch : callable or None
-        Called with what the network is shown, a `View`, scenes that failed as at rest.
+        Called with what the network is shown, a `FeatureView`, scenes that failed as at rest.
 
     Raises
     ------
@@ -354,7 +356,7 @@ class HybridLayer(WithNodes, nn.Module):
         super().__init__()
         self._hybrid = BatchParts(stepper, corrector, velocity)
         self.corrector, self.through_solver = corrector, through_solver
-        self.watch: Callable[[View], None] | None = None
+        self.watch: Callable[[FeatureView], None] | None = None
         self.steps = PDLayer(stepper, on_failure=on_failure)
 
     def forward(
@@ -441,7 +443,7 @@ class HybridLayer(WithNodes, nn.Module):
         _without_derivatives(given, ~at_nodes)
         return after, torch.where(at_nodes, correction, 0.0)
 
-    def _asked(self, view: View) -> Tensor:
+    def _asked(self, view: FeatureView) -> Tensor:
         if self.watch is not None:
             self.watch(view)
         return self.corrector.of_view(view)

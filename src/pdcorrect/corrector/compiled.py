@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled_features import (
     KNOWN_OF_EDGES,
@@ -25,9 +26,8 @@ from pdcorrect.corrector.compiled_features import (
     largest_excess,
 )
 from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
-from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector, without_momentum
-from pdcorrect.corrector.features import View
+from pdcorrect.corrector.features import FeatureView
 from pdcorrect.fem.decomposition import OPTIONS
 
 
@@ -129,9 +129,9 @@ class CompiledCorrector:
         )
         self._output_scale = float(corrector.normaliser.output_scale)
         self._beyond = corrector.time_step_excess(self._bodies)
-        self._view: View | None = None
+        self._view: FeatureView | None = None
 
-    def of_view(self, view: View) -> Tensor:
+    def of_view(self, view: FeatureView) -> Tensor:
         """The correction (n, 3), m."""
         self._follow()
         features = self._seen(view)
@@ -141,17 +141,17 @@ class CompiledCorrector:
         found = torch.from_numpy(answer)
         return without_momentum(view, found) if self.config.momentum_neutral else found
 
-    def outside(self, view: View, margin: float) -> Array:
+    def outside(self, view: FeatureView, margin: float) -> Array:
         """See `Corrector.outside`."""
         excess = self._known(view).excess
         beyond = len(excess) - np.count_nonzero(excess <= margin)
         return np.array([beyond / len(excess)])
 
-    def unlike(self, view: View) -> Array:
+    def unlike(self, view: FeatureView) -> Array:
         """See `Corrector.unlike`."""
         return np.array([self._known(view).strangeness()])
 
-    def least_corners(self, view: View) -> Array:
+    def least_corners(self, view: FeatureView) -> Array:
         """See `Corrector.least_corners`."""
         found: Array = self._corrector.least_corners(view).detach().numpy()
         return found
@@ -173,13 +173,13 @@ class CompiledCorrector:
         if self._contents.changed:
             self.refresh()
 
-    def _known(self, view: View) -> CompiledFeatures:
+    def _known(self, view: FeatureView) -> CompiledFeatures:
         """The features of a view; if it is not the last one by the corrector as it is now."""
         if view is not self._view:
             self._follow()
         return self._seen(view)
 
-    def _seen(self, view: View) -> CompiledFeatures:
+    def _seen(self, view: FeatureView) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""
         if view is not self._view:
             self.features(view.snapshot)

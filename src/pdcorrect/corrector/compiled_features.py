@@ -23,8 +23,8 @@ from pdcorrect.corrector.features import (
     NODE_FEATURES,
     STILL,
     Feature,
+    FeatureView,
     Snapshot,
-    View,
 )
 from pdcorrect.corrector.frames import EDGE_MEANS, rotations
 from pdcorrect.corrector.normaliser import EXTREME
@@ -64,9 +64,9 @@ class CompiledFeatures:
         Largest excess (`Normaliser.excess`) of a node's features and of those of the edges
         that it receives from; infinite where one is not a number.
     deformation : float
-        See `View.deformation`.
+        See `FeatureView.deformation`.
     frames : (n, 3, 3)
-        See `View.frames`.
+        See `FeatureView.frames`.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class CompiledFeatures:
             )
         )  # fmt: skip
         self._clip = math.inf if corrector.config.clip is None else corrector.config.clip
-        still = View(bodies, Snapshot(*[torch.zeros_like(bodies.rest)] * 4))
+        still = FeatureView(bodies, Snapshot(*[torch.zeros_like(bodies.rest)] * 4))
         config = corrector.config
         self._of_nodes = _columns(corrector, config.node_features, _OF_NODES)
         self._of_edges = _columns(corrector, config.edge_features, _OF_EDGES)
@@ -128,7 +128,7 @@ class CompiledFeatures:
             self._squares,
         )  # fmt: skip
         square = float(self._squares.sum()) / len(self._squares)
-        # as `View.deformation`: what is not a number counts as not deformed
+        # as `FeatureView.deformation`: what is not a number counts as not deformed
         self.deformation = math.sqrt(square) if square > STILL**2 else 0.0
         _features(
             before, velocities, after, loads, correction, self._step, self._mass, self._size,
@@ -162,7 +162,7 @@ def _columns(
 
 
 def _at_rest(
-    corrector: Corrector, table: dict[str, Feature], names: tuple[str, ...], view: View
+    corrector: Corrector, table: dict[str, Feature], names: tuple[str, ...], view: FeatureView
 ) -> tuple[list[tuple[Array, Array]], Array]:
     """Columns and normalised values of features that do not change, and their largest excess."""
     found, column, excess = [], 0, torch.zeros(())
@@ -188,7 +188,7 @@ def _deform(  # type: ignore[no-untyped-def]
     positions, cells, means, inverses, touched, touching, rest_frames, gradients, turns, frames,
     strain, squares,
 ):  # fmt: skip
-    """Frames of nodes, the strain in them, and its squared norm, see `View`."""
+    """Frames of nodes, the strain in them, and its squared norm, see `FeatureView`."""
     for chunk in prange((len(cells) + GROUP - 1) // GROUP):
         axes = np.empty((3, 3))
         for c in range(chunk * GROUP, min(len(cells), (chunk + 1) * GROUP)):

@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector import features
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.features import (
     EDGE_FEATURES,
     NODE_FEATURES,
     Feature,
+    FeatureView,
     Snapshot,
-    View,
 )
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
@@ -31,16 +31,16 @@ class Answers(Protocol):
     def config(self) -> CorrectorConfig:
         """Of the corrector."""
 
-    def of_view(self, view: View) -> Tensor:
+    def of_view(self, view: FeatureView) -> Tensor:
         """Corrections (n, 3), m."""
 
-    def outside(self, view: View, margin: float) -> Values:
+    def outside(self, view: FeatureView, margin: float) -> Values:
         """Share of each body's nodes with inputs beyond a margin, (B,)."""
 
-    def unlike(self, view: View) -> Values:
+    def unlike(self, view: FeatureView) -> Values:
         """How far each body's mean inputs are from those of training bodies, (B,)."""
 
-    def least_corners(self, view: View) -> Values:
+    def least_corners(self, view: FeatureView) -> Values:
         """Least det F at corners of each body's cells after the step, (B,)."""
 
     def shape_excess(self, bodies: BodyGraph) -> Values:
@@ -80,9 +80,9 @@ class Corrector(nn.Module):
 
     def forward(self, bodies: BodyGraph, snapshot: Snapshot) -> Tensor:
         """The correction in the snapshot's precision; the network works in its own."""
-        return self.of_view(View(bodies, snapshot))
+        return self.of_view(FeatureView(bodies, snapshot))
 
-    def of_view(self, view: View, network: Callable[..., Tensor] | None = None) -> Tensor:
+    def of_view(self, view: FeatureView, network: Callable[..., Tensor] | None = None) -> Tensor:
         """The same for a view that exists already; ``network`` may be its own, compiled."""
         nodes, edges = self.inputs(view)
         weight = self.network.decoder[0].weight
@@ -91,7 +91,7 @@ class Corrector(nn.Module):
         x = answer(nodes.to(weight.dtype), edges.to(weight.dtype), view.bodies.edge_index)
         return self.in_metres(view, x.to(view.bodies.rest.dtype))
 
-    def inputs(self, view: View) -> tuple[Tensor, Tensor]:
+    def inputs(self, view: FeatureView) -> tuple[Tensor, Tensor]:
         """Normalised features of nodes (n, a) and edges (E, b)."""
         config = self.config
         nodes = features.values(NODE_FEATURES, config.node_features, view)
@@ -99,7 +99,7 @@ class Corrector(nn.Module):
         joined = self.normaliser.joined
         return joined(nodes, config.clip), joined(edges, config.clip)
 
-    def outside(self, view: View, margin: float) -> Tensor:
+    def outside(self, view: FeatureView, margin: float) -> Tensor:
         """Share of each body's nodes with inputs, or an edge with inputs, beyond a margin, (B,).
 
         The margin is in the unit of `Normaliser.excess`, outside the range of the training data.
@@ -116,7 +116,7 @@ class Corrector(nn.Module):
         nodes |= counts > 0.0
         return bodies.body_means(nodes.to(bodies.mass))
 
-    def unlike(self, view: View) -> Tensor:
+    def unlike(self, view: FeatureView) -> Tensor:
         """How far the mean inputs of each body's nodes are from those of training bodies, (B,).
 
         The largest of all components, see `Normaliser.strangeness`.
@@ -126,7 +126,7 @@ class Corrector(nn.Module):
         averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
         return self.normaliser.strangeness(averages).amax(dim=1)
 
-    def least_corners(self, view: View) -> Tensor:
+    def least_corners(self, view: FeatureView) -> Tensor:
         """Least det F at corners of each body's cells after the step, (B,)."""
         return view.bodies.least_corners(view.snapshot.proposed)
 
@@ -144,7 +144,7 @@ class Corrector(nn.Module):
         """
         return self.normaliser.time_step_excess(bodies.time_steps)
 
-    def in_metres(self, view: View, x: Tensor) -> Tensor:
+    def in_metres(self, view: FeatureView, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""
         x = x * self.normaliser.output_scale.to(x)
         if self.config.output == "frame":
@@ -153,14 +153,14 @@ class Corrector(nn.Module):
         x = torch.where(view.bodies.free, x, 0.0)
         return without_momentum(view, x) if self.config.momentum_neutral else x
 
-    def target(self, view: View, correction: Tensor) -> Tensor:
+    def target(self, view: FeatureView, correction: Tensor) -> Tensor:
         """What the network should give, before the output's scale, for a correction (n, 3)."""
         if self.config.output == "world":
             return correction
         return turned_back(view.frames, correction) / (view.size * view.scale)
 
 
-def without_momentum(view: View, correction: Tensor) -> Tensor:
+def without_momentum(view: FeatureView, correction: Tensor) -> Tensor:
     """The correction less the rigid motion of the wholly free nodes that has their momenta.
 
     Nodes with a held component keep theirs: clamps take up what they have.

@@ -12,8 +12,8 @@ from functools import cached_property
 from typing import Protocol, TypeVar
 
 from pdcorrect.corrector.corrector import Answers
-from pdcorrect.corrector.features import View
-from pdcorrect.corrector.gate import Gate, Measured, Reason
+from pdcorrect.corrector.features import FeatureView
+from pdcorrect.corrector.gate import Gate, GateMeasures, Reason
 from pdcorrect.corrector.placements import Values, filled, where
 
 _HALVINGS = 6
@@ -50,7 +50,7 @@ class CoarseStep(Protocol[Answer]):
     def own(self, values: Values) -> Values:
         """Values of a network or gate as what the step computes with."""
 
-    def view(self, answer: Answer | None) -> View:
+    def view(self, answer: Answer | None) -> FeatureView:
         """What the network sees, with the coarse answer if it is asked after that."""
 
     def solved(self, added: Values | None = None, guess: Values | None = None) -> Answer:
@@ -65,10 +65,10 @@ class CoarseStep(Protocol[Answer]):
     def moved(self, answer: Answer, correction: Values) -> Answer:
         """The answer with a correction (n, 3), m, in its state."""
 
-    def measured(self, answer: Answer) -> Measured:
+    def measured(self, answer: Answer) -> GateMeasures:
         """Volumes and energies after the step."""
 
-    def before(self) -> Measured | None:
+    def before(self) -> GateMeasures | None:
         """Those before it, without work; None where they are not known."""
 
     def chosen(self, which: Values, one: Answer, other: Answer) -> Answer:
@@ -98,7 +98,7 @@ class Decision:
 
     @classmethod
     def of(
-        cls, step: CoarseStep[Answer], view: View, corrector: Answers, gate: Gate | None
+        cls, step: CoarseStep[Answer], view: FeatureView, corrector: Answers, gate: Gate | None
     ) -> Decision:
         """Ask the network, if a gate lets it see one of the scenes."""
         bodies, factors = step.bodies, filled(step.bodies.cell_size, 1.0)

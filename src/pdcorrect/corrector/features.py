@@ -57,7 +57,7 @@ class Snapshot:
     correction: Tensor | None = None
 
 
-class View:
+class FeatureView:
     """A snapshot of bodies, and what features need of it, computed when first asked for.
 
     Attributes
@@ -160,40 +160,40 @@ class View:
         return turned_back(self.receiver_frames, x) / self.receiver_unit
 
 
-Feature = tuple[int, Callable[[View], Tensor]]
+Feature = tuple[int, Callable[[FeatureView], Tensor]]
 """Number of components, and the values (n, k) or (E, k)."""
 
 
-def _fixed(view: View) -> Tensor:
+def _fixed(view: FeatureView) -> Tensor:
     fixed = ~view.bodies.free.all(dim=1)
     return torch.stack([~fixed, fixed], dim=1).to(view.bodies.rest.dtype)
 
 
-def _acceleration(view: View) -> Tensor:
+def _acceleration(view: FeatureView) -> Tensor:
     """What the coarse solver adds to the motion by inertia."""
     state = view.snapshot
     return view.in_frame(state.proposed - state.positions - view.step * state.velocities)
 
 
-def _load(view: View) -> Tensor:
+def _load(view: FeatureView) -> Tensor:
     return view.in_frame(view.step**2 * view.snapshot.forces / view.bodies.mass[:, None])
 
 
-def _correction(view: View) -> Tensor:
+def _correction(view: FeatureView) -> Tensor:
     previous = view.snapshot.correction
     if previous is None:
         return torch.zeros_like(view.snapshot.positions)
     return view.in_frame(previous)
 
 
-def _stiffness(view: View) -> Tensor:
+def _stiffness(view: FeatureView) -> Tensor:
     """Logarithm of the squared number of cells that a wave crosses in a step."""
     body = view.bodies
     waves = body.young[:, None] * view.step**2 / (body.density[:, None] * view.size**2)
     return torch.log(waves)
 
 
-def _strain(view: View) -> Tensor:
+def _strain(view: FeatureView) -> Tensor:
     six = _lower_triangle(view.strain.device)
     return view.strain.flatten(1).index_select(1, six) / view.scale
 
@@ -205,23 +205,23 @@ def _lower_triangle(device: torch.device) -> Tensor:
         return torch.tensor([0, 4, 8, 3, 6, 7], device=device)
 
 
-def _rest_edge(view: View) -> Tensor:
+def _rest_edge(view: FeatureView) -> Tensor:
     return _with_length(view.bodies.rest_edges / view.size.index_select(0, view.receiver))
 
 
-def _stretch(view: View) -> Tensor:
+def _stretch(view: FeatureView) -> Tensor:
     """Edge in the receiver's frame, minus that at rest in the frame at rest."""
     now = turned_back(view.receiver_frames, view.edge_change(view.snapshot.proposed))
     return (now - view.bodies.rest_edges) / view.receiver_unit
 
 
-def _motion(view: View) -> Tensor:
+def _motion(view: FeatureView) -> Tensor:
     """Relative motion during the step."""
     state = view.snapshot
     return view.in_receiver_frame(view.edge_change(state.proposed - state.positions))
 
 
-def _turn(view: View) -> Tensor:
+def _turn(view: FeatureView) -> Tensor:
     """Rotation between the frames of an edge's ends, beyond that at rest."""
     senders = view.frames.index_select(0, view.sender)
     now = turns_between(view.receiver_frames, senders)
@@ -279,7 +279,9 @@ def width(features: dict[str, Feature], names: Sequence[str]) -> int:
     return sum(features[name][0] for name in names)
 
 
-def values(features: dict[str, Feature], names: Sequence[str], view: View) -> dict[str, Tensor]:
+def values(
+    features: dict[str, Feature], names: Sequence[str], view: FeatureView
+) -> dict[str, Tensor]:
     """Some features of a view by name, each computed once."""
     for name in names:
         if name not in view.known:

@@ -17,7 +17,7 @@ from pydantic import Field
 from pdcorrect._config import Checked, NonNegative, Number
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Answers, Corrector
-from pdcorrect.corrector.features import View
+from pdcorrect.corrector.features import FeatureView
 from pdcorrect.corrector.placements import Values, where
 from pdcorrect.errors import InputError
 
@@ -46,7 +46,7 @@ class Reason(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class GateMeasures:
     """What a gate looks at in the states of B scenes after a step, or before it.
 
     Arrays or tensors.
@@ -179,7 +179,7 @@ class Gate(Checked):
             reasons = where(beyond, int(Reason.BODY), reasons)
         return reasons
 
-    def unknown(self, corrector: Answers, view: View) -> Values:
+    def unknown(self, corrector: Answers, view: FeatureView) -> Values:
         """Whether the network's inputs are too far from its training data, (B,) bool, or False."""
         found: Values = False
         if self.margin is not None:
@@ -188,7 +188,7 @@ class Gate(Checked):
             found = found | (corrector.unlike(view) > self.average)
         return found
 
-    def folded(self, corrector: Answers, view: View) -> Values:
+    def folded(self, corrector: Answers, view: FeatureView) -> Values:
         """Whether bodies are folded at a corner in what the network sees, (B,) bool, or False.
 
         What is not a number counts as folded.
@@ -197,7 +197,7 @@ class Gate(Checked):
             return False
         return ~(corrector.least_corners(view) > self.corners)
 
-    def reasons(self, answer: Measured, coarse: Measured, rise: float | None) -> Values:
+    def reasons(self, answer: GateMeasures, coarse: GateMeasures, rise: float | None) -> Values:
         """Reasons (B,) to refuse an answer beside another one, which is the coarse one.
 
         ``rise`` takes the place of ``energy``.  What is not a number does not pass.

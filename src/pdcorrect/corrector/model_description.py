@@ -17,7 +17,7 @@ from pydantic import Field, JsonValue, ValidationError
 from pdcorrect._config import Strict
 from pdcorrect._environment import code_digest
 from pdcorrect._version import __version__
-from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.errors import FileFormatError, FileVersionError
 
 FORMAT = "pdcorrect-model"

@@ -24,7 +24,7 @@ from torch import Tensor
 from pdcorrect._environment import home_folder
 from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect.corrector import features
-from pdcorrect.corrector.config import CorrectorConfig
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_description import (
     DESCRIPTION,

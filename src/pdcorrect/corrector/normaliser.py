@@ -42,7 +42,7 @@ Some inputs are large in few steps only, as in kicks: their deviation over all s
 """
 
 
-class Moments:
+class RunningMoments:
     """Mean, deviation and range of values that come in parts.
 
     Attributes
@@ -171,7 +171,7 @@ class Normaliser(nn.Module):
         steps = dict.fromkeys(f"{cell_size * x:.4g}" for x in self.time_steps)
         return f"{' to '.join(steps)} s"
 
-    def fit(self, features: Mapping[str, Moments], target: Moments) -> None:
+    def fit(self, features: Mapping[str, RunningMoments], target: RunningMoments) -> None:
         """Take over the moments of features, and of targets (m, 1).
 
         Raises
@@ -198,42 +198,42 @@ class Normaliser(nn.Module):
             self._part(name, "high").copy_(moments.high)
         self.output_scale.copy_(target.square.mean().sqrt())
 
-    def fit_averages(self, averages: Moments) -> None:
+    def fit_averages(self, averages: RunningMoments) -> None:
         """Take over range, mean and deviation of bodies' mean inputs (m, a), see `joined`."""
         self._fit_range("average_", averages)
         self.average_mean.copy_(averages.mean)
         self.average_deviation.copy_(averages.deviation.clamp_min(_LEAST_SPREAD))
 
-    def fit_shapes(self, shapes: Moments) -> None:
+    def fit_shapes(self, shapes: RunningMoments) -> None:
         """Take over the range of bodies' measures at rest (m, 10)."""
         self._fit_range("shape_", shapes)
 
-    def fit_time_steps(self, steps: Moments) -> None:
+    def fit_time_steps(self, steps: RunningMoments) -> None:
         """Take over the range of logarithms of time steps over cell sizes, s/m, (m, 1)."""
         self._fit_range("time_step_", steps)
 
-    def _fit_range(self, prefix: str, moments: Moments) -> None:
+    def _fit_range(self, prefix: str, moments: RunningMoments) -> None:
         for part in ("low", "high"):
             getattr(self, prefix + part).copy_(getattr(moments, part))
 
-    def widen(self, features: Mapping[str, Moments]) -> None:
+    def widen(self, features: Mapping[str, RunningMoments]) -> None:
         """Widen the ranges by those of further values; means and deviations do not change."""
         for name in self.names:
             self._widen(_key(name, ""), features[name])
 
-    def widen_averages(self, averages: Moments) -> None:
+    def widen_averages(self, averages: RunningMoments) -> None:
         """Widen the ranges of bodies' mean inputs (m, a); as of `widen`."""
         self._widen("average_", averages)
 
-    def widen_shapes(self, shapes: Moments) -> None:
+    def widen_shapes(self, shapes: RunningMoments) -> None:
         """Widen the range of bodies' measures at rest (m, 10); as of `widen`."""
         self._widen("shape_", shapes)
 
-    def widen_time_steps(self, steps: Moments) -> None:
+    def widen_time_steps(self, steps: RunningMoments) -> None:
         """Widen the range of logarithms of time steps over cell sizes (m, 1); as of `widen`."""
         self._widen("time_step_", steps)
 
-    def _widen(self, prefix: str, moments: Moments) -> None:
+    def _widen(self, prefix: str, moments: RunningMoments) -> None:
         for part, of_both in (("low", torch.minimum), ("high", torch.maximum)):
             own: Tensor = getattr(self, prefix + part)
             own.copy_(of_both(own.cpu(), getattr(moments, part)))

@@ -16,13 +16,13 @@ from torch import Tensor
 from pdcorrect.batch.gpu import Recorder
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import Contents, usual
-from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import Snapshot, View
+from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.frames import unrolled_products
-from pdcorrect.corrector.gate import Measured
+from pdcorrect.corrector.gate import GateMeasures
 from pdcorrect.errors import InputError
 
 UNRECORDABLE = (
@@ -76,7 +76,7 @@ class RecordedCorrector:
 
     def _forget(self) -> None:
         self._bodies: BodyGraph | None = None
-        self._view: View | None = None
+        self._view: FeatureView | None = None
         self._replay: Callable[[], None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class RecordedCorrector:
         self._forget()
 
     @torch.no_grad()
-    def of_view(self, view: View) -> Tensor:
+    def of_view(self, view: FeatureView) -> Tensor:
         """The correction (n, 3), m."""
         if view.bodies is not self._bodies or self._contents.replaced:
             self._record(view.bodies)
@@ -100,19 +100,19 @@ class RecordedCorrector:
         return self._answer.clone()
 
     @torch.no_grad()
-    def outside(self, view: View, margin: float) -> Tensor:
+    def outside(self, view: FeatureView, margin: float) -> Tensor:
         """See `Corrector.outside`."""
         if view is not self._view or margin != self._margin:
             return self._corrector.outside(view, margin)
         return self._outside.clone()
 
     @torch.no_grad()
-    def unlike(self, view: View) -> Tensor:
+    def unlike(self, view: FeatureView) -> Tensor:
         """See `Corrector.unlike`."""
         return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
 
     @torch.no_grad()
-    def least_corners(self, view: View) -> Tensor:
+    def least_corners(self, view: FeatureView) -> Tensor:
         """See `Corrector.least_corners`."""
         return self._corrector.least_corners(view)
 
@@ -145,7 +145,7 @@ class RecordedCorrector:
         self._bodies = bodies
 
     def _compute(self) -> None:
-        corrector, view = self._corrector, View(self._recorded, self._snapshot)
+        corrector, view = self._corrector, FeatureView(self._recorded, self._snapshot)
         with unrolled_products():
             self._answer.copy_(corrector.of_view(view, self._network))
             if self._margin is not None:
@@ -163,7 +163,9 @@ class RecordedMeasures:
     def __getstate__(self) -> dict[str, Any]:
         return {"_stepper": self._stepper, "_replay": None}
 
-    def __call__(self, positions: Tensor, velocities: Tensor, y: Tensor, work: Tensor) -> Measured:
+    def __call__(
+        self, positions: Tensor, velocities: Tensor, y: Tensor, work: Tensor
+    ) -> GateMeasures:
         """Of positions and velocities (B, N, 3) and configurations y (B, U, 3)."""
         if self._replay is None:
             self._record(positions, y)
@@ -172,7 +174,7 @@ class RecordedMeasures:
         self._velocities.copy_(velocities)
         self._y.copy_(y)
         self._replay()
-        return Measured(self._ratios.clone(), self._stored.clone(), work)
+        return GateMeasures(self._ratios.clone(), self._stored.clone(), work)
 
     def _record(self, positions: Tensor, y: Tensor) -> None:
         sizes = self._stepper.cells.sizes

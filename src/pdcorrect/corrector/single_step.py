@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.features import Snapshot, View
-from pdcorrect.corrector.gate import Measured
+from pdcorrect.corrector.features import FeatureView, Snapshot
+from pdcorrect.corrector.gate import GateMeasures
 from pdcorrect.corrector.placements import Values, Velocity, as_forces, ballistic, moved
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.state import State, Status, StepResult
@@ -93,7 +93,7 @@ class SingleCoarseStep:
         """See `CoarseStep`."""
         return np.asarray(values)
 
-    def view(self, answer: StepResult | None) -> View:
+    def view(self, answer: StepResult | None) -> FeatureView:
         """See `CoarseStep`."""
         state, problem = self._state, self._problem
         h, mass, free = self._coarse.time_step, problem.mass, problem.free
@@ -105,7 +105,7 @@ class SingleCoarseStep:
         arrays = state.positions, state.velocities, proposed, self._loads
         positions, velocities, after, loads = map(_tensor, arrays)
         old = None if self._previous is None else _tensor(self._previous)
-        return View(self._graph, Snapshot(positions, velocities, after, loads, old))
+        return FeatureView(self._graph, Snapshot(positions, velocities, after, loads, old))
 
     def solved(self, added: Array | None = None, guess: Array | None = None) -> StepResult:
         """See `CoarseStep`; the work of a correction's forces is no ``external_work``."""
@@ -145,7 +145,7 @@ class SingleCoarseStep:
             answer, state=state, status=status, stats=stats, modes=None, volume_ratios=ratios
         )
 
-    def measured(self, answer: StepResult) -> Measured:
+    def measured(self, answer: StepResult) -> GateMeasures:
         """See `CoarseStep`."""
         stored = answer.stats["elastic_energy"] + answer.stats["kinetic_energy"]
         ratios = answer.volume_ratios
@@ -153,7 +153,7 @@ class SingleCoarseStep:
             ratios = self._problem.volume_ratios(answer.state.positions)
         return _measured(ratios, stored, float(np.vdot(self._loads, self._way(answer))))
 
-    def before(self) -> Measured:
+    def before(self) -> GateMeasures:
         """See `CoarseStep`."""
         positions = self._state.positions
         stored = self._problem.energy(positions) + self._kinetic(self._state)
@@ -171,8 +171,8 @@ class SingleCoarseStep:
         return 0.5 * float(np.vdot(state.velocities, self._problem.mass_times(state.velocities)))
 
 
-def _measured(ratios: Array, stored: float, work: float) -> Measured:
-    return Measured(ratios[None], np.array([stored]), np.array([work]))
+def _measured(ratios: Array, stored: float, work: float) -> GateMeasures:
+    return GateMeasures(ratios[None], np.array([stored]), np.array([work]))
 
 
 def _tensor(array: Array) -> Tensor:

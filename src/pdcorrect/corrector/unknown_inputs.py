@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Feature, View
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Feature, FeatureView
 from pdcorrect.corrector.gate import Gate
 
 
@@ -49,7 +49,9 @@ class UnknownInput:
     high: float
 
 
-def unknown_inputs(gate: Gate | None, corrector: Corrector, view: View) -> list[UnknownInput]:
+def unknown_inputs(
+    gate: Gate | None, corrector: Corrector, view: FeatureView
+) -> list[UnknownInput]:
     """The inputs for which `Gate.unknown` refuses a step; empty if it does not, or without a gate.
 
     Values at nodes and edges before means, and those at most nodes first.
@@ -58,7 +60,7 @@ def unknown_inputs(gate: Gate | None, corrector: Corrector, view: View) -> list[
     ----------
     gate : Gate or None
     corrector : Corrector
-    view : View
+    view : FeatureView
         Of one body with n nodes.
     """
     found: list[UnknownInput] = []
@@ -71,7 +73,7 @@ def unknown_inputs(gate: Gate | None, corrector: Corrector, view: View) -> list[
     return sorted(found, key=lambda x: (x.mean, -x.share, -x.excess))
 
 
-def _values(corrector: Corrector, view: View, margin: float) -> list[UnknownInput]:
+def _values(corrector: Corrector, view: FeatureView, margin: float) -> list[UnknownInput]:
     config = corrector.config
     nodes = torch.arange(len(view.bodies.rest), device=view.receiver.device)
     return [
@@ -81,7 +83,7 @@ def _values(corrector: Corrector, view: View, margin: float) -> list[UnknownInpu
 
 
 def _of_rows(
-    corrector: Corrector, view: View, margin: float, table: dict[str, Feature],
+    corrector: Corrector, view: FeatureView, margin: float, table: dict[str, Feature],
     names: tuple[str, ...], at: Tensor,
 ) -> list[UnknownInput]:  # fmt: skip
     """Of nodes or edges; ``at`` (m,) are the nodes at which they count."""
@@ -101,7 +103,7 @@ def _of_rows(
     return found
 
 
-def _means(corrector: Corrector, view: View, bound: float) -> list[UnknownInput]:
+def _means(corrector: Corrector, view: FeatureView, bound: float) -> list[UnknownInput]:
     config, normaliser = corrector.config, corrector.normaliser
     values = features.values(NODE_FEATURES, config.node_features, view)
     means = view.bodies.body_means(normaliser.joined(values, config.clip))

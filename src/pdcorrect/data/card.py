@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from pdcorrect.data.config import EVALUATION, DatasetConfig, ExtraSplit
+from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.info import FEWEST, DatasetInfo, SplitInfo

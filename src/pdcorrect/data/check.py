@@ -13,7 +13,7 @@ import numpy as np
 
 from pdcorrect.data.check_file import cell_size, file_faults, plan_faults
 from pdcorrect.data.check_motion import step_faults
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pdcorrect.data.check_motion import load_faults, model_faults, volume_faults
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import MeshPlan, draw_scene
 from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.data.simulate import lacking

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.engines import MOST_ITERATIONS
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.schema import REFERENCE, STATISTICS, Array, Shard, Simulation

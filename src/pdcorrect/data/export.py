@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._files import make_folder, replacing, write_text
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pdcorrect._config import as_toml
-from pdcorrect.data.config import FamilyName
+from pdcorrect.data.configuration import FamilyName
 from pdcorrect.errors import InputError
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import CONFIG, SUFFIX
 from pdcorrect.data.shard_reader import stored_hashes

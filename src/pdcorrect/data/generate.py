@@ -16,7 +16,7 @@ from pathlib import Path
 from statistics import median
 
 from pdcorrect._files import clear_parts, make_folder, write_text
-from pdcorrect.data.config import TRAINING, DatasetConfig
+from pdcorrect.data.configuration import TRAINING, DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.importing import INTEGRATOR, Motion, check_element, shard_from_arrays
+from pdcorrect.data.importing import INTEGRATOR, ImportedMotion, check_element, shard_from_arrays
 from pdcorrect.data.schema import CONFIG, SUFFIX, Shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.fem.problem import Problem, discretise
@@ -187,7 +187,7 @@ _ARRAY = b"\x93NUMPY"
 """How an .npy file begins."""
 
 
-def _motions(arrays: dict[str, Any]) -> list[Motion]:
+def _motions(arrays: dict[str, Any]) -> list[ImportedMotion]:
     count = 0
     while f"reference_{count}" in arrays:
         count += 1
@@ -204,7 +204,9 @@ def _motions(arrays: dict[str, Any]) -> list[Motion]:
     for name in arrays:
         if name not in known:
             raise InputError(f"array {name!r}: {_advice(name, count, known)}")
-    return [Motion(**{k: arrays[n] for k, n in one.items() if n in arrays}) for one in names]
+    return [
+        ImportedMotion(**{k: arrays[n] for k, n in one.items() if n in arrays}) for one in names
+    ]
 
 
 def _advice(name: str, count: int, known: set[str]) -> str:
@@ -234,7 +236,7 @@ def _shard_of_run(
     problem = discretise(scene)
     step = _uniform_step(run)
     rollout = None if coarse is None else _on_coarse_mesh(coarse, problem)
-    motion = Motion(restrict(run, problem).positions, coarse=rollout)
+    motion = ImportedMotion(restrict(run, problem).positions, coarse=rollout)
     materials = problem.materials
     return shard_from_arrays(
         problem.mesh.positions, problem.mesh.cells, [motion],

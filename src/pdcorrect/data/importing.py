@@ -76,7 +76,7 @@ ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean")
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class ImportedMotion:
     """One simulation of another solver, on the nodes of the coarse mesh.
 
     Attributes
@@ -100,7 +100,7 @@ class Motion:
 def shard_from_arrays(
     points: ArrayLike,
     cells: ArrayLike,
-    motions: Motion | Sequence[Motion],
+    motions: ImportedMotion | Sequence[ImportedMotion],
     *,
     free: ArrayLike,
     young: ArrayLike,
@@ -122,7 +122,7 @@ def shard_from_arrays(
         Rest positions of the coarse mesh, m.
     cells : (C, 8)
         Node numbers, VTK order.
-    motions : Motion or sequence of Motion
+    motions : ImportedMotion or sequence of ImportedMotion
         At least one.
     free : (N, 3) bool
         Components that may move, or 1 for them and 0 for the others, which stay at rest.
@@ -158,7 +158,7 @@ def shard_from_arrays(
         without a scene or of one that is its own best coarse model; names simulation, frame and
         cell or node.
     """
-    motions = [motions] if isinstance(motions, Motion) else list(motions)
+    motions = [motions] if isinstance(motions, ImportedMotion) else list(motions)
     mesh = HexMesh.create(real_array("points", points), integer_array("cells", cells))
     count, nodes = len(mesh.cells), len(mesh.positions)
     moduli = {
@@ -202,15 +202,15 @@ def shard_from_arrays(
 
 def _simulation(
     where: str,
-    motion: Motion,
+    motion: ImportedMotion,
     mesh: HexMesh,
     free: Array,
     stepper: ProjectiveDynamics | None,
     time_step: float,
     better: ProjectiveDynamics | None,
 ) -> Simulation:
-    if not isinstance(motion, Motion):
-        raise InputError(f"{where}: {type(motion).__name__}: expected Motion.")
+    if not isinstance(motion, ImportedMotion):
+        raise InputError(f"{where}: {type(motion).__name__}: expected ImportedMotion.")
     nodes = len(mesh.positions)
     frames = _frames(f"{where}, reference", motion.reference)
     every, steps = (frames, nodes, 3), (frames - 1, nodes, 3)

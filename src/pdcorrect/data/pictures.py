@@ -12,7 +12,15 @@ from pdcorrect.data.measuring import MeasuredMesh, dataset_files, measure_datase
 from pdcorrect.data.schema import PLAIN, REFERENCE, Array
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError, require_extra
-from pdcorrect.figures.panels import Body, Image, Painter, View, replacing, shown_points, write_png
+from pdcorrect.figures.panels import (
+    Body,
+    Camera,
+    Image,
+    Painter,
+    replacing,
+    shown_points,
+    write_png,
+)
 from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
 from pdcorrect.trajectory import Trajectory
 
@@ -207,7 +215,7 @@ def _page(samples: Sequence[_Sample]) -> Image:
         for s in samples
     ]
     columns = min(_COLUMNS, len(samples))
-    view = View.fitted(shown_points(bodies, rest=True), _WIDTH)
+    view = Camera.fitted(shown_points(bodies, rest=True), _WIDTH)
     labels = [sample.label for sample in samples]
     sheet = Sheet(view, labels, -(-len(samples) // columns), bar, _FONT, columns)
     painter = Painter(bodies, view, bar.palette, bar.limit, rest=True)

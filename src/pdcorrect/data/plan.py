@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pdcorrect._config import as_toml
-from pdcorrect.data.config import (
+from pdcorrect.data.configuration import (
     EVALUATION,
     TRAINING,
     VALIDATION,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numba
 
 from pdcorrect._environment import code_digest, environment
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.schema import SUFFIX, write_shard
@@ -57,7 +57,7 @@ def make_engines(config: DatasetConfig, device: str) -> Engines:
     if device == "cpu":
         return Engines(alone, truth or alone, truth or alone)
     require_extra("torch", "learn")
-    from pdcorrect.data.batch_engine import Batched
+    from pdcorrect.data.engines import Batched
 
     batched = Batched(device, config.tolerance)
     return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)

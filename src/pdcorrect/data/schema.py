@@ -1,7 +1,7 @@
 """What a file of a data set holds: one mesh with its material, and its simulations.
 
 The layout of the HDF5 file, version 1 (``docs/data_format.md``), after its seal
-(`pdcorrect.data.seal`)::
+(`pdcorrect.data.checksum`)::
 
     /                     attributes: format, version, dataset, split, number, setting,
                           config_hash, time_step, tolerance, content_hash
@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._files import part_of_process, replacing
-from pdcorrect.data.seal import FORMAT, USER_BLOCK, VERSION, seal
+from pdcorrect.data.checksum import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
 
 REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"

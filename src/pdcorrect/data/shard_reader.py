@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from pdcorrect.data.checksum import FORMAT, VERSION, check_seal, read_sealed
 from pdcorrect.data.hdf5_checks import (
     RefusalError,
     Value,
@@ -37,7 +38,6 @@ from pdcorrect.data.schema import (
     Simulation,
     content_hash,
 )
-from pdcorrect.data.seal import FORMAT, VERSION, check_seal, read_sealed
 from pdcorrect.errors import FileFormatError
 
 _GROUPS = frozenset({"mesh", "material", "simulations", "provenance", "cost"})

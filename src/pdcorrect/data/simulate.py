@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pdcorrect.data.config import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.importing import discretise_stored
 from pdcorrect.data.plan import MeshPlan, draw_scene

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._files import ctrl_c_ignored, write_text
-from pdcorrect.data.config import TRAINING
+from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.folder import Damage, shard_paths, whole_files
 from pdcorrect.data.schema import NORMALISATION
 from pdcorrect.data.shard_arrays import (
@@ -37,14 +37,14 @@ _MOST_PROCESSES = 60
 """Windows waits for no more."""
 
 Array = NDArray[np.float64]
-_Parts = list[dict[str, "Moments"]]
+_Parts = list[dict[str, "ComponentMoments"]]
 _Work = Callable[[Path], _Parts]
 Spread = Callable[[_Work, list[Path]], Iterable[_Parts]]
 """Results of a function of each path, in order."""
 
 
 @dataclass(frozen=True, eq=False)
-class Moments:
+class ComponentMoments:
     """Of values with d components.
 
     Attributes
@@ -62,7 +62,7 @@ class Moments:
     maximum: Array
 
     @classmethod
-    def of(cls, values: NDArray[Any], chosen: NDArray[np.bool_] | None = None) -> Moments:
+    def of(cls, values: NDArray[Any], chosen: NDArray[np.bool_] | None = None) -> ComponentMoments:
         """Of values (n, d), those ``chosen`` (n, d) where given."""
         if chosen is None:
             chosen = np.ones(values.shape, dtype=bool)
@@ -77,18 +77,20 @@ class Moments:
             values.max(axis=0, where=chosen, initial=-np.inf),
         )  # fmt: skip
 
-    def repeated(self, times: int) -> Moments:
+    def repeated(self, times: int) -> ComponentMoments:
         """As if every value came so many times."""
-        return Moments(times * self.count, self.mean, self.deviation, self.minimum, self.maximum)
+        return ComponentMoments(
+            times * self.count, self.mean, self.deviation, self.minimum, self.maximum
+        )
 
-    def merged(self, other: Moments) -> Moments:
+    def merged(self, other: ComponentMoments) -> ComponentMoments:
         """Of both sets of values together (Chan, Golub and LeVeque 1979)."""
         count = self.count + other.count
         share = np.divide(other.count, count, out=np.zeros_like(count), where=count > 0)
         away = other.mean - self.mean
         variance = (1 - share) * self.deviation**2 + share * other.deviation**2
         variance += share * (1 - share) * away**2
-        return Moments(
+        return ComponentMoments(
             count, self.mean + share * away, np.sqrt(variance),
             np.minimum(self.minimum, other.minimum), np.maximum(self.maximum, other.maximum),
         )  # fmt: skip
@@ -107,7 +109,7 @@ class Statistics:
 
     Attributes
     ----------
-    quantities : mapping of str to Moments
+    quantities : mapping of str to ComponentMoments
         By node: ``velocity`` (m/s), ``force`` (N), ``displacement`` (distance from rest, m),
         ``log_young`` (log Pa), ``poisson``, ``density`` (kg/m3).  By directed edge:
         ``rest_edge``, ``edge`` (vector from the first to the second node, at rest and in the
@@ -121,12 +123,12 @@ class Statistics:
         Files that were left out, and what is wrong with them; not saved.
     """
 
-    quantities: Mapping[str, Moments]
+    quantities: Mapping[str, ComponentMoments]
     config_hash: str
     shards: Mapping[str, str]
     damaged: Mapping[Path, str] = field(default_factory=dict)
 
-    def __getitem__(self, name: str) -> Moments:
+    def __getitem__(self, name: str) -> ComponentMoments:
         if name not in self.quantities:
             raise InputError(
                 f"no statistics of {name!r}: expected one of {', '.join(self.quantities)}."
@@ -191,7 +193,7 @@ def compute_statistics(
     return Statistics(found, config_hash, shards, damaged)
 
 
-def _moments(work: _Work, paths: list[Path], processes: int) -> dict[str, Moments]:
+def _moments(work: _Work, paths: list[Path], processes: int) -> dict[str, ComponentMoments]:
     """Of all files, in their order."""
     count = min(processes, len(paths) // _FILES_A_PROCESS, _MOST_PROCESSES)
     if count > 1:
@@ -201,7 +203,7 @@ def _moments(work: _Work, paths: list[Path], processes: int) -> dict[str, Moment
     return _all_merged(map(work, paths))
 
 
-def _moments_by_several(work: _Work, paths: list[Path], count: int) -> dict[str, Moments]:
+def _moments_by_several(work: _Work, paths: list[Path], count: int) -> dict[str, ComponentMoments]:
     pool = ProcessPoolExecutor(count, get_context("spawn"))
     try:
         with ctrl_c_ignored():
@@ -211,7 +213,7 @@ def _moments_by_several(work: _Work, paths: list[Path], count: int) -> dict[str,
         pool.shutdown(cancel_futures=True)
 
 
-def _all_merged(files: Iterable[_Parts]) -> dict[str, Moments]:
+def _all_merged(files: Iterable[_Parts]) -> dict[str, ComponentMoments]:
     return reduce(_merged, chain.from_iterable(files))
 
 
@@ -230,7 +232,7 @@ def load_statistics(folder: str | Path) -> Statistics:
         content = json.loads(path.read_text(encoding="utf-8"))
         found = Statistics(
             {
-                name: Moments(**{part: np.array(values[part]) for part in _MOMENTS})
+                name: ComponentMoments(**{part: np.array(values[part]) for part in _MOMENTS})
                 for name, values in content["quantities"].items()
             },
             content["config_hash"],
@@ -265,39 +267,39 @@ def _identity(headers: list[ShardHeader]) -> tuple[str, dict[str, str]]:
 
 
 def _parts(path: Path, bases: list[str]) -> _Parts:
-    """Moments of a file's mesh, then of each of its simulations."""
+    """ComponentMoments of a file's mesh, then of each of its simulations."""
     mesh, motions = read_arrays(path, bases)
     steps = sum(len(motion.forces) for motion in motions)
     whole = {name: moments.repeated(steps) for name, moments in _of_mesh(mesh).items()}
     return [whole, *(_of_motion(mesh, motion) for motion in motions)]
 
 
-def _of_mesh(mesh: MeshArrays) -> dict[str, Moments]:
+def _of_mesh(mesh: MeshArrays) -> dict[str, ComponentMoments]:
     first, second = mesh.edge_index
     edges = mesh.rest[second] - mesh.rest[first]
     return {
-        "log_young": Moments.of(np.log(mesh.young)[:, None]),
-        "poisson": Moments.of(mesh.poisson[:, None]),
-        "density": Moments.of(mesh.density[:, None]),
-        "rest_edge": Moments.of(edges),
-        "rest_edge_length": Moments.of(_lengths(edges)),
+        "log_young": ComponentMoments.of(np.log(mesh.young)[:, None]),
+        "poisson": ComponentMoments.of(mesh.poisson[:, None]),
+        "density": ComponentMoments.of(mesh.density[:, None]),
+        "rest_edge": ComponentMoments.of(edges),
+        "rest_edge_length": ComponentMoments.of(_lengths(edges)),
     }
 
 
-def _of_motion(mesh: MeshArrays, motion: MotionArrays) -> dict[str, Moments]:
+def _of_motion(mesh: MeshArrays, motion: MotionArrays) -> dict[str, ComponentMoments]:
     first, second = mesh.edge_index
     starts = motion.positions[:-1].astype(np.float64)
     edges = (starts[:, second] - starts[:, first]).reshape(-1, 3)
     free = np.broadcast_to(mesh.free, starts.shape).reshape(-1, 3)
     targets = motion.positions[1:].astype(np.float64)
     return {
-        "velocity": Moments.of(motion.velocities.reshape(-1, 3)),
-        "force": Moments.of(motion.forces.reshape(-1, 3)),
-        "displacement": Moments.of(_lengths((starts - mesh.rest).reshape(-1, 3))),
-        "edge": Moments.of(edges),
-        "edge_length": Moments.of(_lengths(edges)),
+        "velocity": ComponentMoments.of(motion.velocities.reshape(-1, 3)),
+        "force": ComponentMoments.of(motion.forces.reshape(-1, 3)),
+        "displacement": ComponentMoments.of(_lengths((starts - mesh.rest).reshape(-1, 3))),
+        "edge": ComponentMoments.of(edges),
+        "edge_length": ComponentMoments.of(_lengths(edges)),
         **{
-            f"correction/{name}": Moments.of((targets - predicted).reshape(-1, 3), free)
+            f"correction/{name}": ComponentMoments.of((targets - predicted).reshape(-1, 3), free)
             for name, predicted in motion.predictions.items()
         },
     }
@@ -308,6 +310,8 @@ def _lengths(vectors: Array) -> Array:
     return np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _merged(one: dict[str, Moments], other: dict[str, Moments]) -> dict[str, Moments]:
+def _merged(
+    one: dict[str, ComponentMoments], other: dict[str, ComponentMoments]
+) -> dict[str, ComponentMoments]:
     both: Iterable[str] = one.keys() & other.keys()
     return {**one, **other, **{name: one[name].merged(other[name]) for name in both}}

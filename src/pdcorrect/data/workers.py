@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pdcorrect._files import ctrl_c_ignored
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.produce import produce
 from pdcorrect.errors import InputError, require_extra

@@ -20,7 +20,7 @@ from pdcorrect.corrector.model_io import (
     unlike_ends,
     weights_digest,
 )
-from pdcorrect.data.config import TRAINING, VALIDATION
+from pdcorrect.data.configuration import TRAINING, VALIDATION
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.evaluation.rollouts import Hybrid
 from pdcorrect.fem.problem import Problem

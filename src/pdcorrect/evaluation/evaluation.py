@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
-from pdcorrect.data.config import EVALUATION
+from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import Damage, accepted_gaps
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.alone import roll_out_alone, single_steps_alone
 from pdcorrect.evaluation.measures import (
-    Case,
-    Measured,
+    EvaluationCase,
+    MeasuredRollout,
     Outcome,
     TrajectoryMeasures,
     measure,
     read_cases,
 )
 from pdcorrect.evaluation.rollouts import Hybrid, roll_out, single_steps
+from pdcorrect.evaluation.single_rollouts import roll_out_alone, single_steps_alone
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -72,13 +72,13 @@ class EvaluatedRun:
     name : str
     base, group : str or None
         Of a `Candidate`.
-    trajectories : tuple of Measured
+    trajectories : tuple of MeasuredRollout
     """
 
     name: str
     base: str | None
     group: str | None
-    trajectories: tuple[Measured, ...]
+    trajectories: tuple[MeasuredRollout, ...]
 
     def values(self, measure: str) -> tuple[list[float], list[int]]:
         """A measure of the trajectories that have it, and on which mesh each one is."""
@@ -95,7 +95,7 @@ class EvaluatedRun:
         return {name: count for name, count in missing.items() if 0 < count < every}
 
     def refused_by(self) -> list[int]:
-        """Of each trajectory, the `Measured.refused_by`."""
+        """Of each trajectory, the `MeasuredRollout.refused_by`."""
         return [t.refused_by for t in self.trajectories]
 
     @property
@@ -105,7 +105,7 @@ class EvaluatedRun:
         return bool(every) and all(every)
 
     def shapes(self) -> Array:
-        """Measures (B, 10) of the bodies at rest that a gate refused, each `Measured.shape`."""
+        """Measures (B, 10) of bodies at rest that a gate refused (`MeasuredRollout.shape`)."""
         found = [t.shape for t in self.trajectories if len(t.shape)]
         return np.stack(found) if found else np.zeros((0, len(SHAPE_MEASURES)))
 
@@ -207,10 +207,12 @@ def evaluate(
             f"names {', '.join(names)}: expected each one once, and none of a stored run "
             f"({', '.join(stored)})."
         )
-    measured: dict[str, dict[int, Measured]] = {name: {} for name in (*names, *stored, REFERENCE)}
+    measured: dict[str, dict[int, MeasuredRollout]] = {
+        name: {} for name in (*names, *stored, REFERENCE)
+    }
     done = 0
 
-    def take(numbers: Sequence[int], results: Iterator[dict[str, Measured]]) -> None:
+    def take(numbers: Sequence[int], results: Iterator[dict[str, MeasuredRollout]]) -> None:
         nonlocal done
         for i, by_run in zip(numbers, results, strict=True):
             for name, one in by_run.items():
@@ -220,7 +222,7 @@ def evaluate(
                 on_cases(done, len(found.cases))
 
     with _pool(workers) as each:
-        waiting: list[tuple[list[int], Iterator[dict[str, Measured]]]] = []
+        waiting: list[tuple[list[int], Iterator[dict[str, MeasuredRollout]]]] = []
         for numbers in _batches(found.cases, bases, batch):
             cases = [found.cases[i] for i in numbers]
             outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in cases]
@@ -250,12 +252,14 @@ def evaluate(
     )  # fmt: skip
 
 
-def _measure_all(case: Case, outcomes: Mapping[str, Outcome]) -> dict[str, Measured]:
+def _measure_all(
+    case: EvaluationCase, outcomes: Mapping[str, Outcome]
+) -> dict[str, MeasuredRollout]:
     return {name: measure(case, outcome) for name, outcome in outcomes.items()}
 
 
 @contextlib.contextmanager
-def _pool(workers: int) -> Iterator[Callable[..., Iterator[dict[str, Measured]]]]:
+def _pool(workers: int) -> Iterator[Callable[..., Iterator[dict[str, MeasuredRollout]]]]:
     """A `map` over processes, each of one thread; the built-in one for one process."""
     if workers == 1:
         yield map
@@ -267,7 +271,7 @@ def _pool(workers: int) -> Iterator[Callable[..., Iterator[dict[str, Measured]]]
         yield pool.map
 
 
-def _stored(case: Case) -> dict[str, Outcome]:
+def _stored(case: EvaluationCase) -> dict[str, Outcome]:
     """Stored runs by name, the plain one first."""
     names = sorted(case.runs.keys() | case.predictions, key=lambda name: (name != PLAIN, name))
     return {
@@ -280,7 +284,9 @@ def _stored(case: Case) -> dict[str, Outcome]:
     }
 
 
-def _batches(cases: Sequence[Case], bases: Sequence[str], size: int) -> Iterator[list[int]]:
+def _batches(
+    cases: Sequence[EvaluationCase], bases: Sequence[str], size: int
+) -> Iterator[list[int]]:
     """Numbers of cases that can be stepped together, of like numbers of nodes."""
     groups: dict[tuple[str, ...], list[int]] = {}
     for i, case in enumerate(cases):
@@ -292,7 +298,7 @@ def _batches(cases: Sequence[Case], bases: Sequence[str], size: int) -> Iterator
 
 
 def _outcomes(
-    candidates: Sequence[Candidate], cases: Sequence[Case], device: str
+    candidates: Sequence[Candidate], cases: Sequence[EvaluationCase], device: str
 ) -> Iterator[tuple[str, list[Outcome]]]:
     steppers: dict[str, BatchStepper] = {}
     for candidate in candidates:
@@ -316,7 +322,9 @@ def _outcomes(
         )
 
 
-def _outcome_alone(alone: Callable[[Problem], HybridStepper], base: str, case: Case) -> Outcome:
+def _outcome_alone(
+    alone: Callable[[Problem], HybridStepper], base: str, case: EvaluationCase
+) -> Outcome:
     hybrid = alone(case.problems[base])
     run = roll_out_alone(hybrid, case.steps)
     steps = single_steps_alone(hybrid, case.reference, case.predictions.get(base))

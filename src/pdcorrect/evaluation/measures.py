@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
-from pdcorrect.data.config import EVALUATION
+from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import Damage, shard_paths, whole_files
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class EvaluationCase:
     """A simulation of a split and what is known of it.
 
     Attributes
@@ -89,7 +89,7 @@ class SplitCases:
     """A split's simulations in float64; see `read_cases`."""
 
     attributes: Mapping[str, str | int | float]
-    cases: tuple[Case, ...]
+    cases: tuple[EvaluationCase, ...]
     shards: Mapping[str, str]
     damaged: Damage
 
@@ -119,7 +119,7 @@ def read_cases(
     paths = whole_files(shard_paths(folder, split), damaged if skip_damaged else None)
     wanted = [PLAIN, *(base for base in dict.fromkeys(bases) if base != PLAIN)]
     shards: dict[str, str] = {}
-    cases: list[Case] = []
+    cases: list[EvaluationCase] = []
     attributes: list[Mapping[str, str | int | float]] = []
     for path in paths:
         shard = read_shard(path)
@@ -131,7 +131,7 @@ def read_cases(
     return SplitCases(attributes[0], tuple(cases), shards, damaged)
 
 
-def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
+def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[EvaluationCase]:
     for base in bases:
         if base not in BASES:
             raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
@@ -147,7 +147,7 @@ def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[Case]:
         others = {name: run for name, run in simulation.runs.items() if name != REFERENCE}
         rollouts = _float64({name: run.positions for name, run in others.items()})
         out.append(
-            Case(
+            EvaluationCase(
                 int(shard.attributes["number"]),
                 k,
                 {base: each[k] for base, each in problems.items()},
@@ -300,7 +300,7 @@ class TrajectoryMeasures:
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class MeasuredRollout:
     """What was measured of a trajectory.
 
     Attributes
@@ -331,7 +331,7 @@ class Measured:
         return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
 
 
-def measure(case: Case, outcome: Outcome) -> Measured:
+def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
     """Measure a run of a case.
 
     Raises
@@ -358,9 +358,9 @@ def measure(case: Case, outcome: Outcome) -> Measured:
         )
     measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
     if outcome.reasons is None:
-        return Measured(measures, errors)
+        return MeasuredRollout(measures, errors)
     steps = None if outcome.failed is None else outcome.failed - 1
-    found_by = Measured(measures, errors, outcome.reasons[:steps])
+    found_by = MeasuredRollout(measures, errors, outcome.reasons[:steps])
     if found_by.refused_by != Reason.BODY:
         return found_by
     body = BodyGraph.of([case.problems[outcome.base or PLAIN]], dtype=torch.float64)
@@ -382,7 +382,7 @@ def time_within(errors: Array, limit: float, time_step: float) -> float:
     return time_step * float(beyond[0] if len(beyond) else len(errors) - 1)
 
 
-def _of_steps(case: Case, predictions: Array) -> dict[str, float | None]:
+def _of_steps(case: EvaluationCase, predictions: Array) -> dict[str, float | None]:
     start = case.reference[:1]
     plain = case.predictions.get(PLAIN)
     steps = np.concatenate([start, predictions])
@@ -394,7 +394,7 @@ def _of_steps(case: Case, predictions: Array) -> dict[str, float | None]:
 
 
 def _of_rollout(
-    case: Case, positions: Array, base: str | None, errors: Array
+    case: EvaluationCase, positions: Array, base: str | None, errors: Array
 ) -> dict[str, float | None]:
     reference, plain = case.reference, case.runs.get(PLAIN)
     rms = rms_error(positions, reference)
@@ -418,7 +418,9 @@ def _of_rollout(
     return found
 
 
-def _of_physics(case: Case, positions: Array, base: str | None) -> dict[str, float | None]:
+def _of_physics(
+    case: EvaluationCase, positions: Array, base: str | None
+) -> dict[str, float | None]:
     own = case.problems[base or PLAIN]
     ours, truth = energies(own, positions), case.reference_energies(base or PLAIN)
     size = float(truth.total.max())

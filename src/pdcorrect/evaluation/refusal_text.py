@@ -79,7 +79,7 @@ def refused_rollouts(
     ----------
     rollouts : sequence
         Of each the number of the `Reason` by which all of its steps are refused (see
-        `pdcorrect.evaluation.measures.Measured.refused_by`), and those of its steps.
+        `pdcorrect.evaluation.measures.MeasuredRollout.refused_by`), and those of its steps.
     refused : Refused, optional
         As of `refused_corrections`.
     """

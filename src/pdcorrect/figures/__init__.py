@@ -24,9 +24,9 @@ from pdcorrect.figures.curves import (
 )
 from pdcorrect.figures.panels import (
     Body,
+    Camera,
     Image,
     Painter,
-    View,
     check_offscreen,
     replacing,
     shown_points,
@@ -200,7 +200,7 @@ def render_overlay(
         Body(_on_nodes_of(run, coarsest), frames[[place]], None)
         for run, frames in zip(runs, shared, strict=True)
     ]
-    view, colours = View.fitted(shown_points(bodies, rest=False), window), _OVERLAID[: len(runs)]
+    view, colours = Camera.fitted(shown_points(bodies, rest=False), window), _OVERLAID[: len(runs)]
     time = float(runs[0].times[shared[0, place]])
     key = [(label, edges) for label, (_, edges) in zip(labels, colours, strict=True)]
     sheet = Sheet(view, [""], 1, None, _font(window, 2), longest=time, key=key)
@@ -229,7 +229,7 @@ class _Picture:
         if colour:
             bodies, bar = _scaled(bodies, colour)
         rest = _moves(bodies)
-        view = View.fitted(shown_points(bodies, rest), max(16, width // columns))
+        view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns))
         captions = labels + [""] * (side - len(labels))
         longest = max(map(max, self._times))
         font = _font(width, columns)

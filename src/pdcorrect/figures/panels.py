@@ -57,7 +57,7 @@ class Body:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Camera:
     """Camera fitted to points.
 
     Attributes
@@ -76,7 +76,7 @@ class View:
     size: tuple[int, int]
 
     @classmethod
-    def fitted(cls, points: Array, width: int) -> View:
+    def fitted(cls, points: Array, width: int) -> Camera:
         """Show all points (n, 3) in panels of ``width`` pixels."""
         back = _TO_CAMERA / np.linalg.norm(_TO_CAMERA)
         right = np.cross([0.0, 0.0, 1.0], back)
@@ -129,7 +129,7 @@ class Painter:
     Parameters
     ----------
     bodies : sequence of Body
-    view : View
+    view : Camera
     palette : str
         Name of a colour map.
     limit : float
@@ -143,7 +143,7 @@ class Painter:
     def __init__(
         self,
         bodies: Sequence[Body],
-        view: View,
+        view: Camera,
         palette: str,
         limit: float,
         rest: bool,

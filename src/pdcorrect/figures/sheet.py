@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import require_extra
-from pdcorrect.figures.panels import View
+from pdcorrect.figures.panels import Camera
 
 _INK, _GREY = "#111111", "#555555"
 _AXES = {"x": "#c0392b", "y": "#2e8b57", "z": "#2364aa"}
@@ -36,7 +36,7 @@ class Sheet:
 
     Parameters
     ----------
-    view : View
+    view : Camera
         The panels' camera and size.
     labels : sequence of str
         One for each column, in the first row; may have several lines.  With ``columns``
@@ -55,7 +55,7 @@ class Sheet:
 
     def __init__(
         self,
-        view: View,
+        view: Camera,
         labels: Sequence[str],
         rows: int,
         bar: ColourBar | None,

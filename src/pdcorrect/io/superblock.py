@@ -17,7 +17,7 @@ from typing import Any
 from pdcorrect.errors import FileFormatError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_DATASET = b"pdcorrect-dataset "  # see pdcorrect.data.seal
+_DATASET = b"pdcorrect-dataset "  # see pdcorrect.data.checksum
 _SIZE = 48  # bytes of a version 3 superblock with 8-byte offsets
 _END, _CHECKSUM = 28, 44  # byte positions of the end-of-file address and the checksum
 _WORD = 0xFFFFFFFF

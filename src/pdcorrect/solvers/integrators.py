@@ -1,6 +1,6 @@
 """Time integrators: what the tables of `schemes` make of a state.
 
-An integrator is a function from the state to the equation of the step, a `Stage`, which
+An integrator is a function from the state to the equation of the step, a `StepEquation`, which
 also knows how its solution gives the next state.
 """
 
@@ -31,7 +31,7 @@ _MASS_TOLERANCE, _MASS_STEPS = 1e-15, 200
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class StepEquation:
     """The equation of one step, over nodal arrays (N, 3), and what it was made of.
 
     Attributes
@@ -128,7 +128,7 @@ class Integrator:
 
     def __call__(
         self, problem: Problem, state: State, h: float, forces: Array | None = None
-    ) -> Stage:
+    ) -> StepEquation:
         scheme, free = self.scheme(state, h), problem.free
         known = self.known(problem, state, h, forces)
 
@@ -142,7 +142,7 @@ class Integrator:
             return State(scheme.positions(known), velocities, state.time + h, memory)
 
         first, last = (state.time + share * h for share in scheme.loads_over)
-        return Stage(
+        return StepEquation(
             scheme.inertia,
             split(scheme.target, scheme.clamped_target),
             scheme.rate,

@@ -2,7 +2,7 @@
 
     gamma(y) = c/2 (y - q)^T M (y - q) + d/2 (y - o)^T C (y - o) + W(y) - f . (y - X)
 
-with the constants of a `Stage`; for backward Euler c = 1/h^2 and q = p_t + h v_t, and the
+with the constants of a `StepEquation`; for backward Euler c = 1/h^2 and q = p_t + h v_t, and the
 stationary point satisfies eq. 3-4.  M is never inverted.  Clamped components of y are
 prescribed; gradients are zero there.
 """
@@ -26,7 +26,7 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.integrators import Stage
+from pdcorrect.solvers.integrators import StepEquation
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ class StepObjective:
     problem : Problem
     state : State
         At the start of the step.
-    stage : Stage
+    stage : StepEquation
         The integrator's equation.
     forces : (N, 3)
         All external forces of the step, N.
@@ -60,7 +60,7 @@ class StepObjective:
     damping : StepDamping or None
     """
 
-    def __init__(self, problem: Problem, state: State, stage: Stage, forces: Array) -> None:
+    def __init__(self, problem: Problem, state: State, stage: StepEquation, forces: Array) -> None:
         self.problem = problem
         self.state = state
         self.stage = stage
@@ -164,7 +164,7 @@ class StepDamping:
         ``stiffness`` is not zero.
     """
 
-    def __init__(self, problem: Problem, state: State, stage: Stage) -> None:
+    def __init__(self, problem: Problem, state: State, stage: StepEquation) -> None:
         damping = problem.scene.damping
         self._problem = problem
         self.mass = stage.rate * damping.mass
@@ -186,7 +186,7 @@ class StepDamping:
         return 0.5 * float(np.vdot(offset, force)), force
 
 
-def hessian_factors(problem: Problem, stage: Stage) -> tuple[float, float]:
+def hessian_factors(problem: Problem, stage: StepEquation) -> tuple[float, float]:
     """What multiplies mass (1/s2) and stiffness in a stage's Hessian."""
     damping = problem.scene.damping
     return stage.inertia + stage.rate * damping.mass, 1.0 + stage.rate * damping.stiffness

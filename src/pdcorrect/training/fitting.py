@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.errors import InputError
 from pdcorrect.training.windows import StepBatch, StepWindows
 
@@ -109,13 +109,13 @@ def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
 
 def _moments(
     corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
-) -> tuple[dict[str, Moments], Moments]:
+) -> tuple[dict[str, RunningMoments], RunningMoments]:
     """Of features by name, and of targets (m, 1)."""
     config = corrector.config
-    moments = {name: Moments() for name in (*config.node_features, *config.edge_features)}
-    target = Moments()
+    moments = {name: RunningMoments() for name in (*config.node_features, *config.edge_features)}
+    target = RunningMoments()
     for batch in _batches(windows, chosen, last):
-        view = View(batch.bodies, batch.snapshot)
+        view = FeatureView(batch.bodies, batch.snapshot)
         found = features.values(NODE_FEATURES, config.node_features, view)
         found |= features.values(EDGE_FEATURES, config.edge_features, view)
         for name, values in found.items():
@@ -127,19 +127,19 @@ def _moments(
 
 def _averages(
     corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
-) -> Moments:
+) -> RunningMoments:
     """Of bodies' mean inputs (m, a), for which the normalisation has to be there."""
-    averages = Moments()
+    averages = RunningMoments()
     for batch in _batches(windows, chosen, last):
-        view = View(batch.bodies, batch.snapshot)
+        view = FeatureView(batch.bodies, batch.snapshot)
         averages.add(batch.bodies.body_means(corrector.inputs(view)[0]))
     return averages
 
 
-def _at_rest(windows: StepWindows) -> tuple[Moments, Moments]:
+def _at_rest(windows: StepWindows) -> tuple[RunningMoments, RunningMoments]:
     """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
     meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
-    shapes, steps = Moments(), Moments()
+    shapes, steps = RunningMoments(), RunningMoments()
     for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
         shapes.add(batch.bodies.shapes)
         steps.add(batch.bodies.time_steps[:, None])

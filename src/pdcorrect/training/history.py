@@ -19,7 +19,7 @@ COLUMNS = (
 NAME = "history.csv"
 
 
-class History:
+class HistoryFile:
     """Rows of numbers by iteration, written at once.
 
     Parameters

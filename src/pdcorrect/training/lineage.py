@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pdcorrect.corrector.model_io import JOINT, LoadedModel
-from pdcorrect.training.config import TrainingConfig
+from pdcorrect.training.recipe import TrainingConfig
 from pdcorrect.training.recordings import Recording
 
 

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pdcorrect.training.config import Loss
+from pdcorrect.training.recipe import Loss
 
 LEAST_ERROR = 1e-30
 """d1 and D count as at least this, m2."""

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.training.config import Rate, Stage
-from pdcorrect.training.world import World
+from pdcorrect.training.distributed import World
+from pdcorrect.training.recipe import Rate, Stage
 
 _TOLD = ("loss_sum", "count", "skipped", "row", "longest")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")

@@ -7,7 +7,7 @@ from typing import Any
 
 from pdcorrect._config import Strict, as_toml
 from pdcorrect.errors import InputError
-from pdcorrect.training.config import Every, TrainingConfig
+from pdcorrect.training.recipe import Every, TrainingConfig
 
 
 @dataclass

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.training.config import Stage, TrainingConfig
+from pdcorrect.training.distributed import World
 from pdcorrect.training.losses import body_losses
 from pdcorrect.training.precision import network_precision
+from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.windows import StepBatch, StepWindows
-from pdcorrect.training.world import World
 
 
 class Source(Protocol):

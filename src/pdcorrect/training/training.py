@@ -19,25 +19,25 @@ from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_description import ModelRecord
 from pdcorrect.corrector.model_io import LoadedModel, save_model, weights_digest
-from pdcorrect.data.config import TRAINING, VALIDATION
+from pdcorrect.data.configuration import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
-from pdcorrect.training.config import Stage, TrainingConfig
+from pdcorrect.training.distillation import load_start, load_teachers
+from pdcorrect.training.distributed import World
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
-from pdcorrect.training.history import History
+from pdcorrect.training.history import HistoryFile
 from pdcorrect.training.lineage import lineage_of
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import Progress, check_same
+from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.sources import Source, make_source, share_done
-from pdcorrect.training.teachers import load_start, load_teachers
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
-from pdcorrect.training.world import World
 
 CHECKPOINT, MODEL, CONFIG = "checkpoint.safetensors", "model", "config.toml"
 
@@ -143,11 +143,11 @@ class Training:
         self.progress = Progress()
         self._waiting: tuple[dict[str, Any], dict[str, Tensor]] | None = None
         length = 0 if found is None else self._restore(*found)
-        self._history: History | None = None
+        self._history: HistoryFile | None = None
         if self.world.first:
             make_folder(self.output)
             write_text(self.output / CONFIG, config.to_toml())
-            self._history = History(self.output, length, self.progress.total)
+            self._history = HistoryFile(self.output, length, self.progress.total)
 
     # --- running ----------------------------------------------------------------------------
 

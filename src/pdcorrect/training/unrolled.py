@@ -13,11 +13,11 @@ from torch import Tensor
 
 from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import View
+from pdcorrect.corrector.features import FeatureView
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.training.config import Stage
 from pdcorrect.training.losses import body_losses, mean_of
 from pdcorrect.training.precision import network_precision
+from pdcorrect.training.recipe import Stage
 from pdcorrect.training.scenes import Frames, SceneGroup, SceneGroups
 
 Flags = NDArray[np.bool_]
@@ -183,7 +183,7 @@ def unroll(
     With a teacher its correction of each step is compared with that of the teacher, over d(1).
     """
     layer = group.layer(corrector, stage.through_solver, velocity)
-    views: list[View] = []
+    views: list[FeatureView] = []
     layer.watch = None if teacher is None else views.append
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
@@ -220,7 +220,7 @@ def unroll(
 
 
 @torch.no_grad()
-def _taught(teacher: Corrector, view: View, stage: Stage) -> Tensor:
+def _taught(teacher: Corrector, view: FeatureView, stage: Stage) -> Tensor:
     """The teacher's corrections (n, 3), m, of what the learner was shown."""
     with network_precision(teacher, stage.amp):
         return teacher.of_view(view)

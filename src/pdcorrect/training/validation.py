@@ -20,9 +20,9 @@ from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.fem.problem import Base
+from pdcorrect.training.distributed import World
 from pdcorrect.training.recordings import Recording, rounding
 from pdcorrect.training.scenes import SceneGroup
-from pdcorrect.training.world import World
 
 LEAST = -100.0
 """Omega of a simulation whose rollout failed or is worse than this, per cent."""

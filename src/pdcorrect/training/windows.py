@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import KNOWN, BodyGraph
-from pdcorrect.corrector.config import CorrectorConfig
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
-from pdcorrect.data.config import TRAINING
+from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.folder import Folders
 from pdcorrect.data.reader import CACHE_BYTES, ShardShuffle, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.errors import InputError

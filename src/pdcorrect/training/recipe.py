@@ -18,8 +18,8 @@ from pydantic import (
 from pydantic.config import JsonDict
 
 from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
-from pdcorrect.corrector.config import PRESETS, CorrectorConfig, changed
-from pdcorrect.data.config import TRAINING, VALIDATION
+from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, changed
+from pdcorrect.data.configuration import TRAINING, VALIDATION
 from pdcorrect.fem.problem import Base
 
 _FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
@@ -67,7 +67,7 @@ _CHANGES: JsonDict = {name: {} for name in CorrectorConfig.model_fields}
 
 
 class Architecture(Strict):
-    """A preset of `pdcorrect.corrector.config.PRESETS`, and the values that differ from it."""
+    """A preset of `PRESETS`, and the values that differ from it."""
 
     preset: str = "compact"
     changes: Annotated[dict[str, Any], Field(json_schema_extra={"properties": _CHANGES})] = Field(

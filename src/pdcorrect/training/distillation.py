@@ -10,7 +10,7 @@ from pdcorrect._config import as_toml
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import LoadedModel, load_model
 from pdcorrect.errors import InputError
-from pdcorrect.training.config import TrainingConfig
+from pdcorrect.training.recipe import TrainingConfig
 
 
 def load_start(config: TrainingConfig, device: torch.device) -> LoadedModel | None:
