@@ -27,11 +27,11 @@ from pdcorrect import metrics
 from pdcorrect.batch.states import BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybridResult
-from pdcorrect.data.config import EVALUATION, TRAINING
+from pdcorrect.data.configuration import EVALUATION, TRAINING
 from pdcorrect.data.schema import PLAIN
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.measures import Case, read_cases
 from pdcorrect.evaluation.evaluation import Candidate, evaluate
+from pdcorrect.evaluation.measures import EvaluationCase, read_cases
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.evaluation.tables import markdown, write_evaluation
 from pdcorrect.fem.problem import Problem, discretise
@@ -81,7 +81,7 @@ def with_stiffness(factor: float) -> Change:
     return change
 
 
-def mean_omega(cases: Sequence[Case], change: Change, device: str, batch: int) -> float:
+def mean_omega(cases: Sequence[EvaluationCase], change: Change, device: str, batch: int) -> float:
     """Mean Omega, per cent, of rollouts with a change."""
     found = []
     for first in range(0, len(cases), batch):
@@ -96,7 +96,7 @@ def mean_omega(cases: Sequence[Case], change: Change, device: str, batch: int) -
     return float(np.mean(found))
 
 
-def fitted(cases: Sequence[Case], device: str, batch: int) -> float:
+def fitted(cases: Sequence[EvaluationCase], device: str, batch: int) -> float:
     """The factor on Young's modulus with the largest mean Omega."""
 
     def loss(logarithm: float) -> float:
