@@ -1,21 +1,23 @@
 """How the stress battery judges a run: distances from what has to be reached, and verdicts."""
 
-import importlib
-import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pdcorrect.data.config import DatasetConfig
 
 import pdcorrect as pc
 from conftest import rotation
-from pdcorrect.data.config import DatasetConfig
 from pdcorrect.data.plan import make_plan
-from pdcorrect.validation.cases import find_cases
 
-(CASE,) = find_cases(["stress"])
-BATTERY = CASE._module()
+VALIDATION = Path(__file__).parents[1] / "validation"
+sys.path.insert(0, str(VALIDATION))
+import harness  # noqa: E402
+
+CASE = harness.Case(VALIDATION / "stress")
+BATTERY = CASE.module
 SCENES = {scenario.name: scenario for scenario in BATTERY.BATTERY}
 SOLVERS, MODELS, NO_GATE = BATTERY.SOLVERS, BATTERY.MODELS, "no gate"
 
@@ -169,7 +171,7 @@ def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
     assert outcome.figures["1 cell, PD, status"] == "ITERATION_LIMIT"
 
 
-# --- crosses that the torsion models know ------------------------------------------------------
+# --- crosses that the torsion model knows ------------------------------------------------------
 
 
 def test_the_cross_is_drawn_as_those_of_training_and_none_of_them():
@@ -186,9 +188,8 @@ def test_the_cross_is_drawn_as_those_of_training_and_none_of_them():
     assert low <= abs(module.CROSS.loads[0].strength) / material.density <= high
 
 
-@pytest.mark.parametrize("model", ["torsion-exact", "torsion-exact-compact"])
-def test_the_models_know_the_cross_at_rest_and_not_with_its_far_end_held(model):
-    found = pc.load_model(model)
+def test_the_model_knows_the_cross_at_rest_and_not_with_its_far_end_held():
+    found = pc.load_model("torsion-exact")
     for name, known in (("cross ordinary", True), ("cross plane", True), ("cross turned", False)):
         problem = pc.discretise(pc.best_coarse(SCENES[name].scene))
         stepper = pc.HybridStepper(pc.ProjectiveDynamics(problem), found.corrector)
@@ -259,25 +260,3 @@ def test_where_runs_part_the_better_answer_has_less_of_the_objective():
     assert mine < its
     assert curvature > 0.0
     assert BATTERY.parting(scenario, found, found) is None
-
-
-@pytest.mark.parametrize(("script", "scenes"), [("corners", "CROSSES"), ("periods", "PERIODS")])
-def test_records_beside_the_battery_name_the_weights_of_their_hybrids(
-    script, scenes, monkeypatch, tmp_path
-):
-    pytest.importorskip("torch")
-    from pdcorrect.corrector.model_io import weights_digest
-
-    monkeypatch.syspath_prepend(CASE.folder)
-    module, path = importlib.import_module(script), tmp_path / "record.json"
-    for name in (script, "run"):  # other cases have a module of the second name
-        del sys.modules[name]
-    monkeypatch.setattr(module, "rows", lambda scene: iter([{"solver": "PD best"}]))
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", str(path)])
-    module.main()
-    found = json.loads(path.read_text(encoding="utf-8"))
-    assert found["weights_sha256"] == {
-        name: weights_digest(MODELS[name]) for name in ("hybrid torsion", "hybrid compact")
-    }
-    assert len(found["rows"]) == len(getattr(module, scenes))
-    assert found["command"].startswith(f"python validation/stress/{script}.py ")

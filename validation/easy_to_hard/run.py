@@ -14,7 +14,7 @@ import numpy as np
 
 import pdcorrect as pc
 from pdcorrect._environment import home_folder
-from pdcorrect.data.config import EVALUATION, DatasetConfig
+from pdcorrect.data.configuration import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 
 REFINE = 4

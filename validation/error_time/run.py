@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 
 import pdcorrect as pc
 from pdcorrect._environment import home_folder
-from pdcorrect.data.config import EVALUATION, DatasetConfig
+from pdcorrect.data.configuration import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 
 MOTIONS, SETTINGS = ("impulse", "stretch", "torsion"), ("as-published", "exact")
@@ -314,7 +314,7 @@ def draw(record: common.Record, path: Path) -> None:
         common.log_axis(axis.yaxis)
         common.plain(axis)
     panels[0].set_ylabel("RMS error, % of the largest displacement")
-    common.save(figure, path, panels[0], 7)
+    common.save(figure, path, panels[0], 4)
 
 
 def finding(record: common.Record) -> str:

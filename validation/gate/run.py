@@ -73,7 +73,7 @@ def held(data: Path, split: str) -> dict[str, Held]:
 
 def outcome(split: str) -> common.Outcome:
     """One split, generated first."""
-    from pdcorrect.data.config import DatasetConfig
+    from pdcorrect.data.configuration import DatasetConfig
     from pdcorrect.data.generate import generate
 
     with tempfile.TemporaryDirectory() as folder:

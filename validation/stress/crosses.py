@@ -15,7 +15,7 @@ from scenarios import END, HELD, Array, Scenario, bending, scattered, squashed
 from solvers import KNOWN_SOLVERS
 
 import pdcorrect as pc
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 
 DATASET = Path(__file__).resolve().parents[2] / "datasets" / "torsion-exact"
