@@ -70,7 +70,7 @@ TABLES: dict[str, Callable[[], Rows]] = {
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A Markdown table; the first column to the left, the others to the right."""
     rule = ["---", *["---:"] * (len(header) - 1)]
-    return "".join(f"| {' | '.join(row)} |\n" for row in (header, rule, *rows))
+    return "".join(f"|{'|'.join(row)}|\n" for row in (header, rule, *rows))
 
 
 def filled(text: str) -> str:
