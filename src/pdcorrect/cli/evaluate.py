@@ -72,7 +72,7 @@ def evaluate(
             workers=workers, skip_damaged=skip_damaged, incomplete=incomplete,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
-    notes = _notes(saved, found, refuses)
+    notes = _notes(saved, found)
     _print(found, notes, seed)
     if output:
         record = _record(saved, folder, device, batch, refuses, notes)
@@ -81,9 +81,9 @@ def evaluate(
             typer.echo(f"wrote {path}")
 
 
-def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) -> list[str]:
+def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
-    from pdcorrect.evaluation.refusal_text import by_name
+    from pdcorrect.evaluation.report import refused_corrections
 
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
@@ -94,7 +94,10 @@ def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) ->
         )
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
-    notes += by_name({one.candidate.name: _refused(one, found, gate) for one in saved})
+    for one in saved:
+        run = found.runs[one.candidate.name]
+        refused = refused_corrections(r for t in run.trajectories for r in t.reasons)
+        notes += [f"{one.candidate.name}: {refused}"] if refused else []
     for name, run in found.runs.items():
         notes += [
             f"{name}: {count} of {len(run.trajectories)} trajectories have no {measure}; its mean "
@@ -110,22 +113,6 @@ def _notes(saved: list[SavedCandidate], found: Evaluation, gate: Gate | None) ->
                 "from there on, and counted so."
             )
     return notes
-
-
-def _refused(one: SavedCandidate, found: Evaluation, gate: Gate | None) -> list[str]:
-    """Of a model, what its gate refused, and why."""
-    import torch
-
-    from pdcorrect.corrector.foreign import foreign_measures, foreign_step
-    from pdcorrect.corrector.refusal_watch import Refused
-    from pdcorrect.evaluation.refusal_text import refused_rollouts
-
-    run, normaliser = found.runs[one.candidate.name], one.model.corrector.normaliser
-    refused = Refused(
-        foreign_measures(gate, normaliser, torch.from_numpy(run.shapes())),
-        foreign_step(gate, normaliser, found.time_step, found.cell_size),
-    )
-    return refused_rollouts([(t.refused_by, t.reasons) for t in run.trajectories], refused)
 
 
 def _print(found: Evaluation, notes: list[str], seed: int) -> None:

@@ -13,10 +13,8 @@ from pdcorrect.cli.common import Frames, SceneFile, check_models, say, tell_of_c
 from pdcorrect.errors import InputError
 
 if TYPE_CHECKING:
-    from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused
     from pdcorrect.scene import Scene
     from pdcorrect.solvers.rollout import StepLog
-    from pdcorrect.state import State
     from pdcorrect.trajectory import Stepper, Trajectory
 
 
@@ -70,11 +68,11 @@ def simulate(
     say(_told_of_model(stepper))
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
-    log, refused = _run(stepper, count, output, earlier, overwrite)
+    log = _run(stepper, count, output, earlier, overwrite)
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
-        _corrections(log.arrays(), refused)
+        _corrections(log.arrays())
         say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
@@ -112,15 +110,14 @@ def _make_stepper(
 
 
 def _told_of_model(stepper: Stepper) -> str:
-    """Which model corrects, and whether it knows the scene's integrator; empty without one."""
-    from pdcorrect.evaluation.run_text import foreign_integrator
-
+    """Which model corrects; empty without one."""
     about = getattr(stepper, "origin", None)
     if not about:
         return ""
-    told = f"model {about['model']} on the base {about['base']!r}, trained on {about['dataset']!r}"
-    trained, found = about["trained_integrator"], stepper.problem.scene.time.integrator
-    return "\n".join(filter(None, (told, foreign_integrator(found, trained, about["model"]))))
+    return (
+        f"model {about['model']} on the base {about['base']}, trained on {about['dataset']} with "
+        f"{about['trained_integrator']}"
+    )
 
 
 def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | None:
@@ -144,11 +141,8 @@ def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | N
 
 def _run(
     stepper: Stepper, count: int, output: Path, earlier: Trajectory | None, overwrite: bool
-) -> tuple[StepLog, Refused | None]:
-    """Step to frame ``count`` and write each frame; an interruption ends the program.
-
-    Second: what a gate refused; None of plain steppers.
-    """
+) -> StepLog:
+    """Step to frame ``count`` and write each frame; an interruption ends the program."""
     from pdcorrect.cli.common import progress_bar
     from pdcorrect.io.trajectory import TrajectoryWriter
     from pdcorrect.solvers.rollout import StepLog, continue_from, march, run_attributes
@@ -163,15 +157,12 @@ def _run(
     else:
         state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
         writer = TrajectoryWriter.resume(output, earlier)
-    watch = _watch(stepper, state, done)
     with writer, progress_bar(hidden=done >= count) as progress:
         task = progress.add_task(problem.scene.name, total=count, completed=done)
         try:
             for result, elapsed in march(stepper, max(0, count - done), state=state):
                 writer.append(result, elapsed)
                 log.add(result, elapsed)
-                if watch is not None:
-                    watch.add(result)
                 progress.advance(task)
         except (KeyboardInterrupt, Terminated) as stop:
             typer.echo(
@@ -180,23 +171,12 @@ def _run(
             )
             ended = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
             raise typer.Exit(ended) from None
-    return log, None if watch is None else watch.refused
-
-
-def _watch(stepper: Stepper, state: State, frame: int) -> RefusalWatch | None:
-    """Of a hybrid, which knows whence its corrector comes."""
-    if not hasattr(stepper, "origin"):
-        return None
-    from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.corrector.refusal_watch import RefusalWatch
-
-    assert isinstance(stepper, HybridStepper)
-    return RefusalWatch(stepper, state, frame)
+    return log
 
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
-    from pdcorrect.evaluation.run_text import inverted_frames, three_digits
+    from pdcorrect.evaluation.report import inverted_frames, three_digits
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
@@ -221,7 +201,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
         f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
     )
-    say(inverted_frames(stats, problem.time_step) or "")
+    say(inverted_frames(stats, problem.time_step))
 
 
 def _described(stepper: Stepper) -> dict[str, str]:
@@ -233,19 +213,15 @@ def _described(stepper: Stepper) -> dict[str, str]:
     return told
 
 
-def _corrections(stats: dict[str, Any], refused: Refused | None) -> None:
+def _corrections(stats: dict[str, Any]) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
-    from pdcorrect.evaluation.refusal_text import refused_corrections
+    from pdcorrect.evaluation.report import refused_corrections
 
-    if refused is None:
+    if "gate" not in stats:
         return
-    every = bool(stats["refused"].all())
-    if not every:
+    if not stats["refused"].all():
         say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
-    for sentence in refused_corrections(stats["gate"], refused):
-        say(sentence)
-    if every:
-        say("This is no corrected run: its steps are those of the coarse model alone.")
+    say(refused_corrections(stats["gate"]))
 
 
 def _other_work(stats: dict[str, Any]) -> str:

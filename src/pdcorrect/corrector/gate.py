@@ -6,6 +6,7 @@ not finite, and those of steps that the coarse solver failed, are refused withou
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -23,15 +24,7 @@ from pdcorrect.errors import InputError
 
 
 class Reason(IntEnum):
-    """Why a correction was refused; 0 where it was not.
-
-    NOT_FINITE: the network's answer is not a number.  FEATURES: its inputs are unlike those of the
-    training (`Gate.margin`, `Gate.average`).  INVERSION, ENERGY: the corrected state fails
-    (`Gate.volume` and `Gate.crushing`, `Gate.energy`).  SOLVER: the coarse step failed.  BODY: the
-    body at rest is unlike those of the training (`Gate.body`).  PAUSE: it would have passed, too
-    soon after a step that did not (`Gate.pause`).  FOLDED: the network sees a folded body
-    (`Gate.corners`).  TIME_STEP: it is unlike that of the training (`Gate.time_step`).
-    """
+    """Why a correction was refused; 0 where it was not."""
 
     NONE = 0
     NOT_FINITE = 1
@@ -43,6 +36,45 @@ class Reason(IntEnum):
     PAUSE = 7
     FOLDED = 8
     TIME_STEP = 9
+
+    @property
+    def meaning(self) -> str:
+        """The end of a sentence: a correction is refused because ..."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Reason.NONE: "it was not",
+    Reason.NOT_FINITE: "the network's answer is not a number",
+    Reason.FEATURES: "the network's inputs are outside of its training",
+    Reason.INVERSION: "cells of the corrected state are crushed or inverted",
+    Reason.ENERGY: "the corrected state has more energy than the loads account for",
+    Reason.SOLVER: "the coarse step failed",
+    Reason.BODY: "the body is outside of the training",
+    Reason.PAUSE: "a step shortly before was refused",
+    Reason.FOLDED: "a cell is folded at a corner",
+    Reason.TIME_STEP: "the time step over the cell size is outside of the training",
+}
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Steps whose corrections were refused for one reason."""
+
+    reason: Reason
+    steps: int
+
+
+def refusals(reasons: Iterable[float]) -> tuple[Refusal, ...]:
+    """What was refused in the steps of a run, most frequent first.
+
+    Parameters
+    ----------
+    reasons : iterable of numbers of `Reason`
+        Of each step, such as ``run.stats["gate"]``.
+    """
+    counts = Counter(Reason(int(number)) for number in reasons if number)
+    return tuple(Refusal(reason, steps) for reason, steps in counts.most_common())
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,12 +285,3 @@ def check_gate(gate: object, corrector: Corrector) -> None:
             f"gate.limit with placement {placement!r}: expected placement 'state', whose answers "
             "can be scaled back without solving again."
         )
-
-
-def refusals(reasons: Iterable[float]) -> dict[str, int]:
-    """How often corrections were refused, by reason: of ``run.stats["gate"]``, for example."""
-    counts = {reason.name.lower().replace("_", " "): 0 for reason in Reason if reason}
-    for number in reasons:
-        if number:
-            counts[Reason(int(number)).name.lower().replace("_", " ")] += 1
-    return counts

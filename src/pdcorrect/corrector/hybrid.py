@@ -29,7 +29,6 @@ from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.corrector.single_step import SingleCoarseStep
-from pdcorrect.corrector.unknown_inputs import UnknownInput, unknown_inputs
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model
 from pdcorrect.scene import Scene, best_coarse, check_scene
@@ -182,36 +181,6 @@ class HybridStepper:
     def trained_step(self) -> str:
         """The time step of the training for cells of this body's size, or its range, s."""
         return self.corrector.normaliser.trained_step(float(self.bodies.cell_size))
-
-    def unknown_inputs(self, state: State, forces: Array | None = None) -> list[UnknownInput]:
-        """Which of the network's inputs the gate refuses in the step from a state.
-
-        Empty if it refuses none, or there is no gate.  Told also where the step is refused by its
-        body, its time step or a pause anyway.  With placement "state" it takes a coarse step.
-
-        Parameters
-        ----------
-        state : State
-        forces : (N, 3), optional
-            Extra nodal forces in that step, N.
-
-        Returns
-        -------
-        list of UnknownInput
-            Names, and how far values at nodes and edges, or means over the body, are out.
-
-        Raises
-        ------
-        InputError
-            If shapes are wrong or a number is not finite.
-        """
-        before, _ = self.coarse.accepted(_without(state), forces, None)
-        if self.gate is None:
-            return []
-        step = self._step(before, forces, self._previous(state))
-        with torch.no_grad(), one_thread(torch.device("cpu")):
-            answer = step.solved() if self.placement == "state" else None
-            return unknown_inputs(self.gate, self.corrector, step.view(answer))
 
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""

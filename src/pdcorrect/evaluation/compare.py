@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,9 +26,6 @@ from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
 from pdcorrect.state import Status, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
-
-if TYPE_CHECKING:
-    from pdcorrect.corrector.refusal_watch import RefusalWatch, Refused
 
 __all__ = [
     "CASES", "Case", "Comparison", "Row", "case_stepper", "cases_for", "cases_with", "compare",
@@ -82,8 +79,7 @@ class Comparison:
     cases : tuple of Case
     models : dict of str to dict
         Of correctors, by label: model, base, the data set that it was trained on, that one's
-        time integrator, digest of its weights and, of those that came to their end, the
-        training's time step for cells of this size, see `HybridStepper.trained_step`.
+        time integrator, and digest of its weights.
     reference : str
         Label of the case that errors are measured against.
     solver_error : float or None
@@ -95,8 +91,6 @@ class Comparison:
         Of cases that did not come to their end, by label: why.
     without_best : str or None
         Why none of the cases is the best coarse model; None if one is, or could be.
-    refused : dict of str to Refused
-        Of correctors, by label: what of the scene their gates refused.
     """
 
     scene: Scene
@@ -109,7 +103,6 @@ class Comparison:
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
     without_best: str | None = None
-    refused: Mapping[str, Refused] = field(default_factory=dict)
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance from the reference in each frame, by label, m."""
@@ -184,16 +177,12 @@ def compare(
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
     coarse = discretise(scene)
     runs, on_coarse, setup, failures = {}, {}, {}, {}
-    watches: dict[str, RefusalWatch] = {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
         started = time.perf_counter()
         try:
             stepper = case_stepper(scene, case)
             setup[case.label] = time.perf_counter() - started
-            if case.model is not None:
-                watches[case.label] = _watch(stepper)
-            seen = _seen(on_step, case.label, watches.get(case.label))
-            run = rollout(stepper, frames, on_step=seen)
+            run = rollout(stepper, frames, on_step=_counted(on_step, case.label))
         except ConvergenceError as error:
             if case is cases[0]:
                 raise
@@ -226,9 +215,8 @@ def compare(
         )
     return Comparison(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
-        _models(cases, runs), failures,
+        _models(cases), failures,
         None if any(case.base == "best" for case in cases) else without_best(scene),
-        {label: watch.refused for label, watch in watches.items()},
     )  # fmt: skip
 
 
@@ -238,42 +226,21 @@ def _coarse_to_fine(case: Case) -> tuple[int, bool, int, bool]:
     return case.refine, more_nodes, BASES.index(case.base), case.solver != "pd"
 
 
-def _models(cases: Sequence[Case], runs: Mapping[str, Trajectory]) -> dict[str, dict[str, str]]:
+def _models(cases: Sequence[Case]) -> dict[str, dict[str, str]]:
     """Which models the correctors are, by label."""
     if not any(case.model for case in cases):
         return {}
     from pdcorrect.corrector.hybrid import about_model
 
-    found = {case.label: about_model(case.model) for case in cases if case.model}
-    for label in found.keys() & runs.keys():
-        found[label]["trained_step"] = runs[label].attributes["trained_step"]
-    return found
+    return {case.label: about_model(case.model) for case in cases if case.model}
 
 
-def _watch(stepper: Stepper) -> RefusalWatch:
-    """Of a hybrid that begins at rest."""
-    from pdcorrect.corrector.hybrid import HybridStepper
-    from pdcorrect.corrector.refusal_watch import RefusalWatch
-
-    assert isinstance(stepper, HybridStepper)
-    return RefusalWatch(stepper, stepper.problem.rest_state())
-
-
-def _seen(
-    on_step: OnStep | None, label: str, watch: RefusalWatch | None
-) -> Callable[[StepResult, float], None]:
-    """Shows each step to those who look on."""
-    frame = 0
-
-    def show(result: StepResult, seconds: float) -> None:
-        nonlocal frame
-        frame += 1
-        if watch is not None:
-            watch.add(result)
-        if on_step is not None:
-            on_step(label, frame, result)
-
-    return show
+def _counted(on_step: OnStep | None, label: str) -> Callable[[StepResult, float], None] | None:
+    """Shows each step with its case and frame to who looks on."""
+    if on_step is None:
+        return None
+    frames = itertools.count(1)
+    return lambda result, _: on_step(label, next(frames), result)
 
 
 def _solver_error(cases: tuple[Case, ...], runs: dict[str, Trajectory]) -> float | None:

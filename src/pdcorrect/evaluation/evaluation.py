@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import Damage, accepted_gaps
 from pdcorrect.data.schema import PLAIN, REFERENCE
@@ -103,11 +102,6 @@ class EvaluatedRun:
         """Whether a gate refused all corrections of all trajectories."""
         every = [reason > 0 for t in self.trajectories for reason in t.reasons.tolist()]
         return bool(every) and all(every)
-
-    def shapes(self) -> Array:
-        """Measures (B, 10) of bodies at rest that a gate refused (`MeasuredRollout.shape`)."""
-        found = [t.shape for t in self.trajectories if len(t.shape)]
-        return np.stack(found) if found else np.zeros((0, len(SHAPE_MEASURES)))
 
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""

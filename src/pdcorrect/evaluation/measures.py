@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import Damage, shard_paths, whole_files
@@ -310,15 +308,11 @@ class MeasuredRollout:
         RMS distance from the reference over time, m.
     reasons : (T,) int64
         Why a gate left its steps uncorrected, numbers of `Reason`; those until it failed.
-    shape : (10,)
-        Measures of its body at rest, see `pdcorrect.corrector.shapes.shape_measures`, if a gate
-        refused it by them; else (0,).
     """
 
     measures: TrajectoryMeasures
     errors: Array = field(default_factory=lambda: np.zeros(0))
     reasons: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    shape: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def refused_by(self) -> int:
@@ -360,11 +354,7 @@ def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
     if outcome.reasons is None:
         return MeasuredRollout(measures, errors)
     steps = None if outcome.failed is None else outcome.failed - 1
-    found_by = MeasuredRollout(measures, errors, outcome.reasons[:steps])
-    if found_by.refused_by != Reason.BODY:
-        return found_by
-    body = BodyGraph.of([case.problems[outcome.base or PLAIN]], dtype=torch.float64)
-    return replace(found_by, shape=body.shapes[0].numpy())
+    return MeasuredRollout(measures, errors, outcome.reasons[:steps])
 
 
 def omega(positions: Array, coarse: Array | None, reference: Array) -> float | None:

@@ -7,7 +7,9 @@ import dataclasses
 import io
 import json
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +17,10 @@ import pdcorrect.figures as figures
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
-from pdcorrect.evaluation.report_notes import notes, refused_share, shown_labels
-from pdcorrect.evaluation.run_text import inverted_frames, three_digits
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
+from pdcorrect.metrics import energy_balance, largest_displacement
+from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
-
-__all__ = [
-    "HEADINGS", "draw_figures", "inverted_frames", "notes", "overlaid_labels", "table", "to_csv",
-    "to_json", "to_markdown", "write_report", "write_series",
-]  # fmt: skip
 
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
@@ -61,6 +58,173 @@ def table(comparison: Comparison) -> list[tuple[str, ...]]:
 
 def _percent(share: float) -> str:
     return "" if np.isnan(share) else f"{round(share, 1) + 0.0:.1f} %"  # no minus zero
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What the table's numbers mean on this scene: at most six sentences or short paragraphs."""
+    found = [
+        _of_the_errors(comparison),
+        _of_the_reference(comparison),
+        _of_the_solver(comparison),
+        _of_the_rows(comparison),
+        _of_the_models(comparison),
+        _of_the_faults(comparison),
+    ]
+    return [note for note in found if note]
+
+
+def _of_the_errors(comparison: Comparison) -> str:
+    truth, time = comparison.on_coarse[comparison.reference], comparison.scene.time
+    return (
+        f"{len(truth)} frames of {time.step:g} s by {time.integrator}. RMS and worst are distances "
+        f"of the coarse nodes from {comparison.reference}, which moves by up to "
+        f"{1e3 * largest_displacement(truth):.3g} mm; 'corrected' is the share of the coarse PD "
+        "run's squared error that is gone."
+    )
+
+
+def _of_the_reference(comparison: Comparison) -> str:
+    """What is left of the reference's own error, in space and in time."""
+    run = comparison.runs[comparison.reference]
+    lost = _lost_share(run)
+    share = "" if lost is None else f" (it dissipates {100 * lost:.0f} % of the loads' work)"
+    return (
+        f"The reference ({_discretisation(run)}) is not the truth: its mesh error, and the error "
+        f"of the time step{share}, which all rows share, are in none of these numbers."
+    )
+
+
+def _lost_share(run: Trajectory) -> float | None:
+    """Share of the work of loads and clamps that the integrator lost; None if unclear."""
+    if run.problem is None or run.problem.scene.time.integrator == "quasi-static":
+        return None
+    balance = energy_balance(run)
+    work = float(balance.external_work[-1] + balance.clamp_work[-1])
+    lost = float(balance.dissipation[-1])
+    return lost / work if work > lost > 0 else None
+
+
+def _of_the_solver(comparison: Comparison) -> str:
+    material, effective = comparison.scene.material, comparison.scene.material.effective
+    told = (
+        f"The energy's small-strain moduli are E = {effective.young:.6g} Pa and ν = "
+        f"{effective.poisson:.4g} (asked for: {material.young:.6g} and {material.poisson:g}). "
+        f"PD stops at {comparison.scene.solver.tolerance:g} of a coarse cell, Newton at 1e-10"
+    )
+    if comparison.solver_error is not None:
+        told += f"; on the coarse mesh they differ by {1e3 * comparison.solver_error:.2g} mm"
+    return f"{told}."
+
+
+def _of_the_rows(comparison: Comparison) -> str:
+    """Rows whose element or mass is not the reference's."""
+    truth = comparison.runs[comparison.reference]
+    unlike: dict[str, list[str]] = {}
+    for row in comparison.rows:
+        run = comparison.runs[row.label]
+        if _discretisation(run) != _discretisation(truth):
+            unlike.setdefault(_discretisation(run), []).append(row.label)
+    told = [f"{', '.join(labels)}: {what}" for what, labels in unlike.items()]
+    if comparison.without_best:
+        told.append(f"there is no best coarse model: {comparison.without_best}")
+    text = "; ".join(told)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _discretisation(run: Trajectory) -> str:
+    """Element, mass rule and total mass."""
+    mass = "" if run.problem is None else f", {float(run.problem.mass.sum()):.4g} kg"
+    return f"element {run.attributes['element']}, mass {run.attributes['mass']}{mass}"
+
+
+def _of_the_models(comparison: Comparison) -> str:
+    """What correctors were trained on, and what their gates refused."""
+    told = []
+    for label, about in comparison.models.items():
+        trained, now = about["trained_integrator"], comparison.scene.time.integrator
+        step = f" with {trained}, not {now}" if trained != now else ""
+        refused = (
+            refused_corrections(comparison.runs[label].stats["gate"])
+            if label in comparison.runs
+            else ""
+        )
+        told.append(f"{label} was trained on {about['dataset']}{step}. {refused}".strip())
+    return " ".join(told)
+
+
+def refused_corrections(reasons: Iterable[float]) -> str:
+    """One sentence: how many corrections of a run were refused, and why; empty if none was.
+
+    Parameters
+    ----------
+    reasons : iterable of numbers of `pdcorrect.corrector.gate.Reason`
+        Of each step, 0 where it was corrected.
+    """
+    from pdcorrect.corrector.gate import refusals
+
+    every = list(reasons)
+    found = refusals(every)
+    if not found:
+        return ""
+    total = sum(one.steps for one in found)
+    counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
+    alone = ": the run is that of the coarse model alone" if total == len(every) else ""
+    return f"{total} of {len(every)} corrections were refused ({counts}){alone}."
+
+
+def _of_the_faults(comparison: Comparison) -> str:
+    """Rows that failed, needed a fallback, or ended frames with inverted cells."""
+    told = [f"{label} failed: {why.rstrip('.')}" for label, why in comparison.failures.items()]
+    for row in comparison.rows:
+        stats = comparison.runs[row.label].stats
+        if row.unusual_frames:
+            told.append(f"{row.label}: {row.unusual_frames} frames needed a fallback")
+        inverted = inverted_frames(stats, comparison.scene.time.step)
+        if inverted:
+            told.append(f"{row.label}: {inverted}")
+    return f"{'; '.join(told)}." if told else ""
+
+
+def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
+    """How many frames of a run ended with inverted cells, and which was the first; empty if none.
+
+    Parameters
+    ----------
+    stats : mapping of str to (T,) arrays
+        Those of a run from its first step on.
+    step : float
+        s.
+    """
+    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
+    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
+        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
+    if not inverted.any():
+        return ""
+    first = 1 + int(inverted.argmax())
+    return (
+        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
+        f"first at t = {first * step:g} s"
+    )
+
+
+def three_digits(value: float) -> str:
+    """A number with three significant digits and without powers of ten where it is large."""
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+
+
+def shown_labels(comparison: Comparison) -> dict[str, str]:
+    """Labels for readers: of a hybrid also how many of its corrections were refused."""
+    shares = {row.label: refused_share(comparison, row) for row in comparison.rows}
+    return {label: f"{label} ({share})" if share else label for label, share in shares.items()}
+
+
+def refused_share(comparison: Comparison, row: Row) -> str:
+    """As "3 of 40 refused" or "all refused"; empty where no correction was refused."""
+    if not row.refused_frames:
+        return ""
+    frames = len(comparison.runs[row.label])
+    every = row.refused_frames == frames
+    return "all refused" if every else f"{row.refused_frames} of {frames} refused"
 
 
 def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
