@@ -68,6 +68,10 @@ class Evaluation:
         own, others = self.values(self.run, name), self.values(other, name)
         return [own[key] / others[key] for key in own]
 
+    def nearer(self, other: str, name: str) -> int:
+        """Trajectories in which another run has a smaller error than the corrected one."""
+        return sum(ratio > 1.0 for ratio in self.over(other, name))
+
     def provenance(self) -> dict[str, Any]:
         environment = self.summary["environment"]
         return {
@@ -126,10 +130,10 @@ def evaluation_record(name: str, found: Evaluation) -> dict[str, Any]:
         | {run: found.measures(run) for run in others},
         "error_over_base": spread(found.over(found.base)),
         "single_step_error_over_base": spread(found.over(found.base, "step_rms_error")),
-        "intermediate_nearer": sum(ratio > 1.0 for ratio in found.over("intermediate")),
-        "intermediate_nearer_in_stress": sum(
-            ratio > 1.0 for ratio in found.over("intermediate", "stress_error")
-        ),
+        "nearer": {run: found.nearer(run, "rms_error") for run in others if run != "plain"},
+        "nearer_in_stress": {
+            run: found.nearer(run, "stress_error") for run in others if run != "plain"
+        },
     }
 
 
