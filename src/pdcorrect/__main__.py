@@ -1,5 +1,5 @@
 """``python -m pdcorrect``."""
 
-from pdcorrect.cli.main import main
+from pdcorrect.cli.program import main
 
 main()

@@ -1,4 +1,4 @@
-"""The card of a data set: a page that says what it is, what it cost and what it is good for."""
+"""The card of a data set: a short page that says what it is, what it cost and how to use it."""
 
 from __future__ import annotations
 
@@ -9,44 +9,25 @@ from pathlib import Path
 from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.info import FEWEST, DatasetInfo, SplitInfo
-from pdcorrect.data.schema import CONFIG, CONVERGED, MANIFEST, PLAIN
+from pdcorrect.data.info import DatasetInfo, SplitInfo
+from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError
 
 _BODIES = {
-    "beam": "beams of 2 x 2 cells' section, held at x = 0",
-    "cross": "a beam of 2 x 2 cells' section along x, held at x = 0, with two or four "
-    "perpendicular branches of the same section at a random place (CrossMesh, fig. 6.1)",
-    "weight": "a beam along x held at both ends, alone or crossed by a second one along y, and a "
-    "pendulum with an inflated part, all of random sizes (WeightMesh, fig. 6.2)",
+    "beam": "beams of 2×2 cells' section, held at x = 0",
+    "cross": "beams of 2×2 cells' section with two or four branches, held at x = 0",
+    "weight": "beams held at both ends with a hanging weight",
 }
-_MOTIONS = {
-    "torsion": "the rotational field of eq. 6-1 to 6-3 about the axis of the beam along x, "
-    "constant in time, in either sense",
-    "impulse": "a force on the inflated part (or the last two cells) in a random direction during "
-    "the first {duration:g} s",
-    "stretch": "a force on the inflated part (or the last two cells) along the axis that leads "
-    "away from the clamps, with a transverse share, rising in {duration:g} s and constant then",
+_LOADS = {
+    "torsion": "a constant torsional field",
+    "impulse": "a force during {duration:g} s",
+    "stretch": "a force that rises in {duration:g} s and stays",
 }
 _SETTINGS = {
-    "as-published": "mass density times cell volume on every node, volume weight lambda, forces on "
-    "the coarse nodes of every mesh, the same element everywhere: the setting of the thesis as far "
-    "as it is described. Its coarse meshes are too heavy, and point loads have no limit under "
-    "refinement",
-    "exact": "lumped masses that sum to density times volume, volume weight 3 lambda, loads "
-    "integrated on each mesh, and in the reference the best coarse model's element and mass",
+    "as-published": "the thesis's setting: coarse meshes are too heavy, forces act on coarse nodes",
+    "exact": "right masses and moduli, loads integrated, reference by the best coarse model",
 }
-_PUBLISHED_PARTS = (
-    ". The force is divided among all coarse nodes of its part, inner ones too, where the thesis "
-    "speaks of the part's borders"
-)
-_LIMITS = (
-    "Loads under which a run failed or turned a cell inside out were drawn again, so the errors "
-    "are those of survivable loads. All runs of a simulation count, so splits with more runs than "
-    "`training`, as `evaluation`, pass a stricter filter.",
-    "No contact, no gravity, one material a body.",
-)
 
 
 def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
@@ -102,130 +83,74 @@ def card_text(
     """
     sections = [
         f"# {config.name}",
-        _what(config),
-        "## Sizes\n\n" + _sizes(config, info),
-        "## Errors of the models\n\n" + _errors(info),
-        "## Generation\n\n" + _generation(config, info, made_with, content_hash),
-        "## Evaluation\n\n" + _evaluation(config),
-        "## Known limits\n\n" + _limits(config, info),
+        "\n".join(f"- {line}" for line in _what(config)),
+        _table(_SPLIT_HEADS, (_split_cells(name, split) for name, split in info.splits.items())),
+        "\n".join(f"- {line}" for line in _use(config, info, made_with, content_hash)),
     ]
     return "\n\n".join(sections) + "\n"
 
 
-def _what(config: DatasetConfig) -> str:
+def _what(config: DatasetConfig) -> Iterable[str]:
     motion, material = config.motion, config.material
-    loads = _MOTIONS[motion.kind].format(duration=motion.duration)
     nodes = config.coarse_nodes or PUBLISHED[config.family].coarse
-    setting = _SETTINGS[config.setting]
-    if config.setting == "as-published" and motion.kind != "torsion":
-        setting += _PUBLISHED_PARTS
-    return "\n".join((
-        "- **Equation**: elastodynamics with the corotated energy and a volume term, backward "
-        f"Euler, {config.frames} frames of {config.step:g} s from rest.",
-        f"- **Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
-        f"{config.cell_size:g} m.",
-        f"- **Loads**: {loads}; strength {_range(motion.strength)} "
-        f"{'m/s' if motion.kind == 'impulse' else 'm/s2'} times the density or the part's mass.",
-        f"- **Material**, one draw a mesh: E {_range(material.young)} Pa (log-uniform), Poisson's "
-        f"ratio {_range(material.poisson)}, density {_range(material.density)} kg/m3.",
-        f"- **Setting** `{config.setting}`: {setting}.",
-        f"- **Reference**: {config.reference.solver.upper()} on cells cut into "
-        f"{config.reference.refine} x {config.reference.refine} x {config.reference.refine}, to "
-        f"{config.tolerance:g} of a cell in each step.",
-        "- Everything else is in `config.toml`; `docs/datasets.md` explains its keys and why "
-        "material and strength are drawn so.",
-    ))  # fmt: skip
-
-
-def _range(ends: tuple[float, float]) -> str:
-    return f"{ends[0]:g} to {ends[1]:g}"
-
-
-def _sizes(config: DatasetConfig, info: DatasetInfo) -> str:
-    refines = {extra.name: extra.refine for extra in config.extra}
-    rows = [
-        (
-            name, split.meshes, split.simulations, _whole(split.nodes),
-            refines.get(name) or config.reference.refine, f"{1e3 * split.displacement.median:.3g}",
-            f"{1e3 * split.displacement.largest:.3g}", f"{100 * split.rejection_rate:.3g}",
-        )
-        for name, split in info.splits.items()
-    ]  # fmt: skip
-    heads = (
-        "split", "meshes", "simulations", "nodes", "reference's cut", "displacement: median, mm",
-        "largest, mm", "loads rejected, %",
-    )  # fmt: skip
-    size = f"{info.whole.bytes / 1e6:.3g} MB in all."
-    return "\n\n".join([_table(heads, rows), *_rejections(info), size])
-
-
-def _rejections(info: DatasetInfo) -> Iterable[str]:
-    """Which runs rejected loads, and why."""
-    if info.whole.rejections:
-        rows = [
-            (name, "`{}`".format(text.partition(", ")[0]), text.partition(", ")[2], count)
-            for name, split in info.splits.items()
-            for text, count in split.rejections.items()
-        ]
-        yield _table(("split", "rejected by the run", "reason", "loads"), rows)
-    elif info.whole.rejected:
-        yield "Each file says which run rejected its loads and why (attribute `rejected`)."
-
-
-def _whole(ends: tuple[float, float]) -> str:
-    return f"{ends[0]:.0f} – {ends[1]:.0f}"
-
-
-def _errors(info: DatasetInfo) -> str:
-    heads = (
-        "split", "run", "RMS, mm", "one step, mm", "Omega: mean", "median", "5 %", "worst",
-    )  # fmt: skip
-    rows = [row for name, split in info.splits.items() for row in _runs(name, split)]
-    return _table(heads, rows) + (
-        "\n\nDistances from the reference on the coarse nodes, means over simulations; Omega (eq. "
-        "7-3) is the share of the plain run's squared error that is gone, per cent. A dash: fewer "
-        f"than {FEWEST} simulations give no 5 % quantile."
+    unit = "m/s" if motion.kind == "impulse" else "m/s²"
+    yield (
+        "**Equation**: elastodynamics, corotated energy with a volume term, backward Euler, "
+        f"{config.frames} frames of {config.step:g} s from rest."
+    )
+    yield (
+        f"**Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
+        f"{config.cell_size:g} m."
+    )
+    loads = _LOADS[motion.kind].format(duration=motion.duration)
+    yield f"**Loads**: {loads}, {_range(motion.strength)} {unit}."
+    yield (
+        f"**Material**: E {_range(material.young)} Pa, ν {_range(material.poisson)}, "
+        f"ρ {_range(material.density)} kg/m³."
+    )
+    refine = "×".join([str(config.reference.refine)] * 3)
+    yield (
+        f"**Setting** `{config.setting}`: {_SETTINGS[config.setting]}. "
+        f"**Reference**: {config.reference.solver.upper()} on cells cut {refine}."
     )
 
 
-def _runs(name: str, split: SplitInfo) -> Iterable[tuple[object, ...]]:
-    for run, found in split.runs.items():
-        if found.rms_error is None and found.step_error is None:
-            continue
-        errors = (found.rms_error, found.step_error)
-        texts = ["" if e is None else f"{1e3 * e:.3g}" for e in errors]
-        texts += found.omega_texts()
-        yield (name, f"`{run}`", *texts)
+_SPLIT_HEADS = (
+    "split", "meshes", "simulations", "nodes", "loads rejected, %", f"`{PLAIN}` RMS, mm",
+    f"`{BEST}` Ω, %",
+)  # fmt: skip
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+def _split_cells(name: str, split: SplitInfo) -> tuple[object, ...]:
+    plain, best = split.runs.get(PLAIN), split.runs.get(BEST)
+    error = None if plain is None else plain.rms_error
+    return (
+        name, split.meshes, split.simulations, f"{split.nodes[0]:.0f} to {split.nodes[1]:.0f}",
+        f"{100 * split.rejection_rate:.2g}", "" if error is None else f"{1e3 * error:.3g}",
+        "" if best is None else best.omega_texts()[0],
+    )  # fmt: skip
 
 
-def _generation(
+def _use(
     config: DatasetConfig, info: DatasetInfo, made_with: Mapping[str, str], content: str
-) -> str:
+) -> Iterable[str]:
     where = made_with.get("device", "cpu")
     machine = made_with.get("processor", "?") if where == "cpu" else where
-    device = "" if where == "cpu" else " --device cuda --workers N"
-    return (
-        f"`pdcorrect dataset generate {CONFIG} -o FOLDER{device}`, seed {config.seed}: "
-        f"{info.whole.seconds['total']:.3g} s of all workers in all, those that share a GPU "
-        "waiting for each other and compiling of kernels included, begun on "
-        f"{made_with.get('date', '?')} with pdcorrect {made_with.get('pdcorrect', '?')} on "
-        f"{machine}.\n\nSHA-256 of all files' contents: `{content}`. On another processor or "
-        "device numbers agree to the solver's tolerance, and the hash differs."
+    yield (
+        f"**Made** by `pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}, in "
+        f"{info.whole.seconds['total']:.3g} worker seconds, {made_with.get('date', '?')}, "
+        f"pdcorrect {made_with.get('pdcorrect', '?')}, {machine}; "
+        f"{info.whole.bytes / 1e6:.3g} MB. SHA-256 `{content}`; other devices differ within the "
+        "solver's tolerance."
     )
-
-
-def _evaluation(config: DatasetConfig) -> str:
-    lines = [
-        "Omega of rollouts from rest on the split `evaluation`, in the mean over simulations, with "
-        f"`{PLAIN}` as zero; choices while developing are made on `validation`. Splits are by mesh."
-    ]
-    lines += [f"- `{extra.name}`: {_difference(extra)}." for extra in config.extra]
-    return "\n".join(lines)
+    yield (
+        f"**Evaluate** by mean Ω of rollouts on `{EVALUATION}`, the share of the `{PLAIN}` run's "
+        "squared error that is gone; choose on `validation`. Splits are by mesh."
+    )
+    if config.extra:
+        extra = "; ".join(f"`{each.name}` {_difference(each)}" for each in config.extra)
+        yield f"**Further splits**: {extra}."
+    yield f"**Limits**: {_time_error(info)} Loads that failed were drawn again."
 
 
 def _difference(extra: ExtraSplit) -> str:
@@ -234,24 +159,27 @@ def _difference(extra: ExtraSplit) -> str:
     told = [f"{key} {getattr(extra, key)}" for key in keys if getattr(extra, key) is not None]
     factors = {"strength": extra.strength_factor, "step": extra.step_factor}
     factors["frames"] = extra.frames_factor
-    told += [f"{name} times {factor:g}" for name, factor in factors.items() if factor != 1]
-    return ", ".join(told).replace("refine", "reference cut into") or "the same distribution"
+    told += [f"{name} ×{factor:g}" for name, factor in factors.items() if factor != 1]
+    return ", ".join(told) or "the same distribution"
 
 
-def _limits(config: DatasetConfig, info: DatasetInfo) -> str:
-    return "\n".join(f"- {line}" for line in (_time_error(config, info), *_LIMITS))
-
-
-def _time_error(config: DatasetConfig, info: DatasetInfo) -> str:
+def _time_error(info: DatasetInfo) -> str:
     """What is known of the error that the reference itself has from its time step."""
     runs = info.splits[EVALUATION].runs if EVALUATION in info.splits else {}
-    errors = [run.rms_error for n in (CONVERGED, PLAIN) if (run := runs.get(n)) is not None]
-    text = "The errors above leave out the reference's own error of the time step"
-    if len(errors) < 2 or None in errors:
-        return text + "; no run here measures it."
-    converged, plain = (f"{1e3 * e:.3g} mm" for e in errors if e is not None)
+    converged = runs.get(CONVERGED)
+    if converged is None or converged.rms_error is None:
+        return "the reference has the time step's error, not measured here."
     return (
-        f"{text}. In `{EVALUATION}` the run `{CONVERGED}`, the reference with each time step cut "
-        f"into {config.converged_steps}, is {converged} RMS from the reference, and the `{PLAIN}` "
-        f"run {plain}."
+        f"the reference is itself {1e3 * converged.rms_error:.3g} mm (RMS) from the motion "
+        "converged in time."
     )
+
+
+def _range(ends: tuple[float, float]) -> str:
+    return f"{ends[0]:g} to {ends[1]:g}"
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    rule = "|".join(["---", *["---:"] * (len(heads) - 1)])
+    lines = [f"|{'|'.join(heads)}|", f"|{rule}|"]
+    return "\n".join([*lines, *(f"|{'|'.join(map(str, row))}|" for row in rows)])
