@@ -109,7 +109,9 @@ def save(figure: Any, path: Path, legend_of: Any = None, columns: int = 5) -> No
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=90, format="png")
     with Image.open(buffer) as picture:
-        picture.convert("RGB").quantize(32, dither=Image.Dither.NONE).save(path, optimize=True)
+        picture.convert("RGB").quantize(
+            48, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        ).save(path, optimize=True)
 
 
 def plain(axis: Any, axes: str = "both") -> None:

@@ -51,10 +51,9 @@ def gravity(*acceleration: float) -> Loads:
     return {"kind": "gravity", "acceleration": acceleration}
 
 
-def force(region: dict[str, Any], *total: float, window: Sequence[float] | None = None) -> Loads:
+def force(region: dict[str, Any], *total: float, **more: Any) -> Loads:
     """Total force on a plane, N."""
-    load = {"kind": "force", "force": total, "region": region}
-    return load if window is None else {**load, "window": window}
+    return {"kind": "force", "force": total, "region": region, **more}
 
 
 def twist(strength: float, linear: bool = False) -> Loads:
@@ -107,15 +106,9 @@ ALL = MOTIONS | CHECKS | THIN | VARIED
 class Model:
     """A discretisation.
 
-    Attributes
-    ----------
-    lumped : float
-        Share a of the lumped mass in M = a lumped + (1 - a) consistent.
-    integrated : bool
-        Force densities integrated with the shape functions; otherwise their values at the
-        nodes times the nodes' volumes.  Both are the same for a uniform density.
-    modes : str
-        Name of further internal modes in `MODES`.
+    ``lumped`` is the share of the lumped mass, the rest is consistent; force densities are
+    ``integrated`` with the shape functions, or their values at nodes times the nodes' volumes;
+    ``modes`` names further internal modes in `MODES`.
     """
 
     element: str
@@ -142,35 +135,12 @@ REFERENCE = Model("hex8-bubble", 0.5, True, refine=4)
 BEST = Model("hex8-bubble-mean", 0.5, True)
 """What `pdcorrect.best_coarse` chooses."""
 MODELS = (
-    Model("hex8", refine=2),
-    DEFAULT,
-    Model("hex8", 0.5, True),
-    Model("hex8", 0.0, True),
-    Model("hex8-mean", 0.5, True),
-    Model("hex8-bubble", 1.0, False),
-    Model("hex8-bubble", 0.5, False),
-    Model("hex8-bubble", 0.0, False),
-    Model("hex8-bubble-mean", 1.0, False),
-    *(Model("hex8-bubble", a, True) for a in (1.0, 0.75, 0.5, 0.25, 0.0)),
-    *(Model("hex8-bubble-mean", a, True) for a in (1.0, 0.75, 0.5, 0.25, 0.0)),
-    *(Model("hex8-bubble", a, True, modes="3 warping") for a in (0.5, 0.0)),
-    Model("hex27", 0.5, True),
-)
-THIN_MODELS = (
-    Model("hex8", 0.5, True), Model("hex8-mean", 0.5, True), Model("hex8-bubble", 0.5, True),
-    BEST, Model("hex27", 0.5, True),
+    Model("hex8", refine=2), DEFAULT, Model("hex8", 0.5, True), Model("hex8-mean", 0.5, True),
+    Model("hex8-bubble", 0.5, True), Model("hex8-bubble", 0.5, True, modes="3 warping"),
+    *(Model("hex8-bubble-mean", a, True) for a in (1.0, 0.5, 0.0)), Model("hex27", 0.5, True),
 )  # fmt: skip
-VARIED_MODELS = (
-    Model("hex8", refine=2), Model("hex8", 0.5, True), Model("hex8-bubble", 1.0, False),
-    *(Model("hex8-bubble", a, True) for a in (0.5, 0.0)), Model("hex8-bubble", 0.5, False), BEST,
-)  # fmt: skip
-THESIS = ("beam, twist unit", "cross, twist unit", "weight, impulse")
-THESIS_MODELS = (
-    Model("hex8", refine=2), Model("hex8", 0.5), Model("hex8", 0.0), Model("hex8-mean", 0.5),
-    *(Model("hex8-bubble", a) for a in (1.0, 0.5, 0.0)),
-    *(Model("hex8-bubble-mean", a) for a in (1.0, 0.5, 0.0)),
-    Model("hex27", 0.5),
-)  # fmt: skip
+THIN_MODELS = (Model("hex8-bubble", 0.5, True), BEST, Model("hex27", 0.5, True))
+VARIED_MODELS = tuple(Model("hex8-bubble", a, True) for a in (0.5, 0.0))
 
 
 # --- further internal modes ----------------------------------------------------------------
@@ -234,22 +204,22 @@ def enriched(problem: pc.Problem, modes: str) -> pc.Problem:
 # --- problems ------------------------------------------------------------------------------
 
 
-def scene(motion: str, frames: int = FRAMES, **load: Any) -> pc.Scene:
-    """The scene of a motion; ``load`` changes keys of its load."""
+def scene(motion: str) -> pc.Scene:
+    """The scene of a motion."""
     body = motion.split(",")[0]
-    keys = {**ALL[motion], **load}
+    keys = dict(ALL[motion])
     keys.pop("linear", None)
     return pc.Scene(
         name=motion, body=BODIES[body], loads=[keys],
         material={**MATERIAL, **MATERIALS.get(motion, {})},
-        clamps=CLAMPS.get(body, [LEFT]), time={"step": 0.01, "frames": frames},
+        clamps=CLAMPS.get(body, [LEFT]), time={"step": 0.01, "frames": FRAMES},
         solver={"tolerance": TOLERANCE},
     )  # fmt: skip
 
 
-def discretised(motion: str, model: Model, frames: int = FRAMES) -> pc.Problem:
+def discretised(motion: str, model: Model) -> pc.Problem:
     """A motion's problem."""
-    keys, told = ALL[motion], scene(motion, frames)
+    keys, told = ALL[motion], scene(motion)
     problem = pc.discretise(told, model.refine, "consistent", model.element)
     problem = enriched(problem, model.modes)
     share = model.lumped
@@ -279,21 +249,12 @@ def torsion(problem: pc.Problem, load: Torsion, linear: bool, integrated: bool) 
     return NodalLoad(Amplitude(load), pattern)
 
 
-def thesis_problem(motion: str, model: Model) -> pc.Problem:
-    """Forces on the coarse nodes only, on every mesh: ``distribution = "nodal"``."""
-    keys: dict[str, Any] = {"distribution": "nodal"}
-    if ALL[motion]["kind"] == "torsion":
-        keys["strength"] = ALL[motion]["strength"] * CELL**3 / 4  # N on each coarse node
-    mass = {0.0: "consistent", 0.5: "averaged", 1.0: "lumped"}[model.lumped]
-    return pc.discretise(scene(motion, **keys), model.refine, mass, model.element)
-
-
 # --- figures -------------------------------------------------------------------------------
 
 
-def run(problem: pc.Problem, first_hessian: str = "auto") -> pc.Trajectory:
+def run(problem: pc.Problem) -> pc.Trajectory:
     """All frames by projective dynamics."""
-    return pc.rollout(pc.ProjectiveDynamics(problem, first_hessian=first_hessian))
+    return pc.rollout(pc.ProjectiveDynamics(problem))
 
 
 def on_coarse(trajectory: pc.Trajectory, coarse: pc.Trajectory) -> Array:
@@ -301,23 +262,17 @@ def on_coarse(trajectory: pc.Trajectory, coarse: pc.Trajectory) -> Array:
     return pc.restrict(trajectory, to=coarse).positions
 
 
-def shares(
-    motion: str,
-    models: Sequence[Model],
-    make: Callable[[str, Model], pc.Problem] = discretised,
-    title: str = "",
-) -> common.Figures:
+def shares(motion: str, models: Sequence[Model]) -> common.Figures:
     """Omega of each model, and in cells what it is a share of."""
-    plain = run(make(motion, PLAIN))
-    truth = on_coarse(run(make(motion, REFERENCE)), plain)
-    name = f"{title}{motion}"
+    plain = run(discretised(motion, PLAIN))
+    truth = on_coarse(run(discretised(motion, REFERENCE)), plain)
     figures = {
-        f"{name}, displacement": pc.metrics.largest_displacement(truth) / CELL,
-        f"{name}, plain error": pc.metrics.rms_error(plain, truth) / CELL,
+        f"{motion}, displacement": pc.metrics.largest_displacement(truth) / CELL,
+        f"{motion}, plain error": pc.metrics.rms_error(plain, truth) / CELL,
     }
     for model in models:
-        found = on_coarse(run(make(motion, model)), plain)
-        figures[f"{name}, {model.label}"] = pc.metrics.error_corrected(found, plain, truth)
+        found = on_coarse(run(discretised(motion, model)), plain)
+        figures[f"{motion}, {model.label}"] = pc.metrics.error_corrected(found, plain, truth)
     return figures
 
 
@@ -331,17 +286,6 @@ def reference_error(motion: str) -> common.Figures:
         label = f"{motion}, {model.label}, against 8x"
         figures[label] = pc.metrics.error_corrected(found, plain, truth)
         figures[f"{label}, error"] = pc.metrics.rms_error(found, truth) / CELL
-    return figures
-
-
-def iterations(motion: str) -> common.Figures:
-    """Mean PD iterations a frame."""
-    figures: common.Figures = {}
-    for model in (PLAIN, Model("hex8-bubble", 0.5, True), BEST):
-        problem = discretised(motion, model)
-        for hessian in ("G-scaled", "lagged"):
-            mean = run(problem, hessian).stats["iterations"].mean()
-            figures[f"iterations, {motion}, {model.element}, {hessian}"] = float(mean)
     return figures
 
 
@@ -381,9 +325,6 @@ def compute() -> common.Figures:
     figures: common.Figures = {}
     for motion in MOTIONS:
         figures |= shares(motion, MODELS)
-        figures |= iterations(motion)
-    for motion in THESIS:
-        figures |= shares(motion, THESIS_MODELS, thesis_problem, "nodal forces, ")
     for motion in THIN:
         figures |= shares(motion, THIN_MODELS)
     for motion in VARIED:

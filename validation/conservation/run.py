@@ -97,19 +97,7 @@ def case(quick: bool) -> common.Outcome:
     for integrator in ("backward-euler", "midpoint", "generalised-alpha"):
         figures[f"PD, {integrator}, fall, m"] = fall("PD", integrator)
     figures["support over weight"] = support()
-    rows = tuple(
-        (
-            name,
-            *(
-                figures[f"PD, {name}, {what}"]
-                for what in ("momentum", "angular momentum", "energy")
-            ),
-        )
-        for name in INTEGRATORS
-    )
-    headings = ("integrator", "momentum", "angular momentum", "energy")
-    table = common.Table("Largest relative change in a free flight of 0.2 s by PD", headings, rows)
-    return common.Outcome(figures, (table,))
+    return common.Outcome(figures)
 
 
 def finding(record: common.Record) -> str:

@@ -241,7 +241,7 @@ def outcome(label: str, rows: Sequence[Row], reference: Row, scale: float) -> co
         figures[f"{label}, speed-up at the intermediate mesh's error"] = speed_up
         figures[f"{label}, error at its time, of its error"] = as_quick.error / middle.error
         untrained = [r for r in [*rivals(rows), reference] if r not in hybrids]
-        tables += [winners(label, as_near, as_quick), beside(label, hybrids, untrained)]
+        tables.append(beside(label, hybrids, untrained))
     for row in hybrids:
         base = by_name["best" if label.endswith("exact") else "plain"]
         figures[f"{label}, {row.name}, error over its base's"] = row.error / base.error
@@ -264,13 +264,6 @@ def methods_table(label: str, rows: Sequence[Row], scale: float) -> common.Table
         for r in sorted(rows, key=lambda r: r.milliseconds)
     )  # fmt: skip
     return common.Table(label, HEADS, body)
-
-
-def winners(label: str, as_near: Row, as_quick: Row) -> common.Table:
-    """Who is as near as the intermediate mesh in the least time, and nearest in its time."""
-    heads = ("scene", "as near, quickest", "ms a frame", "as quick, nearest", "RMS error, mm")
-    row = (label, as_near.name, as_near.milliseconds, as_quick.name, 1e3 * as_quick.error)
-    return common.Table("Beside the intermediate mesh (plain 2×2×2)", heads, (row,))
 
 
 BESIDE = "Hybrids beside what needs no training"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +76,10 @@ def run(scene: pc.Scene, refine: int = 1, newton: bool = False) -> pc.Trajectory
     return made
 
 
-def stepped(integrator: str, split: int, tolerance: float = ACCURATE) -> Array:
+def stepped(integrator: str, split: int) -> Array:
     """Positions (T+1, N, 3) at the frames, with ``split`` steps a frame."""
     time = {"step": STEP / split, "frames": FRAMES * split, "integrator": integrator}
-    changed = SCENE.with_changes(time=time, solver={"tolerance": tolerance})
+    changed = SCENE.with_changes(time=time, solver={"tolerance": ACCURATE})
     return run(changed).positions[::split]
 
 
@@ -88,10 +88,10 @@ def tight() -> Array:
     return run(SCENE.with_changes(solver={"tolerance": TIGHT})).positions
 
 
-def solver_error(tolerances: Sequence[float] = TOLERANCES) -> common.Figures:
+def solver_error() -> common.Figures:
     """PD at several tolerances, and Newton at the tightest, against PD at the tightest."""
     truth, figures = tight(), {}
-    for tolerance in tolerances:
+    for tolerance in TOLERANCES:
         changed = SCENE.with_changes(solver={"tolerance": tolerance})
         label = f"solver, {tolerance:g}"
         figures |= _error(label, run(changed).positions, truth)
@@ -100,30 +100,19 @@ def solver_error(tolerances: Sequence[float] = TOLERANCES) -> common.Figures:
     return figures | _error("solver, Newton", newton.positions, truth)
 
 
-def time_error(
-    integrators: Sequence[str] = INTEGRATORS,
-    splits: Sequence[int] = SPLITS,
-    finest: int = FINEST,
-) -> common.Figures:
-    """Integrators against midpoint with ``finest`` steps a frame, and the order of each."""
-    truth, figures = stepped("midpoint", finest), {}
-    for integrator in integrators:
-        errors = []
-        for split in splits:
+def time_error() -> common.Figures:
+    """Integrators against midpoint with `FINEST` steps a frame, and the order of each."""
+    truth = stepped("midpoint", FINEST)
+    figures = _error("time, reference", stepped("generalised-alpha", FINEST), truth)
+    for integrator in INTEGRATORS:
+        for split in SPLITS:
             label = f"time, {integrator}, {_step(split)}"
             figures |= _error(label, stepped(integrator, split), truth)
-            errors.append(figures[f"{label}, mm"])
-        for k in range(1, len(splits)):
-            order = np.log(errors[k - 1] / errors[k]) / np.log(splits[k] / splits[k - 1])
-            steps = f"{_step(splits[k - 1])} to {_step(splits[k])}"
-            figures[f"order, {integrator}, {steps}"] = float(order)
+        for split, finer in itertools.pairwise(SPLITS):
+            steps = _step(split), _step(finer)
+            before, after = (figures[f"time, {integrator}, {step}, mm"] for step in steps)
+            figures[f"order, {integrator}, {' to '.join(steps)}"] = float(np.log2(before / after))
     return figures
-
-
-def time_reference() -> common.Figures:
-    """Two references of time error against each other."""
-    other = stepped("generalised-alpha", FINEST)
-    return _error("time, reference", other, stepped("midpoint", FINEST))
 
 
 def discretisation_error() -> common.Figures:
@@ -183,65 +172,45 @@ RATIOS = (
 def compute() -> common.Figures:
     """All figures."""
     figures = {"displacement, mm": 1e3 * _size(tight())}
-    figures |= solver_error() | time_error() | time_reference()
+    figures |= solver_error() | time_error()
     figures |= discretisation_error() | model_error() | model_error("hex27")
     for above, below in RATIOS:
         figures[f"ratio, {above} over {below}"] = figures[f"{above}, mm"] / figures[f"{below}, mm"]
     return figures
 
 
-# --- figure ----------------------------------------------------------------------------------
-
-_KINDS = {
-    "solver": ("#009e73", "solver error: h = 0.01 s, against 10⁻¹⁰ cells"),
-    "time": ("#0072b2", "time error: h = 0.01 s, against 0.01/128 s"),
-    "mesh": ("#e69f00", "discretisation error: against hex27 3x"),
-    "model": ("#d55e00", "model error: against the corotated energy"),
+KINDS = {
+    "solver": "solver error: 10 ms, tolerance in cells, against 1e-10",
+    "time": "time error: 10 ms, against 10/128 ms",
+    "mesh": "discretisation error: against hex27 3x",
+    "model": "model error: against the corotated energy",
 }
-
-
-def _rows() -> list[tuple[str, str, str]]:
-    """Kind, name shown and figure of each bar, from the top."""
-    powers = "⁰¹²³⁴⁵⁶⁷⁸⁹"
-    rows = []
-    for tolerance in TOLERANCES:
-        shown = f"to 10⁻{powers[round(-np.log10(tolerance))]} cells"
-        rows.append(("solver", shown, f"solver, {tolerance:g}"))
-    rows += [("time", name, f"time, {name}, h") for name in INTEGRATORS]
-    names = {"hex8 1x": "hex8 (plain coarse)", f"{BEST} 1x": f"{BEST} (best coarse)"}
-    for name in MESHES:
-        rows += [
-            ("mesh", names.get(mesh, mesh.removesuffix(" 1x")), f"mesh, {mesh}")
-            for mesh in (f"{name} {refine}x" for refine in REFINES)
-        ]
-    return rows + [("model", name, f"model, {name}") for name in MODELS]
 
 
 def draw(record: common.Record, path: Path) -> None:
     """Bars on a logarithmic axis, grouped by the kind of error."""
     figures = record.figures
     figure, axis = common.panels(9, 6.2)
-    place, last, places, legend = 0.0, "", [], {}
-    for kind, _, name in _rows():
-        place += 1.0 if kind == last else 1.7
-        colour, label = _KINDS[kind]
-        value = figures[f"{name}, mm"]
-        legend[label] = axis.barh(place, value, 0.78, color=colour)
-        axis.annotate(
-            f"{value:.3g}", (value, place), (5, 0), textcoords="offset points", va="center"
-        )
-        places.append(place)
-        last = kind
-    axis.set_yticks(places, [shown for _, shown, _ in _rows()])
+    names = [n.removesuffix(", mm") for n in figures if n.endswith(", mm")]
+    names = [n for n in names if n.startswith("time") == n.endswith(", h") and ", on " not in n]
+    place, labels = 0.0, {}
+    for k, (kind, label) in enumerate(KINDS.items()):
+        place += 0.7
+        for name in (n for n in names if n.startswith(f"{kind}, ") and n != "solver, Newton"):
+            value = figures[f"{name}, mm"]
+            axis.barh(place, value, 0.78, color=common.COLOURS[k], label=label)
+            axis.annotate(
+                f"{value:.3g}", (value, place), (5, 0), textcoords="offset points", va="center"
+            )
+            labels[place] = name.removeprefix(f"{kind}, ").removesuffix(", h")
+            label, place = "", place + 1.0
+    axis.set_yticks(list(labels), list(labels.values()))
     axis.invert_yaxis()
     moved = f"RMS displacement {figures['displacement, mm']:.0f} mm"
     label = f"RMS distance of a node over nodes and frames, mm ({moved})"
     axis.set(xscale="log", xlim=(5e-6, 100.0), xlabel=label)
     common.plain(axis, "x")
-    figure.legend(
-        legend.values(), legend.keys(), loc="outside upper center", ncols=2, frameon=False
-    )
-    common.save(figure, path)
+    common.save(figure, path, axis, 2)
 
 
 def finding(record: common.Record) -> str:

@@ -17,17 +17,6 @@ MODEL = "tiny"
 FAR = Path(__file__).with_name("far.toml")
 SPLITS = ("evaluation", "stronger", "stiffer", "softer", "compressible", "half-step",
           "double-step", "long")  # fmt: skip
-GATES: dict[str, dict[str, float | None] | None] = {
-    "none": None,
-    "margin 3": {"margin": 3.0, "average": None, "body": None, "time_step": None},
-    "margin 1": {"average": None, "body": None, "time_step": None},
-    "margin 0.3": {"margin": 0.3, "average": None, "body": None, "time_step": None},
-    "average": {"margin": None, "body": None, "time_step": None},
-    "body": {"margin": None, "average": None, "time_step": None},
-    "step": {"margin": None, "average": None, "body": None},
-    "default": {},
-}
-"""Changes of the default gate; None: no gate."""
 HARM = 1.05
 """Times the coarse model's RMS error: what is more counts as harm."""
 
@@ -57,8 +46,7 @@ def held(data: Path, split: str) -> dict[str, Held]:
     cases = read_cases(data, split, ["best"], skip_damaged=False).cases
     stepper = BatchStepper([case.problems["best"] for case in cases])
     found = {}
-    for name, changes in GATES.items():
-        gate = None if changes is None else Gate(**changes)
+    for name, gate in (("none", None), ("default", Gate())):
         hybrid = BatchHybrid(stepper, corrector, gate=gate)
         runs = roll_out(hybrid, stepper, [case.steps for case in cases])
         errors = [

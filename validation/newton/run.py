@@ -65,7 +65,7 @@ def solver_error(motion: str, element: str) -> common.Figures:
     }
 
 
-def model_error(motion: str) -> tuple[common.Figures, list[float]]:
+def model_error(motion: str) -> common.Figures:
     """Newton FEM with stable neo-Hookean energy against the corotated one, by load."""
     errors = []
     for share in SHARES:
@@ -78,7 +78,7 @@ def model_error(motion: str) -> tuple[common.Figures, list[float]]:
         for share, error in zip(SHARES, errors, strict=True)
     }
     order = float(np.log10(errors[1] / errors[0]))
-    return figures | {f"model, {motion}, order in the load": order}, errors
+    return figures | {f"model, {motion}, order in the load": order}
 
 
 def converging(name: str, runs: list[Array]) -> common.Figures:
@@ -111,25 +111,13 @@ def time(motion: str, splits: tuple[int, ...]) -> common.Figures:
 def outcome(motion: str, quick: bool) -> common.Outcome:
     """All figures of a motion."""
     figures: common.Figures = {}
-    rows = []
     for element in ("hex8", "hex8-bubble-mean") if quick else common.ELEMENTS:
         figures |= solver_error(motion, element)
-        rows.append((motion, element, figures[f"solver, {motion}, {element}, cells"]))
-    model, errors = model_error(motion)
     refines = (1, 2, 4) if quick else (1, 2, 4, 8)
     splits = (1, 2, 4, 8) if quick else (1, 2, 4, 8, 16, 32)
-    figures |= model | mesh(motion, refines) | time(motion, splits)
-    tables = (
-        common.Table(
-            "PD (10⁻⁸) and Newton on one energy: largest distance",
-            ("motion", "element", "cells"), tuple(rows),
-        ),
-        common.Table(
-            "Newton FEM: neo-Hookean against corotated, per cent of the displacement",
-            ("motion", *(f"{s:g} of the load" for s in SHARES)), ((motion, *errors),),
-        ),
-    )  # fmt: skip
-    return common.Outcome(figures, tables)
+    return common.Outcome(
+        figures | model_error(motion) | mesh(motion, refines) | time(motion, splits)
+    )
 
 
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:

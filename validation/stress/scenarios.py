@@ -26,31 +26,12 @@ CALM = {"mass": 20.0}
 class Scenario:
     """A scene, how it begins, and what has to be reached.
 
-    Attributes
-    ----------
-    name, about : str
-    scene : Scene
-        On the plain mesh.
-    goal : {"rest", "shape", "motion"}
-        The end of the run has to be at rest where it was made ("rest"), or that but for a
-        rigid motion of each part of the body ("shape"); or all frames have to be those of
-        the same steps by the other method, solved tightly ("motion").
-    start : callable, optional
-        Positions (N, 3) at the start, m, from a problem.
-    velocity : callable, optional
-        Velocities (N, 3) at the start, m/s.
-    forces : callable, optional
-        Nodal forces (N, 3), N, from a problem and the number of the step.
-    quick : bool
-        Whether quick runs have it.
-    solvers : sequence of str, optional
-        Which of them; all by default.
-    known : bool
-        Whether hybrids were trained on such bodies: what share of their corrections is
-        accepted is a figure then.
-    finer : int
-        For motions: into how many cells, along each axis, those of a reference are cut,
-        beside which hybrids are judged; 0: they are judged beside the coarse model.
+    ``goal`` is "rest": at the end the body is at rest where it was made; "shape": that but for a
+    rigid motion of each part of it; or "motion": all frames are those of the same steps by the
+    other method, solved tightly.  ``start`` gives positions and ``velocity`` velocities (N, 3);
+    ``forces`` nodal forces by the number of the step.  ``known`` says that hybrids were trained
+    on such bodies; ``finer`` into how many cells, along each axis, those of a reference are cut,
+    beside which hybrids are judged (0: beside the coarse model).
     """
 
     name: str
