@@ -3,10 +3,9 @@
 python datasets/make_all.py FOLDER SUMMARIES [NAME ...] [--device cuda] [--workers 2]
     [--batch 60] [--seconds 1500]
 
-FOLDER/NAME gets the data; SUMMARIES/NAME the card, all numbers of `pdcorrect dataset info`,
-the manifest with the files' hashes, the normalisation statistics, and one file of the
-evaluation split to draw.  A set that is not complete when time is up has no summary.  Exit
-status 1 if one is not complete, or its check finds something.
+FOLDER/NAME gets the data; SUMMARIES/NAME the card and the manifest with the files' hashes.  A set
+that is not complete when time is up has no summary.  Exit status 1 if one is not complete, or its
+check finds something.
 
 Several workers are started once and compute all sets; a set is begun when too little is left
 of the one before to keep them busy, and summaries are written by processes of their own.
@@ -24,16 +23,16 @@ import traceback
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 
+from pdcorrect._files import make_folder, write_text
+from pdcorrect.cli.common import FileLines
 from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import InputError
-from pdcorrect.progress import FileLines
-from pdcorrect.replacement import make_folder, write_text
 
 HERE = Path(__file__).parent
 NAMES = [
@@ -149,13 +148,9 @@ def summarise(data: Path, target: Path) -> int:
     """Check a complete data set and write its summary; how much the check found."""
     started = time.monotonic()
     findings = check_dataset(data)
-    info = dataset_info(data)
     make_folder(target)
-    write_text(target / "info.json", info.to_json() + "\n")
-    write_text(target / "README.md", dataset_card(data, info))
-    for name in (MANIFEST, "statistics.json"):
-        shutil.copyfile(data / name, target / name)
-    shutil.copyfile(data / "evaluation" / "mesh-0000.h5", target / "sample.h5")
+    write_text(target / "README.md", dataset_card(data, dataset_info(data)))
+    shutil.copyfile(data / MANIFEST, target / MANIFEST)
     lines = [f"{data.name}: {len(findings)} findings", *map(str, findings[:10])]
     print("\n  ".join(lines), f"({time.monotonic() - started:.0f} s)", flush=True)
     return len(findings)

@@ -138,9 +138,9 @@ def _use(
     machine = made_with.get("processor", "?") if where == "cpu" else where
     yield (
         f"**Made** by `pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}, in "
-        f"{info.whole.seconds['total']:.3g} worker seconds, {made_with.get('date', '?')}, "
+        f"{info.whole.seconds['total']:.0f} worker seconds, {made_with.get('date', '?')}, "
         f"pdcorrect {made_with.get('pdcorrect', '?')}, {machine}; "
-        f"{info.whole.bytes / 1e6:.3g} MB. SHA-256 `{content}`; other devices differ within the "
+        f"{info.whole.bytes / 1e6:.0f} MB. SHA-256 `{content}`; other devices differ within the "
         "solver's tolerance."
     )
     yield (
@@ -155,8 +155,10 @@ def _use(
 
 def _difference(extra: ExtraSplit) -> str:
     """What a split changes against the data set."""
-    keys = ("family", "young", "poisson", "refine")
-    told = [f"{key} {getattr(extra, key)}" for key in keys if getattr(extra, key) is not None]
+    told = [f"family {extra.family}"] if extra.family is not None else []
+    told += [f"E {_range(extra.young)} Pa"] if extra.young is not None else []
+    told += [f"ν {_range(extra.poisson)}"] if extra.poisson is not None else []
+    told += [f"reference cut {extra.refine}"] if extra.refine is not None else []
     factors = {"strength": extra.strength_factor, "step": extra.step_factor}
     factors["frames"] = extra.frames_factor
     told += [f"{name} ×{factor:g}" for name, factor in factors.items() if factor != 1]
