@@ -25,6 +25,7 @@ lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/python docs/tables.py --check
 
 docs: $(VENV)/dev.stamp
 	$(BIN)/python -m sphinx -W -b html docs docs/_build/html

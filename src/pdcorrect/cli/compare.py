@@ -31,7 +31,7 @@ def compare(
     model: Annotated[
         Optional[list[str]],
         typer.Option(
-            help="Also a corrector, by name (docs/results.md and models/README.md list them) or "
+            help="Also a corrector, by name (models/README.md lists them) or "
             "folder; repeatable (extra 'learn'). Those of base 'best' not together with others."
         ),
     ] = None,

@@ -33,8 +33,8 @@ def simulate(
     model: Annotated[
         Optional[str],
         typer.Option(
-            help="Correct the steps by this model, a name (docs/results.md and models/README.md "
-            "list them) or a folder, on the coarse model that it is for (extra 'learn')."
+            help="Correct the steps by this model, a name (models/README.md lists "
+            "them) or a folder, on the coarse model that it is for (extra 'learn')."
         ),
     ] = None,
     gate: Annotated[

@@ -27,7 +27,6 @@ from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity, check_velocity
-from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model
@@ -44,9 +43,6 @@ MEMORY = "previous_correction"
 
 _OWN = (MEMORY, PAUSE)
 """What a coarse stepper has no use for in `State.memory`."""
-
-_ROUNDING = 1e-5
-"""Of measures whose ranges were fitted to meshes in single precision."""
 
 
 class HybridStepper:
@@ -159,15 +155,6 @@ class HybridStepper:
             "time_step_excess": f"{self.time_step_excess():.6g}",
             **self.origin,
         }
-
-    def body_excess(self) -> dict[str, float]:
-        """Measures of the body at rest that lie outside their range in training, and how far.
-
-        By the names of `SHAPE_MEASURES`, dimensionless; a gate refuses the body if one is more
-        than its bound `Gate.body`.
-        """
-        found = self.corrector.normaliser.shape_excess(self.bodies.shapes)[0].tolist()
-        return {name: x for name, x in zip(SHAPE_MEASURES, found, strict=True) if x > _ROUNDING}
 
     def time_step_excess(self) -> float:
         """How far the time step over the cell size lies outside its range in training, at least 0.

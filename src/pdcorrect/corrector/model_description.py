@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,8 +23,6 @@ VERSION = 5
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 _CHECKSUM = "checksum"
-_BROUGHT_UP_BY = {2: "fit_shapes.py", 3: "fit_time_steps.py", 4: "fit_time_steps.py"}
-"""Scripts of the folder ``models`` for older versions; there is none for the first."""
 
 
 class ModelRecord(Strict):
@@ -96,14 +92,8 @@ def read_file(path: Path) -> bytes:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
 
 
-def read_description(folder: Path, versions: Sequence[int] = (VERSION,)) -> Description:
+def read_description(folder: Path) -> Description:
     """What ``model.json`` in a folder says, if it is whole.
-
-    Parameters
-    ----------
-    folder : Path
-    versions : sequence of int
-        Of the format, which may be older ones.
 
     Raises
     ------
@@ -114,7 +104,7 @@ def read_description(folder: Path, versions: Sequence[int] = (VERSION,)) -> Desc
     """
     path = folder / DESCRIPTION
     content, whole = _content(path)
-    _check_version(folder, content.get("version"), versions, whole)
+    _check_version(path, content.get("version"), whole)
     try:
         return Description.model_validate(content)
     except ValidationError as error:
@@ -137,45 +127,16 @@ def _content(path: Path) -> tuple[dict[str, Any], bool]:
     return content, content.pop(_CHECKSUM, None) == digest
 
 
-def _check_version(folder: Path, version: object, versions: Sequence[int], whole: bool) -> None:
-    """Refuse what is altered, for its version may be what was altered, and other versions.
+def _check_version(path: Path, version: object, whole: bool) -> None:
+    """Refuse altered files and other versions of the format.
 
-    A newer version is not taken for altered by its checksum alone, which may be another one there.
+    A newer version is refused as such, for its checksum may be another one.
     """
-    path, expected = folder / DESCRIPTION, " or ".join(map(str, versions))
-    found = version if type(version) is int else 0
-    if found > VERSION:
-        raise FileVersionError(
-            f"{path}: format version {found}: expected {expected}: {_newer(whole)}"
-        )
-    if not whole:
+    newer = type(version) is int and version > VERSION
+    if not whole and not newer:
         raise FileFormatError(
             f"{path}: damaged: its checksum is not that of its content; copy or save it again."
         )
-    if found < 1:
-        raise FileVersionError(f"{path}: version is {version!r}: expected {expected}: damaged.")
-    if found not in versions:
-        raise FileVersionError(
-            f"{path}: format version {found}: expected {expected}: written by an older pdcorrect: "
-            f"{_way_up(folder, found)}"
-        )
-
-
-def _newer(whole: bool) -> str:
-    if whole:
-        return "written by a newer pdcorrect: update pdcorrect."
-    return (
-        "its checksum is not that of its content, as this pdcorrect computes it: written by a "
-        "newer one or damaged: update pdcorrect, or copy the model again."
-    )
-
-
-def _way_up(folder: Path, version: int) -> str:
-    """What can be done about a model of an older version."""
-    if version not in _BROUGHT_UP_BY:
-        return "nothing brings it up to date: train the model anew."
-    command = f"python models/{_BROUGHT_UP_BY[version]} {shlex.quote(str(folder))}"
-    return (
-        f"bring it up to date by `{command} DATASET/config.toml ...` with the configurations that "
-        "docs/files.md tells of, or train it anew if its data sets have none."
-    )
+    if version != VERSION:
+        remedy = "update pdcorrect" if newer else "train the model anew"
+        raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {remedy}.")

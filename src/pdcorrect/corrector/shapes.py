@@ -18,9 +18,6 @@ SHAPE_MEASURES = (
 )  # fmt: skip
 """What `shape_measures` gives, in order."""
 
-_PLUS_ONE, _AS_IT_IS = ("distance", "spread"), ("overhang",)
-"""Measures that are logarithms of 1 plus a length, and that are no logarithm as others are."""
-
 _LEAST_RADIUS = 0.1
 """Cell sizes; flatter bodies count as this."""
 
@@ -109,20 +106,6 @@ def shape_measures(
         overhang,
         np.log1p(np.sqrt(apart)),
     ])  # fmt: skip
-
-
-def plain_measures(measures: Array) -> Array:
-    """Measures (..., 10) without their logarithms.
-
-    Numbers, shares, and lengths in cell sizes; the overhang as it is.
-    """
-    plain = np.exp(measures)
-    for k, name in enumerate(SHAPE_MEASURES):
-        if name in _PLUS_ONE:
-            plain[..., k] = np.expm1(measures[..., k])
-        elif name in _AS_IT_IS:
-            plain[..., k] = measures[..., k]
-    return plain
 
 
 def _distances(x: Array, edge_index: Numbers, sources: Numbers) -> Array:

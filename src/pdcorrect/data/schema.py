@@ -1,6 +1,6 @@
 """What a file of a data set holds: one mesh with its material, and its simulations.
 
-The layout of the HDF5 file, version 1 (``docs/data_format.md``), after its seal
+The layout of the HDF5 file, version 1 (``docs/datasets.md``), after its seal
 (`pdcorrect.data.checksum`)::
 
     /                     attributes: format, version, dataset, split, number, setting,

@@ -170,7 +170,7 @@ def best_coarse(scene: Scene) -> Scene:
     """The scene with the most accurate discretisation that a coarse mesh affords.
 
     Element "hex8-bubble-mean" and averaged mass: of the elements with 8 nodes they remove
-    most of the plain coarse mesh's error (``validation/best_coarse``).  "hex8-bubble" for
+    most of the plain coarse mesh's error (see `validation/best_coarse`).  "hex8-bubble" for
     a body that is one cell thick somewhere, where the other bends too easily; of bodies
     from mesh files that is not looked for.
 
