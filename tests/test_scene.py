@@ -1,6 +1,7 @@
 """Scene files: what they mean, round trips, and messages for wrong ones."""
 
 import math
+import re
 import tomllib
 from pathlib import Path
 
@@ -83,133 +84,99 @@ def changed(old, new):
     return TEXT.replace(old, new, 1)
 
 
+MOVING = """
+[[clamps]]
+region = { everywhere = true }
+motion = { times = [0, 1], displacement = [[0, 0, 0]] }
+"""
+
+
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "told"),
     [
-        (changed("poisson = 0.45", "poisson = 0.5"), ["material.poisson = 0.5", "less than 0.5"]),
-        (changed("poisson = 0.45", "poisson = -0.1"), ["material.poisson = -0.1", "at least 0"]),
-        (changed("density = 1.0e3", "density = -1.0"), ["material.density = -1.0", "more than 0"]),
-        (changed("young = 1.0e6", "young = nan"), ["material.young = nan", "finite"]),
-        (changed("young = 1.0e6", "young = inf"), ["material.young = inf", "finite"]),
-        (changed("young = 1.0e6\n", ""), ["material.young: missing"]),
-        (
-            changed("young = 1.0e6", 'young = "soft"'),
-            ['material.young = "soft": expected a number'],
-        ),
-        (changed("young = 1.0e6", "youngs = 1.0e6"), ["material.youngs: unknown key"]),
-        (changed('"lame"', '"lambda"'), ['material.volume_weight = "lambda"', "'published'"]),
-        (changed("cells = [24, 2, 2]", "cells = [24, 0, 2]"), ["body.cells[1] = 0", "at least 1"]),
-        (changed("cells = [24, 2, 2]", "cells = [24, 2]"), ["body.cells[2]: missing"]),
-        (changed('"beam"', '"bean"'), ['body.shape = "bean"', "'cross'"]),
-        (changed("step = 0.01", "step = 0.0"), ["time.step = 0.0", "more than 0"]),
-        (changed("frames = 50", "frames = 1.5"), ["time.frames = 1.5", "integer"]),
-        (changed("at = 0.0 }", 'at = "middle" }'), ['clamps[0].region.at = "middle"', "'max'"]),
-        (changed(", at = 0.0 }", " }"), ["clamps[0].region", "plane and at together"]),
-        (changed('plane = "x", at = 0.0', ""), ["clamps[0].region", "exactly one of plane"]),
-        (changed('"gravity"', '"gravty"'), ['loads[0].kind = "gravty"', "'body-force'"]),
-        (changed("[0.0, 0.0, -9.81]", "[0.0, nan, -9.81]"), ["loads[0].acceleration[1]", "finite"]),
-        (changed("[solver]", "[solver]\nspeed = 9"), ["solver.speed: unknown key"]),
-        (changed("tolerance = 1.0e-5", "tolerance = 0.0"), ["solver.tolerance = 0.0"]),
-        (changed('"hex8"', '"hex9"'), ['solver.element = "hex9"', "'hex8'"]),
-        (changed("kind = ", "window = [0.2, 0.1]\nkind = "), ["window", "start < end"]),
-        (changed("kind = ", "table = [[0, 1], [0, 2]]\nkind = "), ["table", "increasing"]),
-        (changed("kind = ", "ramp = 1.0\ntable = [[0, 1], [1, 2]]\nkind = "), ["not both"]),
-        (changed("name = ", "name = ["), ["not valid TOML"]),
-        (changed('"gravity beam"', '" "'), ["name", "not empty"]),
-        (changed("poisson = 0.45", "poisson = false"), ["material.poisson = false", "number"]),
-        (changed("young = 1.0e6", 'young = "1e6"'), ['material.young = "1e6"', "number"]),
-        (changed("frames = 50", "frames = true"), ["time.frames = true", "integer"]),
-        (changed("step = 0.01", "step = 1e300"), ["time.step", "1e+30"]),
-        (changed("name = ", "self = 1\nname = "), ["self: unknown key"]),
-        (changed("name = ", "__source__ = 1\nname = "), ["__source__: unknown key"]),
-        (changed("kind = ", "window = [-2, -1]\nkind = "), ["ends after time 0"]),
-        (
-            changed("young = 1.0e6", "yung = 1.0e6"),
-            ["material.yung: unknown key; did you mean young?"],
-        ),
+        (changed("poisson = 0.45", "poisson = 0.5"), "material.poisson = 0.5"),
+        (changed("poisson = 0.45", "poisson = -0.1"), "material.poisson = -0.1"),
+        (changed("poisson = 0.45", "poisson = false"), "material.poisson = false"),
+        (changed("density = 1.0e3", "density = -1.0"), "material.density = -1.0"),
+        (changed("young = 1.0e6", "young = nan"), "material.young = nan"),
+        (changed("young = 1.0e6", "young = inf"), "material.young = inf"),
+        (changed("young = 1.0e6", 'young = "1e6"'), 'material.young = "1e6"'),
+        (changed("young = 1.0e6\n", ""), "material.young: missing"),
+        (changed("young = 1.0e6", "youngs = 1.0e6"), "material.youngs: unknown key"),
+        (changed('"lame"', '"lambda"'), 'material.volume_weight = "lambda"'),
+        (changed("cells = [24, 2, 2]", "cells = [24, 0, 2]"), "body.cells[1] = 0"),
+        (changed("cells = [24, 2, 2]", "cells = [24, 2]"), "body.cells[2]: missing"),
+        (changed("[24, 2, 2]", "[24, 2, 2, 2]"), "body.cells = [24, 2, 2, 2]"),
+        (changed('"beam"', '"bean"'), 'body.shape = "bean"'),
+        (changed('"beam"', '"cross"\narm_start = 1'), "body.arm_length: missing"),
+        (changed("[body]", "[body]\narm_length = 3"), "body.arm_length: unknown key"),
+        (changed("step = 0.01", "step = 0.0"), "time.step = 0.0"),
+        (changed("step = 0.01", "step = 1e300"), "time.step = 1e+300"),
+        (changed("frames = 50", "frames = 1.5"), "time.frames = 1.5"),
+        (changed("frames = 50", "frames = true"), "time.frames = true"),
+        (changed("[time]", "[time]\nyoung = 3"), "time.young: unknown key"),
+        (changed("at = 0.0 }", 'at = "middle" }'), 'clamps[0].region.at = "middle"'),
+        (changed(", at = 0.0 }", " }"), 'clamps[0].region = { plane = "x" }'),
+        (changed('plane = "x", at = 0.0', ""), "clamps[0].region = { }"),
         (
             changed('plane = "x", at', 'everywhere = true, plane = "x", at'),
-            ['{ everywhere = true, plane = "x", at = 0.0 }: ', "got plane, everywhere."],
+            'clamps[0].region = { everywhere = true, plane = "x", at = 0.0 }',
         ),
-        (changed("kind = ", "window = [2, 1]\nkind = "), ["start < end, got [2.0, 1.0]."]),
+        (changed("[[clamps]]", "[[clamps]]\nat = 0.0"), "clamps[0].at: unknown key"),
+        (f"{TEXT}{MOVING}", "clamps[1].motion = { times = [0, 1], displacement = [[0, 0, 0]] }"),
+        (changed('"gravity"', '"gravty"'), 'loads[0].kind = "gravty"'),
+        (changed('kind = "gravity"\n', ""), "loads[0].kind: missing"),
+        (changed("[0.0, 0.0, -9.81]", "[0.0, nan, -9.81]"), "loads[0].acceleration[1] = nan"),
+        (changed("kind = ", "strength = 3\nkind = "), "loads[0].strength: unknown key"),
+        (changed("kind = ", "window = [0.2, 0.1]\nkind = "), "loads[0] = { window = [0.2, 0.1]"),
+        (changed("kind = ", "window = [-2, -1]\nkind = "), "loads[0] = { window = [-2, -1]"),
+        (changed("kind = ", "table = [[0, 1], [0, 2]]\nkind = "), "table = [[0, 1], [0, 2]]"),
         (
-            changed("name = ", "frames = 3\nname = "),
-            ["frames: unknown key; it belongs to [time]."],
+            changed("kind = ", "ramp = 1.0\ntable = [[0, 1], [1, 2]]\nkind = "),
+            "loads[0] = { ramp = 1.0, table = [[0, 1], [1, 2]]",
         ),
-        (changed("[time]", "[time]\nname = 3"), ["it belongs to the top, above all tables."]),
-        (
-            changed("[time]", "[time]\ntolerence = 1"),
-            ["time.tolerence: unknown key; did you mean tolerance, which belongs to [solver]?"],
-        ),
-        (
-            changed("[body]", "[body]\narm_length = 3"),
-            ['body.arm_length: unknown key; it goes with shape = "cross".'],
-        ),
-        (
-            changed("kind = ", "strength = 3\nkind = "),
-            ['loads[0].strength: unknown key; it goes with kind = "torsion".'],
-        ),
-        (
-            changed("[[clamps]]", "[[clamps]]\nat = 0.0"),
-            ["clamps[0].at: unknown key; it belongs to [clamps.region]."],
-        ),
-        (
-            changed("[time]", "[time]\nyoung = 3"),
-            ["time.young: unknown key; it belongs to [material] or to [[materials]]."],
-        ),
-        (changed("[24, 2, 2]", "[24, 2, 2, 2]"), ["expected a list of at most 3, got 4."]),
-        (changed("[solver]", "[dampings]\nmass = 1.0\n\n[solver]"), ["did you mean damping?"]),
-        (
-            changed('"gravity"', '"gravty"'),
-            ["loads[0].kind = \"gravty\": expected one of 'gravity',"],
-        ),
-        (changed('kind = "gravity"\n', ""), ["loads[0].kind: missing"]),
-        (changed("24", "9" * 5000), ["not valid TOML", "digits"]),
-        (changed("24", "0x" + "f" * 5000), ["not valid TOML", "integer of more than 1024 bits"]),
-        (changed("24", "[" * 3000), ["not valid TOML", "nested more than 100 deep"]),
-        (changed("[body]", "a." * 3000 + "a = 1\n[body]"), ["nested more than 100 deep"]),
+        (changed("[solver]", "[solver]\nspeed = 9"), "solver.speed: unknown key"),
+        (changed("tolerance = 1.0e-5", "tolerance = 0.0"), "solver.tolerance = 0.0"),
+        (changed('"hex8"', '"hex9"'), 'solver.element = "hex9"'),
+        (changed('"gravity beam"', '" "'), 'name = " "'),
+        (changed("name = ", "self = 1\nname = "), "self: unknown key"),
+        (changed("name = ", "__source__ = 1\nname = "), "__source__: unknown key"),
+        (changed("name = ", "name = ["), "not valid TOML"),
+        (changed("24", "9" * 5000), "not valid TOML"),
+        (changed("24", "0x" + "f" * 5000), "not valid TOML"),
+        (changed("24", "[" * 3000), "not valid TOML"),
+        (changed("[body]", "a." * 3000 + "a = 1\n[body]"), "not valid TOML"),
         (
             changed('"beam"\ncells = [24, 2, 2]\ncell_size = 0.02', '"file"\npath = "a\\u0000b"'),
-            ["body.path", "NUL"],
+            'body.path = "a\\u0000b"',
         ),
     ],
 )
-def test_wrong_scenes_are_refused_in_one_paragraph(text, words):
-    with pytest.raises(SceneError) as caught:
+def test_wrong_scenes_are_refused_by_key_and_value_in_one_paragraph(text, told):
+    with pytest.raises(SceneError, match=f"^beam.toml: .*{re.escape(told)}") as caught:
         pc.Scene.from_toml(text, source="beam.toml")
-    message = str(caught.value)
-    assert message.startswith("beam.toml: ")
-    assert "\n" not in message
-    for word in words:
-        assert word in message
+    assert "\n" not in str(caught.value)
 
 
-def test_keys_of_loads_and_bodies_are_named_as_written():
-    with pytest.raises(SceneError, match=r"loads\[0\]\.force\[1\]"):
-        beam(loads=[{"kind": "force", "force": [1, "a", 2], "region": {"everywhere": True}}])
-    with pytest.raises(SceneError, match=r"body\.arm_length: missing"):
-        beam(body={"shape": "cross", "arm_start": 1})
-    with pytest.raises(SceneError, match=r"motion.displacement to have the 2 entries"):
-        beam(
-            clamps=[
-                {
-                    "region": {"everywhere": True},
-                    "motion": {"times": [0, 1], "displacement": [[0, 0, 0]]},
-                }
-            ]
-        )
+@pytest.mark.parametrize(
+    ("wrong", "meant"),
+    [
+        (changed("young = 1.0e6", "yung = 1.0e6"), "young"),
+        (changed("[time]", "[time]\ntolerence = 1"), "tolerance"),
+        (changed("[solver]", "[dampings]\nmass = 1.0\n\n[solver]"), "damping"),
+        (changed("name = ", "frames = 3\nname = "), "[time]"),
+    ],
+)
+def test_of_an_unknown_key_it_is_said_which_may_be_meant(wrong, meant):
+    with pytest.raises(SceneError, match=rf"unknown key.*{re.escape(meant)}"):
+        pc.Scene.from_toml(wrong)
 
 
 def test_unreadable_files_are_named(tmp_path):
-    with pytest.raises(SceneError, match="nowhere.toml: cannot be read"):
-        pc.Scene.load(tmp_path / "nowhere.toml")
-    with pytest.raises(SceneError, match="is a folder: expected a scene in a TOML file; none is"):
-        pc.Scene.load(tmp_path)
-    with pytest.raises(SceneError, match=r"cannot be read \(embedded null byte\)"):
-        pc.Scene.load(tmp_path / "a\0b")
     (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneError, match="not a UTF-8"):
-        pc.Scene.load(tmp_path / "binary.toml")
+    for path in (tmp_path / "nowhere.toml", tmp_path, tmp_path / "a\0b", tmp_path / "binary.toml"):
+        with pytest.raises(SceneError, match=f"^{re.escape(str(path))}: cannot be read"):
+            pc.Scene.load(path)
 
 
 def test_numpy_numbers_are_numbers():
@@ -219,15 +186,17 @@ def test_numpy_numbers_are_numbers():
     assert scene.to_toml() == plain.to_toml()
 
 
-def test_absurd_grids_are_refused_by_name():
-    for cells in ([10**20, 1, 1], [10**6, 10**6, 1]):
-        with pytest.raises(SceneError, match="cells"):
-            pc.discretise(beam(cells))
-
-
-@pytest.mark.parametrize("change", [{"origin": [1e20, 0.0, 0.0]}, {"cell_size": 1e-150}])
-def test_cells_that_rounding_leaves_no_volume_are_refused_by_the_keys(change):
-    with pytest.raises(SceneError, match=r"body.cell_size = .* with body.origin = .*no volume"):
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"cells": [10**20, 1, 1]}, "body.cells"),
+        ({"cells": [10**6, 10**6, 1]}, "body: .*1000000 x 1000000 x 1"),
+        ({"origin": [1e20, 0.0, 0.0]}, "body.origin"),
+        ({"cell_size": 1e-150}, "body.cell_size = 1e-150"),
+    ],
+)
+def test_bodies_that_memory_or_rounding_cannot_hold_are_refused_by_the_key(change, key):
+    with pytest.raises(SceneError, match=key):
         pc.discretise(beam().with_changes(body=change))
 
 
@@ -305,10 +274,4 @@ def test_best_coarse_changes_element_and_mass_only():
     assert best.with_changes(solver=scene.solver.model_dump()) == scene
     assert pc.best_coarse(best) == best
     assert (scene.solver.element, scene.solver.mass) == ("hex8", "lumped")
-
-
-@pytest.mark.parametrize(
-    ("cells", "element"), [([6, 2, 2], "hex8-bubble-mean"), ([6, 2, 1], "hex8-bubble")]
-)
-def test_best_coarse_looks_at_the_thickness(cells, element):
-    assert pc.best_coarse(beam(cells)).solver.element == element
+    assert pc.best_coarse(beam([6, 2, 1])).solver.element == "hex8-bubble"  # one cell thick
