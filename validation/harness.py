@@ -204,6 +204,7 @@ class Case:
         found = hashlib.sha256(code_digest().encode() + json.dumps(self.inputs()).encode())
         code = {*self.folder.parent.glob("*.py"), *self.folder.rglob("*.py")}
         for path in [*sorted(code), self.folder / "expected.json"]:
+            found.update(path.relative_to(self.folder.parent).as_posix().encode())
             found.update(path.read_bytes())
         return found.hexdigest()
 

@@ -30,6 +30,7 @@ def write(sections: Sections, folder: Path, page: bool = True) -> Path:
     OutputError
         If a file cannot be written.
     """
+    folder = make_folder(folder)
     told = [(case, record, figure(case, record, folder)) for case, record in sections]
     write_text(folder / "report.md", "\n".join(markdown(told)))
     if not page:
