@@ -1,6 +1,6 @@
 """Batches of scenes on one device: steps and derivatives a second, memory, scaling.
 
-    python benchmarks/batch.py [cuda|cpu] [results.json]
+    python benchmarks/batch.py [cuda|cpu]
 
 Cross-shaped bodies of one size, each with its own Young's modulus and gravity (so none
 share a first Hessian, unless said so), to 1e-4 of the coarse cell size, float64, after
@@ -15,14 +15,13 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from machine_file import add
 
 import pdcorrect as pc
-from pdcorrect.environment import environment
 
 COARSE, FINE = (16, 7), (12, 5)
 """Cells along the body and along its arms: 405 coarse nodes, 10 449 fine ones."""
@@ -175,28 +174,19 @@ def main() -> None:
     gpu = device == "cuda"
     coarse = (1, 4, 16, 64, 256, 1024) if gpu else (1, 4, 16)
     fine = (1, 2, 4, 8, 16) if gpu else (1,)
-    record: dict[str, Any] = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": f"python benchmarks/batch.py {device}",
-        "environment": {
-            **environment(),
-            "torch": torch.__version__,
-            "device": torch.cuda.get_device_name() if gpu else "CPU",
-            "torch threads": torch.get_num_threads(),
-        },
+    results: dict[str, Any] = {
         "coarse": [measure(n, COARSE, 1, device) for n in coarse],
         "fine": [measure(n, FINE, 4, device) for n in fine],
         "one at a time, CPU": [one_at_a_time(COARSE, 1), one_at_a_time(FINE, 4)],
     }
     if gpu:
-        record["fine, other first Hessians"] = [
+        results["fine, other first Hessians"] = [
             measure(8, FINE, 4, device, "G-scaled"),
             measure(8, FINE, 4, device, shared=True),
         ]
-        record["newton"] = newton_bound()
-    path = Path(sys.argv[2]) if len(sys.argv) > 2 else Path("batch.json")
-    path.write_text(json.dumps(record, indent=2) + "\n")
-    print(f"wrote {path}")
+        results["newton"] = newton_bound()
+    name = torch.cuda.get_device_name() if gpu else None
+    add("batch", results, name, torch_threads=torch.get_num_threads())
 
 
 if __name__ == "__main__":

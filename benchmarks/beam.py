@@ -116,7 +116,7 @@ def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[
     from pdcorrect.solvers.first_hessian import TrueHessian
     from pdcorrect.solvers.implicit import _quiet_blas
     from pdcorrect.solvers.integrators import backward_euler
-    from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
+    from pdcorrect.solvers.minimise import MinimiserOptions, minimise
     from pdcorrect.solvers.step import GlobalSolver, StepObjective
     from pdcorrect.solvers.tangent_solver import TangentFactory
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 import pdcorrect as pc
 from pdcorrect.fem.factorisation import factor_bytes, factorise
 from pdcorrect.solvers.integrators import backward_euler
-from pdcorrect.solvers.lbfgs import MinimiserOptions, minimise
+from pdcorrect.solvers.minimise import MinimiserOptions, minimise
 from pdcorrect.solvers.step import GlobalSolver, StepObjective
 
 Array = NDArray[np.float64]

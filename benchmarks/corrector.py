@@ -1,6 +1,6 @@
 """What a call of the corrector costs on the CPU: features apart from the network.
 
-    python benchmarks/corrector.py [results.json] [--quick]
+    python benchmarks/corrector.py [--quick]
 
 Each preset with random weights, a beam of 135 and a cross of 405 nodes, both bent; states in
 float64, network in float32, without gradients, on one and two threads of torch and of the compiled
@@ -23,22 +23,22 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
 import torch
+from machine_file import add
 
 import pdcorrect as pc
-from pdcorrect.corrector import cost, features
+from pdcorrect.corrector import features
+from pdcorrect.corrector import model_io as cost
+from pdcorrect.corrector.architecture import PRESETS
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.config import PRESETS
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
-from pdcorrect.corrector.normaliser import Moments
-from pdcorrect.environment import environment
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
+from pdcorrect.corrector.normaliser import RunningMoments
 
 BODIES: dict[str, dict[str, Any]] = {
     "beam": {"shape": "beam", "cells": [14, 2, 2], "cell_size": 0.05},
@@ -72,7 +72,7 @@ def sample(body: dict[str, Any]) -> tuple[BodyGraph, Snapshot]:
     return bodies, Snapshot(start, noise(0.1), start + noise(1e-3), noise(1.0))
 
 
-def fitted(name: str, view: View) -> Corrector:
+def fitted(name: str, view: FeatureView) -> Corrector:
     """A corrector whose normaliser has seen one view."""
     torch.manual_seed(0)
     corrector, found = Corrector(PRESETS[name]), {}
@@ -81,9 +81,9 @@ def fitted(name: str, view: View) -> Corrector:
         (NODE_FEATURES, config.node_features), (EDGE_FEATURES, config.edge_features),
     ):  # fmt: skip
         for feature, values in features.values(table, names, view).items():
-            found[feature] = Moments()
+            found[feature] = RunningMoments()
             found[feature].add(values)
-    target, averages, shapes, steps = (Moments() for _ in range(4))
+    target, averages, shapes, steps = (RunningMoments() for _ in range(4))
     target.add(torch.ones(1, 1))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
@@ -100,12 +100,12 @@ def measure(name: str, body: str, threads: int, calls: int, warm: int) -> dict[s
     torch.set_num_threads(threads)
     numba.set_num_threads(threads)
     bodies, step = sample(BODIES[body])
-    corrector = fitted(name, View(bodies, step))
+    corrector = fitted(name, FeatureView(bodies, step))
     n, e = len(bodies.rest), bodies.edge_index.shape[1]
     with torch.no_grad():
-        nodes, edges = (x.float() for x in corrector.inputs(View(bodies, step)))
+        nodes, edges = (x.float() for x in corrector.inputs(FeatureView(bodies, step)))
         taken: dict[str, Callable[[], object]] = {
-            "features_ms": lambda: corrector.inputs(View(bodies, step)),
+            "features_ms": lambda: corrector.inputs(FeatureView(bodies, step)),
             "network_ms": lambda: corrector.network(nodes, edges, bodies.edge_index),
             "call_ms": lambda: corrector(bodies, step),
         }
@@ -114,7 +114,7 @@ def measure(name: str, body: str, threads: int, calls: int, warm: int) -> dict[s
             taken |= {
                 "compiled_features_ms": lambda: compiled.features(step),
                 "compiled_network_ms": lambda: compiled.network(),
-                "compiled_ms": lambda: compiled.of_view(View(bodies, step)),
+                "compiled_ms": lambda: compiled.of_view(FeatureView(bodies, step)),
             }
         times = {key: timed(function, calls, warm) for key, function in taken.items()}
     times |= steps(corrector, body, step, calls, warm)
@@ -168,8 +168,7 @@ def timed(function: Callable[[], object], calls: int, warm: int) -> tuple[float,
 
 
 def main() -> None:
-    """Measure and write JSON."""
-    paths = [argument for argument in sys.argv[1:] if argument != "--quick"]
+    """Measure; `--quick` writes nothing."""
     quick = "--quick" in sys.argv
     calls, warm = (3, 1) if quick else (30, 3)
     rows = [
@@ -178,15 +177,8 @@ def main() -> None:
         for body in BODIES
         for threads in (1, 2)
     ]
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": "python benchmarks/corrector.py" + (" --quick" if quick else ""),
-        "environment": environment(),
-        "results": rows,
-    }
-    path = Path(paths[0]) if paths else Path("corrector.json")
-    path.write_text(json.dumps(record, indent=2) + "\n")
-    print(f"wrote {path}")
+    if not quick:
+        add("corrector", rows)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How far the error estimate of a step is from its error, on a slender beam, by tolerance.
 
-    python benchmarks/estimates.py [results.json]
+    python benchmarks/estimates.py
 
 A beam of 100 x 1 x 1 cells of 0.02 m, Poisson's ratio 0.49, held at one end, falling under its
 weight by steps of 0.1 s, with ten Young's moduli about 10 MPa, three steps each: estimate over
@@ -9,16 +9,12 @@ distance from Newton's answer at 1e-11 cells, and that distance over the toleran
 
 from __future__ import annotations
 
-import json
-import sys
-import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from machine_file import add
 
 import pdcorrect as pc
-from pdcorrect.environment import environment
 from pdcorrect.metrics import largest_error
 
 MODULI = [1e7 * (1.0 + 0.013 * k) for k in range(10)]
@@ -78,17 +74,8 @@ def summary(rows: list[dict[str, float]]) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Measure all and print JSON."""
-    record = {
-        "command": "python benchmarks/estimates.py results.json",
-        "date": time.strftime("%Y-%m-%d"),
-        "environment": environment(),
-        "results": summary([row for young in MODULI for row in measured(young)]),
-    }
-    text = json.dumps(record, indent=1)
-    print(text)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(text + "\n", encoding="utf-8")
+    """Measure all."""
+    add("estimates", summary([row for young in MODULI for row in measured(young)]))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Simulations a minute by one worker and by several, once they have started.
 
     python benchmarks/generation.py CONFIG.toml [--device cuda] [--workers 1 2] [--batch 60]
-        [--units 4] [--results generation.json]
+        [--units 4]
 
 Each number of workers begins with a batch each of other loads and meshes, which does not count:
 it loads and compiles what they need.  Then they generate ``units`` batches from training meshes
@@ -17,10 +17,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pdcorrect.data.config import DatasetConfig, Split
+from machine_file import add
+
+from pdcorrect.data.configuration import DatasetConfig, Split
 from pdcorrect.data.generate import generate
 from pdcorrect.data.workers import Workers, local_cluster
-from pdcorrect.environment import environment
 
 
 def measure(config: DatasetConfig, workers: Workers, units: int) -> dict[str, Any]:
@@ -64,30 +65,22 @@ def _gpus() -> list[str]:
 
 
 def main() -> None:
-    """Measure and write JSON."""
+    """Measure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("config", type=Path)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--batch", type=int, default=60)
     parser.add_argument("--units", type=int, default=4)
-    parser.add_argument("--results", type=Path, default=Path("generation.json"))
     options = parser.parse_args()
     config = DatasetConfig.load(options.config)
     rows = [
         measure(config, Workers(n, None, options.device, options.batch), options.units)
         for n in options.workers
     ]
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "environment": environment(),
-        "device": options.device,
-        "gpus": _gpus() if options.device == "cuda" else [],
-        "dataset": config.name,
-        "batch": options.batch,
-        "runs": rows,
-    }
-    options.results.write_text(json.dumps(record, indent=2) + "\n")
+    gpus = _gpus() if options.device == "cuda" else []
+    more = {"gpus": gpus, "dataset": config.name, "batch": options.batch}
+    add("generation", rows, gpus[0] if gpus else None, **more)
 
 
 if __name__ == "__main__":

@@ -5,18 +5,14 @@
 
 Scenes are the first ones of a data set's split, repeated where a batch is larger; the fine
 mesh is that of its reference.  DATA is its folder, or a configuration, whose scenes are drawn
-then: one load for each of ``--meshes``.  Network and gate count to the corrected step.  Results
-go to ``results/<machine>-hybrid-<model>.json``.  ``--quick`` is one scene and three steps, to
-see that it works.
+then: one load for each of ``--meshes``.  Network and gate count to the corrected step.
+``--quick`` is one scene and three steps, to see that it works.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
-import sys
-import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import cycle, islice
@@ -24,23 +20,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from machine_file import add
 
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Gate
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.rebuild import rebuilt_problems
-from pdcorrect.data.runs import models
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.environment import environment
+from pdcorrect.data.simulate import models, rebuilt_problems
 from pdcorrect.evaluation.candidates import saved_candidates
 from pdcorrect.evaluation.speed import measure_speed
-from pdcorrect.fem.coarse_models import coarse_model
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import Problem, coarse_model, discretise
 from pdcorrect.scene import best_coarse
 
 
@@ -115,28 +109,16 @@ def main() -> None:
             "bodies_refused": refused([coarse for coarse, _ in scenes]),
         })  # fmt: skip
         print(json.dumps(rows[-1], indent=1), flush=True)
-    machine = environment()
-    device = torch.cuda.get_device_name() if chosen.device != "cpu" else machine["processor"]
-    record = {
-        "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", "benchmarks/hybrid.py", *sys.argv[1:]]),
-        "environment": {**machine, "device": device, "torch_threads": torch.get_num_threads()},
-        "model": saved.record(),
-        "data": chosen.data,
-        "distinct_scenes": len(pairs),
-        "recorded": chosen.recorded,
-        "results": rows,
-    }
-    slug = re.sub(r"[^a-z0-9]+", "-", device.lower()).strip("-")
-    folder = Path(__file__).parent / "results"
-    folder.mkdir(exist_ok=True)
-    recorded = "-recorded" if chosen.recorded else ""
-    path = folder / f"{slug}-hybrid-{Path(chosen.model).name}{recorded}.json"
     if chosen.quick:
         print("--quick: no file was written")
         return
-    path.write_text(json.dumps(record, indent=2) + "\n")
-    print(f"wrote {path}")
+    recorded = ", recorded" if chosen.recorded else ""
+    add(
+        f"hybrid {Path(chosen.model).name}{recorded}", rows,
+        torch.cuda.get_device_name() if chosen.device != "cpu" else None,
+        model=saved.record(), data=chosen.data, distinct_scenes=len(pairs),
+        torch_threads=torch.get_num_threads(),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

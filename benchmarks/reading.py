@@ -1,6 +1,6 @@
 """One-step graph samples a second read from a data set, from files and from memory.
 
-    python benchmarks/reading.py [results.json]
+    python benchmarks/reading.py
 
 A synthetic data set in a temporary folder: 20 beams of 43 x 2 x 2 cells (396 nodes, 1 830
 directed edges), 5 simulations of 60 steps each, in batches of 32.  "files" is the first epoch,
@@ -10,8 +10,6 @@ is the best of three epochs after it.  Worker processes persist; each decodes fo
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -19,11 +17,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from machine_file import add
 
-from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
-from pdcorrect.data.sampling import ShardShuffle
+from pdcorrect.data.reader import ShardShuffle, TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
-from pdcorrect.environment import environment
 from pdcorrect.fem.mesh import voxel_mesh
 
 MESHES, SIMULATIONS, STEPS, CELLS, BATCH = 20, 5, 60, (43, 2, 2), 32
@@ -79,7 +76,7 @@ def measure(folder: Path, workers: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the data set, measure, print JSON."""
+    """Write the data set and measure."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -87,16 +84,10 @@ def main() -> None:
             write_shard(folder / "training" / f"mesh-{number:04d}.h5", shard(number))
         sizes = [path.stat().st_size for path in folder.glob("*/*.h5")]
         rows = [measure(folder, workers) for workers in (0, 1, 2)]
-    record = {
-        "environment": environment(),
-        "graphs": MESHES * SIMULATIONS * STEPS,
-        "file_megabytes": round(sum(sizes) / 1e6, 1),
-        "results": rows,
-    }
-    text = json.dumps(record, indent=2)
-    print(text)
-    if len(sys.argv) > 1:
-        Path(sys.argv[1]).write_text(text + "\n")
+    add(
+        "reading", rows,
+        graphs=MESHES * SIMULATIONS * STEPS, file_megabytes=round(sum(sizes) / 1e6, 1),
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 
 import pdcorrect as pc
 from pdcorrect.solvers.first_hessian import TrueHessian
-from pdcorrect.solvers.lbfgs import MinimiserOptions
+from pdcorrect.solvers.minimise import MinimiserOptions
 from pdcorrect.solvers.tangent_solver import TangentFactory
 
 SIZES = ((24, 1), (24, 2), (24, 4), (56, 4))

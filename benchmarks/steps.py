@@ -12,7 +12,7 @@ os.environ["NUMBA_NUM_THREADS"] = sys.argv[1]
 import numpy as np
 
 import pdcorrect as pc
-from pdcorrect.evaluate import make_stepper
+from pdcorrect.evaluation.compare import make_stepper
 
 SCENE = Path(__file__).parent.parent / "examples" / "twisted_cross.toml"
 

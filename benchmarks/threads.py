@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import pdcorrect as pc
-from pdcorrect.evaluate import make_stepper  # sets GOMP_SPINCOUNT
+from pdcorrect.evaluation.compare import make_stepper  # sets GOMP_SPINCOUNT
 from pdcorrect.solvers import implicit
 
 SCENE = Path(__file__).parent.parent / "examples" / "twisted_cross.toml"

@@ -68,7 +68,7 @@ def released() -> Rows:
 def minutes(model: str) -> float:
     """Of training, as all recipes that led to a model ask for."""
     if model in RECIPES:
-        return sum(seconds_of(name) for name in chain(RECIPES[model])) / 60.0
+        return float(sum(map(seconds_of, chain(RECIPES[model])))) / 60.0
     record = read(f"models/{model}/model.json")["record"]
     return float(record["training"]["seconds"]) / 60.0
 

@@ -18,6 +18,7 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+import benchmark_tables
 import model_tables
 import page_tables
 from records import RECORDS, ROOT, Rows, number, read
@@ -60,6 +61,7 @@ def _millimetres(metres: float | None, reference: bool) -> str:
 TABLES: dict[str, Callable[[], Rows]] = {
     "demo": demo,
     **dict(model_tables.tables()),
+    **dict(benchmark_tables.tables()),
     **dict(page_tables.tables()),
 }
 

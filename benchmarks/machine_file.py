@@ -1,0 +1,73 @@
+"""One record a machine, ``results/MACHINE.json``: each case with when and how it ran."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from pdcorrect._environment import environment
+
+RESULTS = Path(__file__).parent / "results"
+DIGITS = 5
+"""Significant digits that are kept."""
+
+
+def add(name: str, results: Any, device: str | None = None, **more: Any) -> None:
+    """Put a case's results into the machine's record in place of its earlier ones.
+
+    Parameters
+    ----------
+    name : str
+        Of the case.
+    results : list or dict
+        Rows, or rows by name.
+    device : str, optional
+        The GPU that was measured, after which the record is called; else it is the processor.
+    **more
+        Written beside the results.
+    """
+    machine = environment()
+    label = device or f"{machine['processor']} {machine['cores']}cores"
+    path = RESULTS / (re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") + ".json")
+    record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    script = Path(sys.argv[0]).name
+    record[name] = {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": " ".join(["python", f"benchmarks/{script}", *sys.argv[1:]]),
+        "environment": machine | ({} if device is None else {"device": device}),
+        **more,
+        "results": results,
+    }
+    RESULTS.mkdir(exist_ok=True)
+    path.write_text(text(record), encoding="utf-8")
+    print(f"wrote {path}")
+
+
+def text(record: Any, depth: int = 0) -> str:
+    """JSON with a row on a line, numbers rounded."""
+    record = _rounded(record)
+    end = "\n" if depth == 0 else ""
+    inside, outside = " " * (depth + 1), " " * depth
+    if depth < 3 and isinstance(record, dict) and any(_holds(x) for x in record.values()):
+        items = [f"{inside}{json.dumps(k)}: {text(x, depth + 1)}" for k, x in record.items()]
+        return "{\n" + ",\n".join(items) + f"\n{outside}}}{end}"
+    if depth < 4 and isinstance(record, list) and any(_holds(x) for x in record):
+        rows = [f"{inside}{json.dumps(row)}" for row in record]
+        return "[\n" + ",\n".join(rows) + f"\n{outside}]{end}"
+    return json.dumps(record) + end
+
+
+def _holds(value: Any) -> bool:
+    return isinstance(value, (dict, list))
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return [_rounded(item) for item in value] if isinstance(value, (list, tuple)) else value
