@@ -21,7 +21,7 @@ def runs() -> dict[str, pc.Trajectory]:
     steppers = {
         "coarse": pc.ProjectiveDynamics(pc.discretise(scene)),
         "best coarse": pc.ProjectiveDynamics(pc.discretise(best)),
-        "corrected": pc.hybrid_of(scene, ROOT / "models" / "torsion-exact", gate=pc.Gate()),
+        "corrected": pc.hybrid_of(scene, ROOT / "models" / "torsion-exact"),
         "fine": pc.ProjectiveDynamics(pc.discretise(best, refine=4)),
     }
     return {name: pc.rollout(stepper) for name, stepper in steppers.items()}
