@@ -7,6 +7,7 @@ prints a line for each run, and writes ``hook.json``, ``hook.png``, ``hook_hybri
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -45,6 +46,7 @@ def main(
     refused = int(runs["hybrid"].stats["refused"].sum())
     print(f"{refused} of {len(runs['hybrid'])} corrections refused")
     record = {"rows": rows, "refused": refused, "frames": len(runs["hybrid"])}
+    record |= {"load": os.getloadavg()[0], "cores": os.cpu_count()}  # of the machine, last minute
     record |= {name: judged(folder / name) for name in ("before", "after")}
     (folder / "hook.json").write_text(json.dumps(record, indent=1) + "\n")
     drawn = ("plain", "best coarse", "hybrid")
