@@ -7,11 +7,12 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam
+from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_bodies import BatchBodies
-from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, View
-from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
+from pdcorrect.corrector.model_io import ModelRecord, save_model
+from pdcorrect.corrector.normaliser import RunningMoments
 
 PLACEMENTS = ("state", "force", "guess")
 TORSION = {"kind": "torsion", "strength": 3e3, "stretch": 0.01}
@@ -55,18 +56,18 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
     torch.manual_seed(seed)
     corrector = kind(config).double()
     nodes, states = _plain_run(scenes, steps)
-    moments = {name: Moments() for name in corrector.normaliser.names}
+    moments = {name: RunningMoments() for name in corrector.normaliser.names}
     views = []
     for state, after in itertools.pairwise(states):
         coarse = after.positions if config.placement == "state" else None
-        views.append(View(nodes.graph, nodes.snapshot(state, coarse, None)))
+        views.append(FeatureView(nodes.graph, nodes.snapshot(state, coarse, None)))
         for table, names in (
             (NODE_FEATURES, config.node_features),
             (EDGE_FEATURES, config.edge_features),
         ):
             for name in names:
                 moments[name].add(table[name][1](views[-1]))
-    target, averages, shapes, lengths = (Moments() for _ in range(4))
+    target, averages, shapes, lengths = (RunningMoments() for _ in range(4))
     target.add(torch.full((4, 1), size))
     corrector.normaliser.fit(moments, target)
     for view in views:
@@ -103,6 +104,17 @@ def _contents(problem):
         problem.free, clamps.rest, materials.young, materials.poisson, materials.density,
     )  # fmt: skip
     return (problem.scene.to_toml(), *(a.tobytes() for a in arrays))
+
+
+def saved(folder, scenes, base="plain", **changes):
+    """A fitted corrector on disk, as trained on some coarse model; its folder."""
+    corrector = fitted(scenes, **changes)
+    corrector.network.float()
+    return save_model(
+        corrector,
+        folder,
+        record=ModelRecord(dataset="none", dataset_hash="", training={"base": base}),
+    )
 
 
 def silent(corrector):

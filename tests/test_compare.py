@@ -1,9 +1,8 @@
-"""What `compare` shows: the best coarse model, its reference, refused correctors, VTU files."""
+"""`compare`: its cases, their reference, what fails or is refused, and what it writes."""
 
 import csv
 import dataclasses
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -12,23 +11,32 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from conftest import beam
+from conftest import beam, cross
+from hybrid_samples import problems, saved
+from pdcorrect.cli import common as cli
 from pdcorrect.cli import compare as compare_cli
-from pdcorrect.cli import main as cli
-from pdcorrect.evaluation import refusal_text
-from pdcorrect.evaluation import run_text
-from pdcorrect.evaluation import report
-from pdcorrect.evaluation.comparison_cases import HEX27, cases_for, without_best
+from pdcorrect.corrector.gate import Reason
 from pdcorrect.errors import InputError
+from pdcorrect.evaluation import compare as evaluate
+from pdcorrect.evaluation import report
+from pdcorrect.evaluation.compare import CASES, Case, case_stepper, cases_with
+from pdcorrect.evaluation.comparison_cases import HEX27, cases_for, without_best
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-MODEL = "torsion-exact-compact"
+MODEL = "torsion-exact"
 
 
 @pytest.fixture
 def thick():
     """A small beam that is nowhere one cell thick."""
     return beam((3, 2, 2), time={"frames": 2})
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(beam((4, 2, 1), time={"frames": 4}).to_toml(), encoding="utf-8")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -56,41 +64,35 @@ def test_the_best_coarse_model_is_always_there_and_the_reference_has_its_element
     assert row.rms_error == pytest.approx(pc.metrics.rms_error(own, by_hand), rel=1e-9)
     assert row.rms_error < 0.5 * found.rows[0].rms_error
     assert found.rows[0].omega == 0.0  # the zero is the scene's own coarse run
-    told = " ".join(report.notes(found))
-    assert "is not the truth: it is the scene with each cell cut 4×4×4" in told
-    assert "best coarse PD: element hex8-bubble-mean, mass averaged, as the reference" in told
+    notes = report.notes(found)
+    assert 3 <= len(notes) <= 6
+    (other,) = [note for note in notes if "hex8," in note]
+    assert "coarse Newton, intermediate PD" in other  # unlike the reference
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    "changes",
     [
-        ({"solver": {"element": "hex8-bubble-mean", "mass": "averaged"}}, "are those of the best"),
-        ({"solver": {"element": "hex27"}}, "27-node elements"),
-        ({"material": {"energy": "volume-only"}}, "nothing resists"),
+        {"solver": {"element": "hex8-bubble-mean", "mass": "averaged"}},
+        {"solver": {"element": "hex27"}},
+        {"material": {"energy": "volume-only"}},
     ],
 )
-def test_scenes_without_a_best_coarse_model_say_why(thick, changes, words):
+def test_scenes_without_a_best_coarse_model_say_why(thick, changes):
     scene = thick.with_changes(**changes)
-    assert words in without_best(scene)
-    assert cases_for(scene) == pc.evaluate.CASES
-    (found,) = [
-        note
-        for note in report.notes(pc.compare(scene, 1, pc.evaluate.CASES[2:3]))
-        if "no row of the best coarse model" in note
-    ]
-    assert words in found
-
-
-def test_the_same_element_with_another_mass_is_another_model(thick):
-    scene = thick.with_changes(solver={"element": "hex8-bubble-mean"})
-    assert without_best(scene) is None
-    assert "best coarse PD" in labels(cases_for(scene))
+    why = without_best(scene)
+    assert cases_for(scene) == CASES
+    notes = report.notes(pc.compare(scene, 1, CASES[2:3]))
+    assert any(why in note for note in notes)
+    other = thick.with_changes(solver={"element": "hex8-bubble-mean"})  # of another mass
+    assert without_best(other) is None
+    assert "best coarse PD" in labels(cases_for(other))
 
 
 def test_27_node_elements_are_measured_on_the_coarse_nodes(program, thick, tmp_path):
     (tmp_path / "scene.toml").write_text(thick.to_toml())
     arguments = ("-o", tmp_path / "r", "--hex27", "--no-figures")
-    status, out, _ = program("compare", tmp_path / "scene.toml", *arguments)
+    status, _, _ = program("compare", tmp_path / "scene.toml", *arguments)
     assert status == 0
     rows = {r["label"]: r for r in csv.DictReader((tmp_path / "r" / "report.csv").open())}
     assert list(rows)[3] == HEX27.label == "coarse PD, hex27"
@@ -105,7 +107,6 @@ def test_27_node_elements_are_measured_on_the_coarse_nodes(program, thick, tmp_p
     error = float(rows[HEX27.label]["rms_error"])
     assert error == pytest.approx(pc.metrics.rms_error(own, fine), rel=1e-9)
     assert error < 0.3 * float(rows["coarse PD"]["rms_error"])
-    assert "it has 175 nodes" in out
     record = json.loads((tmp_path / "r" / "report.json").read_text())
     assert [case["element"] for case in record["cases"]] == [None] * 5 + ["hex27"]
 
@@ -123,7 +124,7 @@ def test_hex27_is_refused_where_it_is_the_scenes_own(program, thick, tmp_path):
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     status, _, err = program("compare", tmp_path / "scene.toml", "-o", tmp_path / "r", "--hex27")
     assert status == cli.BAD_INPUT
-    assert "leave the option out" in err
+    assert "hex27" in err
     assert not (tmp_path / "r").exists()
     with pytest.raises(InputError, match="element 'hex27' with base 'best'"):
         dataclasses.replace(HEX27, base="best").problem(thick)
@@ -137,41 +138,8 @@ def test_models_keep_the_reference_that_they_learned_from(thick):
         "hybrid torsion-as-published", "coarse PD, hex27",
     ]  # fmt: skip
     best = cases_for(thick, [MODEL])
-    assert best == pc.evaluate.cases_with([MODEL])
+    assert best == cases_with([MODEL])
     assert labels(best).count("best coarse PD") == 1
-
-
-def test_errors_from_another_element_than_the_references_are_told(thick):
-    cases = (*pc.evaluate.CASES[:1], *pc.evaluate.CASES[2:3], cases_for(thick)[4])
-    told = " ".join(report.notes(pc.compare(thick, cases=cases)))
-    assert "best coarse PD: element hex8-bubble-mean, mass averaged, unlike the reference's" in told
-    assert "(element hex8, mass lumped)" in told
-
-
-def test_rows_unlike_the_reference_are_named_by_element_mass_and_total_mass(thick):
-    told = report.notes(pc.compare(thick))
-    (found,) = [note for note in told if "unlike the reference's" in note]
-    assert found.startswith(
-        "coarse PD, coarse Newton, intermediate PD: element hex8, mass lumped, unlike the "
-        "reference's (element hex8-bubble-mean, mass averaged, total mass 0.096 kg)"
-    )
-    assert any("is the mesh's, the element's and the mass's." in note for note in told)
-
-
-def test_rows_of_another_total_mass_and_the_row_of_the_right_one_are_told(thick):
-    heavy = thick.with_changes(solver={"mass": "per-node"})
-    right = dataclasses.replace(
-        pc.evaluate.CASES[2], label="coarse PD, total mass", base="total-mass"
-    )
-    cases = (*pc.evaluate.CASES[:1], *pc.evaluate.CASES[2:], right)
-    told = report.notes(pc.compare(heavy, cases=cases))
-    (unlike,) = [note for note in told if "unlike the reference's" in note]
-    assert unlike.startswith("coarse PD, coarse Newton: element hex8, mass per-node, total mass 0.")
-    assert any("is the mesh's and the total mass's." in note for note in told)
-    (what,) = [note for note in told if note.startswith("coarse PD, total mass: ")]
-    assert what.endswith("By the mass rule per-node a mesh is the heavier the coarser it is.")
-    told = " ".join(report.notes(pc.compare(thick, cases=cases)))
-    assert "By the mass rule lumped meshes have one mass, so it changes nothing" in told
 
 
 @pytest.mark.parametrize(
@@ -185,9 +153,9 @@ def test_rows_of_another_total_mass_and_the_row_of_the_right_one_are_told(thick)
 )
 def test_a_case_does_not_ignore_what_its_corrector_is_not_for(thick, changes, words):
     pytest.importorskip("torch_geometric")
-    case = pc.evaluate.Case("odd", "pd", 1, "best", MODEL)
+    case = Case("odd", "pd", 1, "best", MODEL)
     with pytest.raises(InputError, match=f"odd: {words}"):
-        pc.evaluate.case_stepper(thick, dataclasses.replace(case, **changes))
+        case_stepper(thick, dataclasses.replace(case, **changes))
 
 
 def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once(
@@ -198,108 +166,43 @@ def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once
     arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
     status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
     assert status == cli.BAD_INPUT
-    assert f"model {MODEL}: corrects the best coarse model, and this scene has none: it has" in err
+    assert f"model {MODEL}: " in err
     assert not (tmp_path / "r").exists()
     own = pc.best_coarse(thick)  # has none beside its own, which is as good
     assert labels(cases_for(own, [MODEL]))[-1] == f"hybrid {MODEL}"
 
 
-def test_a_foreign_integrator_is_told_of_in_the_notes(stiff):
-    pytest.importorskip("torch_geometric")
-    scene = stiff.with_changes(time={"integrator": "midpoint"})
-    cases = cases_for(scene, [MODEL])[4:]
-    (found,) = [n for n in report.notes(pc.compare(scene, 1, cases)) if "has never seen" in n]
-    assert "trained on steps by backward-euler, and the scene's integrator is midpoint" in found
-    assert not any("has never seen" in n for n in report.notes(pc.compare(stiff, 1, cases)))
-
-
 def test_large_numbers_have_no_powers_of_ten():
-    assert [run_text.three_digits(x) for x in (0.01234, 999.4, 999.6, 12345.6)] == [
+    assert [report.three_digits(x) for x in (0.01234, 999.4, 999.6, 12345.6)] == [
         "0.0123", "999", "1000", "12346"
     ]  # fmt: skip
 
 
-def test_a_row_whose_corrections_are_all_refused_says_so(stiff, tmp_path):
+def test_a_row_whose_corrections_are_all_refused_is_the_base_and_says_so(stiff, tmp_path):
     pytest.importorskip("torch_geometric")
     coarse, hybrid = cases_for(stiff, [MODEL])[4:]
     found = pc.compare(stiff, cases=(coarse, hybrid))
+    assert found.rows[1].refused_frames == 2
     name = f"hybrid {MODEL} (all refused)"
     assert [line[0] for line in report.table(found)] == ["best coarse PD", name]
-    text = report.write_report(found, tmp_path, draw=False).read_text()
-    assert f"| {name} |" in text
-    assert f"- hybrid {MODEL} is no corrected run" in text
-    assert f"- hybrid {MODEL}: inputs (docs/corrector.md#graph-and-features) outside of" in text
-    assert "in frame 1, in deviations of which the gate allows 1: stiffness by 7.11" in text
-    assert ": stiffness by 7.11 at 100 % of the nodes" in text
-    assert f"{refusal_text.PAGE}#{refusal_text.SECTIONS['features']}" in text
+    assert any(f"{hybrid.label} " in note and "2 of 2" in note for note in report.notes(found))
+    assert f"| {name} |" in report.write_report(found, tmp_path, draw=False).read_text()
     np.testing.assert_array_equal(
         found.runs[hybrid.label].positions, found.runs["best coarse PD"].positions
     )
+    for count, label in ((1, f"{hybrid.label} (1 of 2 refused)"), (0, hybrid.label)):
+        fewer = (found.rows[0], dataclasses.replace(found.rows[1], refused_frames=count))
+        assert report.table(dataclasses.replace(found, rows=fewer))[1][0] == label
+    open_ = pc.compare(stiff, cases=cases_with([MODEL], gate=False)[-1:])
+    assert (open_.rows[0].label, open_.rows[0].refused_frames) == (f"{hybrid.label}, no gate", 0)
 
 
-def test_some_refused_corrections_are_counted_beside_the_label(stiff):
-    pytest.importorskip("torch_geometric")
-    found = pc.compare(stiff, cases=cases_for(stiff, [MODEL])[5:])
-    (label,) = found.runs
-    run = found.runs[label]
-    stats = {**run.stats, "refused": np.array([1.0, 0.0]), "gate": np.array([6.0, 0.0])}
-    fewer = dataclasses.replace(
-        found,
-        rows=(dataclasses.replace(found.rows[0], refused_frames=1),),
-        runs={label: dataclasses.replace(run, stats=stats)},
-    )
-    assert report.table(fewer)[0][0] == f"{label} (1 of 2 refused)"
-    told = report.notes(fewer)
-    assert f"{label}: 1 of 2 corrections were refused by the gate (1 by body)." in told
-    assert not any("no corrected run" in note for note in told)
-    none = dataclasses.replace(fewer, rows=(dataclasses.replace(found.rows[0], refused_frames=0),))
-    assert report.table(none)[0][0] == label
-
-
-def test_another_time_step_is_told_beside_that_of_the_training(stiff):
-    pytest.importorskip("torch_geometric")
-    scene = stiff.with_changes(time={"step": 2.0 * stiff.time.step})
-    found = pc.compare(scene, 2, cases=cases_for(scene, [MODEL])[4:])
-    label = f"hybrid {MODEL}"
-    told = report.notes(found)
-    assert f"{label}: 2 of 2 corrections were refused by the gate (2 by time step)." in told
-    assert any(note.startswith(f"{label} is no corrected run") for note in told)
-    (step,) = [note for note in told if note.startswith(f"{label}: the time step per cell size")]
-    assert "is 2.0 times that of the training: 0.02 s, where the training has 0.01 s" in step
-    (way,) = [note for note in told if note.startswith(f"{label}: expected")]
-    link = f"{refusal_text.PAGE}#{refusal_text.SECTIONS['time step']}"
-    assert f"expected a time step of 0.01 s ({link}); or, at your own risk, a gate" in way
-    assert "without this bound, Gate(time_step=None), or none (--no-gate)." in way
-    assert not any("that of the training" in n for n in report.notes(pc.compare(
-        stiff, 1, cases=cases_for(stiff, [MODEL])[4:])))  # fmt: skip
-
-
-def test_another_time_step_is_told_of_a_foreign_body_too(thick):
-    pytest.importorskip("torch_geometric")
-    scene = thick.with_changes(time={"step": 0.02})
-    for gate, count in ((True, 1), (False, 0)):
-        cases = pc.evaluate.cases_with([MODEL], gate=gate)[-1:]
-        found = pc.compare(scene, 2, cases=cases)
-        told = report.notes(found)
-        label = cases[0].label
-        both = f"{label}: 2 of 2 corrections were refused by the gate (2 by body and time step)."
-        assert told.count(both) == count
-        assert sum(note.startswith(f"{label}: measures of the body") for note in told) == count
-        assert sum(": the time step per cell size is 5.0 times" in note for note in told) == count
-        assert sum("Gate(body=None, time_step=None)" in note for note in told) == count
-
-
-def test_of_two_models_that_refuse_the_same_it_is_told_once(thick, tmp_path):
-    pytest.importorskip("torch_geometric")
-    for name in ("one", "two"):
-        shutil.copytree(EXAMPLES.parent / "models" / MODEL, tmp_path / name)
-    cases = pc.evaluate.cases_with([str(tmp_path / name) for name in ("one", "two")])[-2:]
-    told = report.notes(pc.compare(thick.with_changes(time={"step": 0.02}), 1, cases=cases))
-    names = "hybrid one, hybrid two: "
-    for words in ("measures of the body", "the time step per cell size", "expected a body"):
-        assert [note for note in told if words in note] == [
-            note for note in told if note.startswith(names + words)
-        ]
+def test_refused_corrections_are_told_with_their_numbers_and_meanings():
+    body, pause = Reason.BODY, Reason.PAUSE
+    assert report.refused_corrections([]) == report.refused_corrections([0.0, 0.0]) == ""
+    told = report.refused_corrections([0.0, body, pause, body])
+    assert "3 of 4" in told
+    assert told.index(f"2 because {body.meaning}") < told.index(f"1 because {pause.meaning}")
 
 
 def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
@@ -323,17 +226,10 @@ def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
 
 
 def test_labels_that_become_one_file_name_are_told_apart(thick, tmp_path):
-    case = pc.evaluate.CASES[2]
+    case = CASES[2]
     other = dataclasses.replace(case, label="coarse, PD")
     written = report.write_series(pc.compare(thick, 1, (case, other)), tmp_path)
     assert [path.name for path in written] == ["coarse-pd.pvd", "coarse-pd-again.pvd"]
-
-
-def test_no_gate_without_a_model_is_refused(program, thick, tmp_path):
-    (tmp_path / "scene.toml").write_text(thick.to_toml())
-    status, _, err = program("compare", tmp_path / "scene.toml", "-o", tmp_path / "r", "--no-gate")
-    assert status == cli.BAD_INPUT
-    assert "--no-gate without --model" in err
 
 
 def test_compare_with_a_model_and_no_torch_names_the_extra(program, thick, tmp_path, monkeypatch):
@@ -342,24 +238,8 @@ def test_compare_with_a_model_and_no_torch_names_the_extra(program, thick, tmp_p
     arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
     status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
     assert status == cli.BAD_INPUT
-    assert "pip install 'pdcorrect[learn]'" in err
+    assert "pdcorrect[learn]" in err
     assert not (tmp_path / "r").exists()
-
-
-def test_a_long_legend_stays_in_the_picture(tmp_path, monkeypatch):
-    pytest.importorskip("matplotlib")
-    from pdcorrect.figures import curves
-
-    seen = []
-    monkeypatch.setattr(curves, "_save", lambda figure, output: seen.append(figure))
-    times = np.linspace(0.0, 1.0, 3)
-    names = [f"hybrid of a model with a long name, number {k} (all refused)" for k in range(6)]
-    curves.plot_error_over_time(dict.fromkeys(names, times), times, tmp_path / "a.png")
-    curves.plot_error_over_time({name[:6] + name[-15:]: times for name in names}, times, "b.png")
-    for figure in seen:
-        (legend,) = figure.legends
-        assert legend.get_window_extent().width <= figure.bbox.width
-        assert len(figure.legends) == 1
 
 
 @pytest.mark.parametrize("length", [20, 60, 160])
@@ -387,9 +267,9 @@ def test_no_text_of_a_plot_leaves_it_and_axes_keep_their_height(tmp_path, monkey
 
 
 def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkeypatch, capsys):
-    label = "hybrid torsion-as-published-total-mass"
-    case = dataclasses.replace(pc.evaluate.CASES[2], label=label)
-    found = pc.compare(thick, 1, (pc.evaluate.CASES[2], case))
+    label = "hybrid torsion-as-published-other-mass"
+    case = dataclasses.replace(CASES[2], label=label)
+    found = pc.compare(thick, 1, (CASES[2], case))
     slow = [dataclasses.replace(row, seconds_a_frame=1.2346) for row in found.rows]
     found = dataclasses.replace(found, rows=tuple(slow))
     monkeypatch.setenv("COLUMNS", "78")
@@ -408,53 +288,214 @@ def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkey
     assert " ".join(folded).replace("- ", "-") == label
 
 
-def test_refused_corrections_stand_above_a_body(stiff):
-    pytest.importorskip("torch_geometric")
-    found = pc.compare(stiff, cases=cases_for(stiff, [MODEL])[5:])
-    (row,) = found.rows
-    slow = dataclasses.replace(row, seconds_a_frame=12.3456)
-    first, second, third = report._panel_label(found, slow).splitlines()
-    assert first == f"hybrid {MODEL}, {row.nodes} nodes"
-    assert second == "reference, 12346 ms a frame"
-    assert third == "all refused"
-    without = dataclasses.replace(row, refused_frames=0)
-    assert len(report._panel_label(found, without).splitlines()) == 2
-
-
-def test_a_vtu_folder_that_cannot_be_made_ends_the_program_before_its_work(
-    program, thick, tmp_path, monkeypatch
-):
-    (tmp_path / "scene.toml").write_text(thick.to_toml())
-    (tmp_path / "r").mkdir()
-    (tmp_path / "r" / "vtu").write_text("")
-    monkeypatch.setattr(pc.evaluate, "case_stepper", None)  # what works raises TypeError
-    arguments = ("-o", tmp_path / "r", "--vtu", "--no-figures")
-    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
-    assert status == cli.FAILED
-    assert "vtu: is a file: expected a folder" in err
-    path, blocked = tmp_path / "run.h5", tmp_path / "r" / "vtu"
-    status, _, err = program("simulate", tmp_path / "scene.toml", "-o", path, "--vtu", blocked)
-    assert status == cli.FAILED
-    assert "vtu: is a file: expected a folder" in err
-    assert not path.exists()
-
-
 def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_path):
-    first = pc.compare(thick, 1, pc.evaluate.CASES[1:3])
+    first = pc.compare(thick, 1, CASES[1:3])
     report.write_series(first, tmp_path)
     (tmp_path / "vtu" / "mine.vtu").write_text("")
-    second = pc.compare(thick, 1, pc.evaluate.CASES[2:3])
+    second = pc.compare(thick, 1, CASES[2:3])
     report.write_series(second, tmp_path)
     assert {path.name for path in (tmp_path / "vtu").iterdir()} == {
         "coarse-pd.pvd", "coarse-pd_0000.vtu", "coarse-pd_0001.vtu", "mine.vtu"
     }  # fmt: skip
     (tmp_path / "scene.toml").write_text(thick.to_toml())
     command = ("compare", tmp_path / "scene.toml", "--frames", 1, "--no-figures", "-o")
-    assert "is of an earlier run" in program(*command, tmp_path)[1]
-    assert "is of an earlier run" not in program(*command, tmp_path / "new")[1]
+    assert f"{tmp_path / 'vtu'} " in program(*command, tmp_path)[1]
+    assert "vtu" not in program(*command, tmp_path / "new")[1]
 
 
-def test_notes_name_the_solvers_rest_beside_two_plain_coarse_cases(thick):
-    again = dataclasses.replace(pc.evaluate.CASES[2], label="coarse PD again")
-    found = pc.compare(thick, 2, (*pc.evaluate.CASES[1:], again))
-    assert any("the rest of their error is" in note for note in report.notes(found))
+# --- correctors --------------------------------------------------------------------------
+
+
+def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program, tmp_path):
+    pytest.importorskip("torch_geometric")
+    scene, folder = EXAMPLES / "unseen_cross.toml", tmp_path / "report"
+    command = ("compare", scene, "-o", folder, "--frames", 6, "--no-figures")
+    assert program(*command, "--model", MODEL)[0] == 0
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    coarse = ["coarse PD", "coarse Newton", "best coarse PD", f"hybrid {MODEL}"]
+    assert list(rows) == [*coarse, "intermediate PD", "fine best PD"]
+    errors = [float(rows[name]["rms_error"]) for name in coarse]
+    assert errors[3] < 0.5 * errors[2] < 0.5 * errors[0]
+    assert [rows[name]["refused_frames"] for name in coarse] == ["", "", "", "0"]
+    assert rows[coarse[3]]["solver"] == "hybrid"
+    record = json.loads((folder / "report.json").read_text())
+    about = record["models"][coarse[3]]
+    assert (about["base"], about["dataset"].split("+")[0]) == ("best", MODEL)
+    assert any(coarse[3] in note for note in record["notes"])
+
+
+def test_correctors_share_the_reference_of_their_base(tmp_path):
+    pytest.importorskip("torch_geometric")
+    plain = cases_with(["torsion-as-published"])
+    assert plain[:-1] == CASES
+    assert (plain[-1].label, plain[-1].base) == ("hybrid torsion-as-published", "plain")
+    scenes = problems((3, 1, 1))
+    heavy = [str(saved(tmp_path / name, scenes, base="total-mass")) for name in ("one", "two")]
+    cases = cases_with(["torsion-as-published", *heavy])
+    assert cases[:4] == CASES
+    assert [case.base for case in cases[4:]] == ["total-mass", "plain", "total-mass", "total-mass"]
+    assert cases[4].label == "coarse PD, total mass"
+    with pytest.raises(InputError, match="best, plain"):
+        cases_with([MODEL, "torsion-as-published"])
+
+
+def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tmp_path):
+    pytest.importorskip("torch_geometric")
+    models = [str(saved(tmp_path / name / "model", problems((3, 1, 1)))) for name in ("one", "two")]
+    assert labels(cases_with(models))[-2:] == ["hybrid one/model", "hybrid two/model"]
+    with pytest.raises(InputError, match="coarse PD, coarse PD"):
+        pc.compare(beam((2, 1, 1)), cases=CASES[2:3] * 2)
+
+
+def test_a_base_is_known_and_on_a_mesh_that_it_is_for():
+    scene, case = beam((2, 1, 1)), CASES[1]
+    for base in ("total-mass", "worst"):
+        with pytest.raises(InputError, match=f"base '{base}' refined 2 times"):
+            dataclasses.replace(case, base=base).problem(scene)
+    with pytest.raises(InputError, match="base 'worst'"):
+        dataclasses.replace(case, base="worst", refine=1).problem(scene)
+    assert dataclasses.replace(case, base="best").problem(scene).element == "hex8-bubble"
+
+
+# --- whole reports and what fails --------------------------------------------------------
+
+
+def test_compare_writes_its_report(program, tmp_path):
+    scene = tmp_path / "cross.toml"
+    scene.write_text(cross(0.4, solver={"tolerance": 1e-4}).to_toml())
+    folder = tmp_path / "report"
+    status, out, _ = program("compare", scene, "-o", folder, "--frames", 3)
+    assert status == 0
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    best = ["best coarse PD", "intermediate PD", "fine best PD"]
+    assert list(rows) == ["coarse PD", "coarse Newton", *best]
+    assert float(rows["fine best PD"]["rms_error"]) == 0
+    errors = [float(rows[k]["rms_error"]) for k in ("coarse PD", "intermediate PD")]
+    assert errors[0] > 2 * errors[1] > 0
+    assert float(rows["coarse PD"]["omega"]) == 0
+    assert float(rows["intermediate PD"]["omega"]) == pytest.approx(
+        100 * (1 - (errors[1] / errors[0]) ** 2)
+    )
+    record = json.loads((folder / "report.json").read_text())
+    assert 0 < record["solver_error"] < 1e-2 * errors[0]
+    assert all(row["unusual_frames"] == 0 for row in record["rows"])
+    assert record["environment"]["threads"]
+    text = (folder / "report.md").read_text()
+    for name in ("comparison.png", "overlay.png", "node.png", "energy.png", "error_over_time.png"):
+        assert f"]({name})" in text
+        assert (folder / name).stat().st_size > 5000
+    for label in rows:
+        assert label in out
+        assert f"| {label} |" in text
+
+
+def failing_after_a_step(monkeypatch, kind, nodes, element="hex8"):
+    """Have steppers of a class fail in their second step on such meshes."""
+    step = kind.__call__
+
+    def fails_second(self, state, *others, **named):
+        result = step(self, state, *others, **named)
+        fails = len(state.positions) in nodes and self.problem.element == element
+        if fails and state.time > 0.0:
+            return dataclasses.replace(result, status=pc.Status.ITERATION_LIMIT)
+        return result
+
+    monkeypatch.setattr(kind, "__call__", fails_second)
+
+
+def nodes_of(scene, refine):
+    return len(pc.discretise(scene, refine).positions)
+
+
+@pytest.mark.parametrize("failing", ["coarse PD", "intermediate PD"])
+def test_compare_goes_on_after_a_case_that_fails(
+    program, scene_file, tmp_path, monkeypatch, failing
+):
+    refine = {case.label: case.refine for case in CASES}[failing]
+    nodes = nodes_of(pc.Scene.load(scene_file), refine)
+    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes})
+    folder = tmp_path / "report"
+    status, out, err = program("compare", scene_file, "-o", folder)
+    assert (status, err) == (cli.FAILED, "")
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
+    others = ["coarse PD", "coarse Newton", "best coarse PD", "intermediate PD", "fine best PD"]
+    assert list(rows) == [*(label for label in others if label != failing), failing]
+    assert [row["failure"] != "" for row in rows.values()] == [False] * 4 + [True]
+    record = json.loads((folder / "report.json").read_text())
+    assert list(record["failures"]) == [failing]
+    assert (record["solver_error"] is None) == (failing == "coarse PD")
+    assert f"| {failing} |  | failed |" in (folder / "report.md").read_text()
+    assert f"{failing} failed: frame 2" in " ".join(out.split())
+    assert (folder / "comparison.png").stat().st_size > 5000
+
+
+def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, monkeypatch):
+    nodes = nodes_of(pc.Scene.load(scene_file), 4)
+    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes}, "hex8-bubble")
+    status, _, err = program("compare", scene_file, "-o", tmp_path / "report")
+    assert status == cli.FAILED
+    assert "frame 2 (t = 0.02 s) failed" in err
+    assert not (tmp_path / "report" / "report.md").exists()
+
+
+def test_a_report_of_a_reference_alone_has_no_plots_of_errors(tmp_path, monkeypatch):
+    scene = beam((4, 2, 1), time={"frames": 2})
+    coarse = {nodes_of(scene, refine) for refine in (1, 2)}
+    for kind in (pc.ProjectiveDynamics, pc.Newton):
+        failing_after_a_step(monkeypatch, kind, coarse)
+    found = pc.compare(scene, cases=CASES)
+    assert [row.label for row in found.rows] == ["fine PD"]
+    assert list(found.failures) == ["coarse Newton", "coarse PD", "intermediate PD"]
+    text = report.write_report(found, tmp_path).read_text()
+    assert "](comparison.png)" in text
+    assert "](error_" not in text
+    assert not list(tmp_path.glob("error_*.png"))
+
+
+def test_a_case_that_cannot_be_set_up_has_failed(monkeypatch):
+    scene = beam((2, 1, 1), time={"frames": 1})
+    make = case_stepper
+
+    def refuses(scene, case):
+        if case.solver == "newton":
+            raise pc.errors.ConvergenceError("no factor.")
+        return make(scene, case)
+
+    monkeypatch.setattr(evaluate, "case_stepper", refuses)
+    assert pc.compare(scene).failures == {"coarse Newton": "no factor."}
+
+
+def test_compare_without_figures_needs_no_view_extra(program, scene_file, tmp_path, monkeypatch):
+    for module in ("pyvista", "matplotlib"):
+        monkeypatch.setitem(sys.modules, module, None)
+    status, _, _ = program(
+        "compare", scene_file, "-o", tmp_path / "r", "--frames", 2, "--no-figures"
+    )
+    assert status == 0
+    assert not list((tmp_path / "r").glob("*.png"))
+    status, _, err = program("compare", scene_file, "-o", tmp_path / "r2", "--frames", 2)
+    assert status == cli.BAD_INPUT
+    assert "pdcorrect[view]" in err
+
+
+def test_a_name_that_reads_nan_survives_the_report(tmp_path):
+    scene = beam((2, 1, 1), name="NaN study", time={"frames": 1})
+    comparison = pc.compare(scene, cases=CASES[2:3])
+    record = json.loads(report.to_json(comparison))
+    assert "NaN study" in record["scene"]
+    assert record["rows"][0]["omega"] is None
+    with pytest.raises(InputError, match="cases"):
+        pc.compare(scene, cases=())
+
+
+def test_frames_that_needed_a_fallback_are_reported(monkeypatch):
+    real = pc.Newton.__call__
+    monkeypatch.setattr(
+        pc.Newton,
+        "__call__",
+        lambda self, *args: dataclasses.replace(real(self, *args), status=pc.Status.SUBSTEPPED),
+    )
+    comparison = pc.compare(beam((3, 1, 1), time={"frames": 2}))
+    assert comparison.solver_error is None
+    assert [row.unusual_frames for row in comparison.rows if row.solver == "newton"] == [2]
+    assert any("coarse Newton: 2 frames" in note for note in report.notes(comparison))
