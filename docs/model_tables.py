@@ -68,7 +68,7 @@ def released() -> Rows:
 def minutes(model: str) -> float:
     """Of training, as all recipes that led to a model ask for."""
     if model in RECIPES:
-        return float(sum(map(seconds_of, chain(RECIPES[model])))) / 60.0
+        return sum(map(seconds_of, chain(RECIPES[model]))) / 60.0
     record = read(f"models/{model}/model.json")["record"]
     return float(record["training"]["seconds"]) / 60.0
 
@@ -90,7 +90,7 @@ def chain(name: str) -> list[str]:
 
 
 def seconds_of(name: str) -> float:
-    return sum(stage["seconds"] for stage in recipe_of(name)["stages"])
+    return float(sum(stage["seconds"] for stage in recipe_of(name)["stages"]))
 
 
 def recipes() -> Rows:
