@@ -1,6 +1,6 @@
 """Small data-set configurations for tests."""
 
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 
 FAMILIES = {"torsion": "cross", "impulse": "weight", "stretch": "weight"}
 STRENGTHS = {"torsion": [5.0, 15.0], "impulse": [0.2, 0.6], "stretch": [3.0, 8.0]}

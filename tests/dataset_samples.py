@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import pdcorrect as pc
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
 

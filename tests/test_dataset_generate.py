@@ -15,12 +15,11 @@ import pytest
 
 import pdcorrect as pc
 from dataset_configs import small
+from pdcorrect._files import INTERRUPTED, clear_parts, part_of_process
 from pdcorrect.data import statistics
-from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import generate
-from pdcorrect.data.info import dataset_info
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.produce import make_engines
 from pdcorrect.data.schema import MANIFEST
@@ -28,8 +27,6 @@ from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
-from pdcorrect.cli.common import FileBar, FileLines, progress_bar
-from pdcorrect._files import clear_parts, part_of_process
 
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")
@@ -57,24 +54,6 @@ def generated(tmp_path_factory):
 def test_a_generated_data_set_passes_its_check(generated):
     _, folder = generated
     assert check_dataset(folder) == []
-
-
-def test_its_card_says_what_it_is_and_how_it_fares(generated, tmp_path):
-    _, folder = generated
-    text = dataset_card(folder, dataset_info(folder))
-    manifest = json.loads((folder / MANIFEST).read_text())
-    for words in (
-        "# small-torsion", "72 to 108 nodes", "`exact`", "seed 7", manifest["content_hash"],
-        "| training | `best` |", "| evaluation | `plain` |", "3 frames of 0.01 s",
-    ):  # fmt: skip
-        assert words in text
-    with pytest.raises(InputError, match=r"no config.toml: expected a generated data set"):
-        dataset_card(tmp_path, dataset_info(folder))
-    shutil.copy(folder / "config.toml", tmp_path)
-    with pytest.raises(
-        InputError, match=r"no manifest.json: expected a complete .* generate again"
-    ):
-        dataset_card(tmp_path, dataset_info(folder))
 
 
 def test_its_runs_are_what_a_user_gets_from_the_scene(generated):
@@ -159,7 +138,7 @@ def test_newton_as_reference_agrees_with_pd():
 
 def test_batches_agree_with_one_by_one():
     pytest.importorskip("torch")
-    from pdcorrect.data.batch_engine import Batched
+    from pdcorrect.data.engines import Batched
 
     config = small(frames=2, tolerance=1e-7)
     plans = make_plan(config)[:2]
@@ -206,13 +185,9 @@ def test_a_rejected_load_is_noted_and_drawn_again():
     assert (first.attempt, second.attempt) == (2, 0)
     assert first.rejected == ("reference, step 1: broke",) * 2
     assert first.scene_toml == draw_scene(config, plan, 0, attempt=2).to_toml()
-
-
-def test_loads_that_are_never_accepted_are_an_error():
-    config = small(frames=1, training={"meshes": 1, "simulations": 1})
     engine = Failing(1000)
-    with pytest.raises(ConvergenceError, match="20 loads were drawn and all rejected"):
-        simulate(config, make_plan(config)[:1], Engines(engine, engine, engine))
+    with pytest.raises(ConvergenceError, match="20 loads"):
+        simulate(config, [plan], Engines(engine, engine, engine))
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):
@@ -253,77 +228,29 @@ def test_a_damaged_file_is_made_again_and_a_whole_one_is_not(generated, tmp_path
     assert hashes(tmp_path) == hashes(folder)
 
 
-def test_without_a_terminal_the_program_prints_a_line_for_each_file(program, tmp_path):
-    config = small()
+def test_the_command_prints_a_line_for_each_file_and_says_which_splits_are_complete(
+    program, tmp_path
+):
+    config = small(frames=1)
     path, folder = tmp_path / "set.toml", tmp_path / "set"
     path.write_text(config.to_toml())
-    status, out, _ = program("dataset", "generate", path, "-o", folder)
-    first, *lines, last = out.splitlines()
-    assert status == 0
-    assert first.startswith("0 of 4 simulations are there, computing 4; on first use kernels are")
-    assert last == f"{folder}: complete"
-    for line, plan, done in zip(lines, make_plan(config), (1, 3, 4), strict=True):
-        text = rf"\d+ s: {plan.name}, {done} of 4 simulations, about \d+ s left"
-        assert re.fullmatch(text, line)
-    assert lines[-1].endswith("about 0 s left")
-
-
-def test_the_rest_is_estimated_from_what_was_computed_since_the_start(monkeypatch, capsys):
-    now = 100.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
-    on_file = FileLines()
-    now += 30.0
-    on_file("training/mesh-0007", 90, 120, 10)  # 80 were there before
-    assert capsys.readouterr().out == (
-        "30 s: training/mesh-0007, 90 of 120 simulations, about 90 s left\n"
-    )
-
-
-def test_a_damaged_file_is_named_before_it_is_made_again(capsys):
-    FileLines().begin(2, 4, ["training/mesh-0001"])
-    FileLines().begin(4, 4, [])
-    damaged, rest = capsys.readouterr().out.splitlines()
-    assert damaged == "training/mesh-0001 is damaged: computed again"
-    assert rest.startswith("2 of 4 simulations are there, computing 2; ")
-
-
-def test_on_a_terminal_the_same_is_said_above_a_bar(capsys):
-    bar = progress_bar("simulations", apart=True)
-    shown = FileBar(bar)
-    assert shown.interrupted().startswith("interrupted before anything was computed")
-    with bar:
-        shown.begin(1, 4, ["training/mesh-0001"])
-        shown("training/mesh-0001", 3, 4, 2)
-    (task,) = bar.tasks
-    assert (task.completed, task.total, task.description) == (3, 4, "training/mesh-0001")
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "training/mesh-0001 is damaged: computed again" in err
-    assert "1 of 4 simulations are there, computing 3" in err
-    assert shown.interrupted() == (
-        "interrupted: 3 of 4 simulations are there; the same command goes on"
-    )
-
-
-def test_the_program_says_which_splits_are_complete(program, tmp_path):
-    path, folder = tmp_path / "set.toml", tmp_path / "set"
-    path.write_text(small(frames=1).to_toml())
     command = ("dataset", "generate", path, "-o", folder)
     status, out, _ = program(*command, "--seconds", 0)
     assert status == 1
-    assert out.splitlines()[-1] == (
-        f"{folder}: 0 of 4 simulations are there; the same command goes on"
-    )
+    assert f"{folder}: 0 of 4 simulations" in out.splitlines()[-1]
     status, out, _ = program(*command, "--split", "evaluation")
     assert status == 0
-    assert out.splitlines()[-1] == f"{folder}: evaluation complete; training is still missing"
-    status, out, _ = program(*command, "--split", "evaluation", "--split", "training")
+    assert "evaluation complete" in out.splitlines()[-1]
+    status, out, _ = program(*command)
     assert status == 0
-    assert out.splitlines()[-1] == f"{folder}: complete"
+    _, *lines, last = out.splitlines()
+    assert last == f"{folder}: complete"
+    for line, plan, done in zip(lines, make_plan(config)[:2], (2, 4), strict=True):
+        assert plan.name in line
+        assert f"{done} of 4 simulations" in line
 
 
 def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, monkeypatch):
-    from pdcorrect.cli import main as cli
     from pdcorrect.data import workers as module
 
     real = module.produce
@@ -337,40 +264,42 @@ def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, 
     path = tmp_path / "set.toml"
     path.write_text(small(frames=1).to_toml())
     status, _, err = program("dataset", "generate", path, "-o", tmp_path / "set")
-    assert status == cli.INTERRUPTED
-    assert err == "interrupted: 1 of 4 simulations are there; the same command goes on\n"
+    assert status == INTERRUPTED
+    assert "1 of 4 simulations" in err
 
 
 def test_another_configuration_may_not_use_the_folder(generated):
     _, folder = generated
-    with pytest.raises(
-        InputError, match=r"is another configuration \(seed: 7 there, 99 here\): expected a new"
-    ):
+    with pytest.raises(InputError, match="seed: 7 there, 99 here"):
         generate(small(seed=99), folder)
-    with pytest.raises(InputError, match="splits nonsense: expected some of training, evaluation"):
-        generate(small(), folder, splits=["nonsense"])
-    with pytest.raises(InputError, match=r"splits = 'training': expected a list of names"):
-        generate(small(), folder, splits="training")
-
-
-def test_many_differences_of_configurations_are_cut_short(generated):
-    _, folder = generated
     extra = [{"name": "stiffer", "meshes": 1, "simulations": 1}]
-    with pytest.raises(InputError, match=r"extra.0.meshes: nothing there, 1 here; .*; 1 more\)"):
+    with pytest.raises(InputError, match=r"extra.*meshes: nothing there, 1 here"):
         generate(small(extra=extra), folder)
 
 
-def test_what_is_refused_leaves_no_folder(tmp_path):
+def test_what_is_refused_leaves_no_folder(program, tmp_path):
     folder = tmp_path / "set"
     few = small(coarse_nodes=[72, 72], training={"meshes": 500, "simulations": 500})
     for config, options, words in (
-        (few, {}, "the configuration asks for 501 meshes"),
-        (small(), {"splits": ["nonsense"]}, "splits nonsense"),
-        (small(), {"seconds": -1.0}, "seconds = -1.0: expected 0 or more"),
-        (small(), {"seconds": float("nan")}, "seconds = nan: expected 0 or more"),
+        (few, {}, "501 meshes"),
+        (small(), {"splits": ["nonsense"]}, "nonsense"),
+        (small(), {"splits": "training"}, "splits = 'training'"),
+        (small(), {"seconds": -1.0}, "seconds = -1.0"),
+        (small(), {"seconds": float("nan")}, "seconds = nan"),
+        (small(), {"device": "gpu"}, "device 'gpu'"),
+        (small(), {"count": 0}, "count = 0"),
+        (small(), {"batch": 0}, "batch = 0"),
     ):
+        own = {k: options.pop(k) for k in ("device", "count", "batch") if k in options}
         with pytest.raises(InputError, match=words):
-            generate(config, folder, **options)
+            generate(config, folder, Workers(**own), **options)
+    path = tmp_path / "set.toml"
+    path.write_text(small().to_toml())
+    command = ("dataset", "generate", path, "-o")
+    for arguments, words in (((folder, "--seconds", "-1"), "--seconds"), ((path,), "set.toml")):
+        status, _, err = program(*command, *arguments)
+        assert status == 2
+        assert words in err
     assert not folder.exists()
 
 
@@ -381,53 +310,23 @@ def test_a_configuration_of_which_nothing_is_there_yet_is_replaced(tmp_path):
     written = (tmp_path / "config.toml").read_text()
     assert written == other.to_toml()
     (tmp_path / "config.toml").write_text("# by hand\n" + written)
-    with pytest.raises(InputError, match="is another configuration"):
+    with pytest.raises(InputError, match="config"):
         generate(config, tmp_path, seconds=0.0)
     assert (tmp_path / "config.toml").read_text() == "# by hand\n" + written
 
 
-def test_a_file_in_place_of_the_folder_is_bad_input(program, tmp_path):
-    path = tmp_path / "set.toml"
-    path.write_text(small().to_toml())
-    status, _, err = program("dataset", "generate", path, "-o", path)
-    assert status == 2
-    assert "set.toml: not a folder: expected that of a data set, or a new one" in err
-
-
-def test_negative_seconds_are_bad_input(program, tmp_path):
-    path = tmp_path / "set.toml"
-    path.write_text(small().to_toml())
-    status, _, err = program("dataset", "generate", path, "-o", tmp_path / "s", "--seconds", "-1")
-    assert status == 2
-    assert "--seconds" in err
-    assert not (tmp_path / "s").exists()
-
-
-def test_impossible_numbers_of_workers_are_refused():
-    for options, words in (
-        ({"count": 0}, "count = 0: expected 1 or more"),
-        ({"count": -3}, "count = -3"),
-        ({"batch": 0}, "batch = 0: expected 1 or more"),
-    ):
-        with pytest.raises(InputError, match=words):
-            Workers(**options)
-
-
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path, monkeypatch, address):
+def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_named(
+    tmp_path, monkeypatch, address
+):
     monkeypatch.setattr("pdcorrect.data.workers._ANSWER", 0.5)
-    with pytest.raises(
-        InputError, match=f"--scheduler {address}: no scheduler answers there .*tcp://HOST:8786"
-    ):
+    with pytest.raises(InputError, match=f"--scheduler {address}"):
         generate(small(), tmp_path, Workers(scheduler=address))
-
-
-def test_a_scheduler_without_workers_is_bad_input(tmp_path, monkeypatch):
     monkeypatch.setattr("pdcorrect.data.workers._PATIENCE", 0.2)
     options = {"n_workers": 0, "processes": False, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
-        pytest.raises(InputError, match="no worker joined in 0.2 s: expected one or more"),
+        pytest.raises(InputError, match=r"0\.2 s"),
     ):
         generate(small(), tmp_path, Workers(scheduler=cluster.scheduler_address))
 
@@ -437,14 +336,14 @@ def test_files_of_others_are_never_overwritten(generated, tmp_path, monkeypatch)
     foreign = tmp_path / "foreign"
     shutil.copytree(folder, foreign)
     (foreign / "config.toml").unlink()
-    with pytest.raises(InputError, match="holds files of meshes but no config.toml"):
+    with pytest.raises(InputError, match=r"config\.toml"):
         generate(config, foreign)
     other = small(seed=8)
     (foreign / "config.toml").write_text(other.to_toml())
-    with pytest.raises(InputError, match=r"mesh-0000.h5 is of another data set"):
+    with pytest.raises(InputError, match=r"mesh-0000\.h5"):
         generate(other, foreign)
-    monkeypatch.setattr("pdcorrect.data.seal.VERSION", 0)
-    with pytest.raises(FileFormatError, match="written by a newer pdcorrect"):
+    monkeypatch.setattr("pdcorrect.data.checksum.VERSION", 0)
+    with pytest.raises(FileFormatError, match="version 1"):
         generate(config, folder)
 
 
@@ -463,13 +362,8 @@ def test_processes_write_to_places_of_their_own_and_clear_up_after_dead_ones(tmp
     assert own.exists()
     assert strange.exists()
     assert not dead.exists()
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="Linux only")
-def test_what_a_killed_process_left_is_cleared_before_its_parent_has_asked_for_it(tmp_path):
-    path = tmp_path / "training" / "mesh-0000.h5"
-    path.parent.mkdir()
-    own = part_of_process(path)
+    if not os.path.exists("/proc/self/stat"):  # only Linux tells
+        return
     with subprocess.Popen(["sleep", "60"]) as killed:
         part = own.with_name(own.name.replace(f".{os.getpid()}.", f".{killed.pid}."))
         part.write_bytes(b"half")
@@ -519,18 +413,12 @@ def test_a_schedulers_workers_compute_the_statistics_wherever_they_run(tmp_path,
     assert not any((tmp_path / "elsewhere").iterdir())
 
 
-def test_an_unknown_device_is_refused(tmp_path):
-    with pytest.raises(InputError, match="device 'gpu': expected cpu, cuda or cuda:N"):
-        generate(small(), tmp_path / "set", Workers(device="gpu"))
-    assert not (tmp_path / "set").exists()
-
-
 def interrupted(config, folder, delay, workers):
     """Start the generation in processes of its own and kill them; whether it was running."""
     path = folder.parent / "set.toml"
     path.write_text(config.to_toml())
     command = [
-        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", path, "-o", folder,
+        sys.executable, "-m", "pdcorrect", "dataset", "generate", path, "-o", folder,
         "--workers", str(workers),
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -549,7 +437,7 @@ def interrupted(config, folder, delay, workers):
 def test_ctrl_c_ends_the_workers_without_further_words(tmp_path):
     (tmp_path / "set.toml").write_text(small(frames=200).to_toml())
     command = [
-        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", tmp_path / "set.toml",
+        sys.executable, "-m", "pdcorrect", "dataset", "generate", tmp_path / "set.toml",
         "-o", tmp_path / "set", "--workers", "2",
     ]  # fmt: skip
     process = subprocess.Popen(
@@ -560,9 +448,7 @@ def test_ctrl_c_ends_the_workers_without_further_words(tmp_path):
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert re.fullmatch(
-        r"interrupted: \d of 4 simulations are there; the same command goes on\n", err
-    )
+    assert re.fullmatch(r"interrupted: \d of 4 simulations .*\n", err)
 
 
 @pytest.mark.slow
@@ -621,11 +507,7 @@ def test_a_cluster_that_closes_slowly_stops_nothing_and_hides_no_error(monkeypat
     with pytest.raises(TimeoutError, match="of the work"), local_scheduler(2):
         raise TimeoutError("of the work itself")
     assert made[1].closed == 1
-
-
-def test_one_worker_needs_no_cluster(monkeypatch):
-    monkeypatch.setattr("pdcorrect.data.workers.local_cluster", lambda n: pytest.fail("a cluster"))
-    with local_scheduler(1) as address:
-        assert address is None
-    with local_scheduler(0) as address:
-        assert address is None
+    for count in (0, 1):  # one worker needs no cluster
+        with local_scheduler(count) as address:
+            assert address is None
+    assert len(made) == 2

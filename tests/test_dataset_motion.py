@@ -9,7 +9,7 @@ import pytest
 
 from dataset_samples import with_run, with_simulation
 from pdcorrect.data.check import check_dataset
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import manifest_content
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
@@ -37,78 +37,65 @@ def spoilt(tmp_path):
     return spoil
 
 
-def test_a_file_as_it_was_generated_is_sound(spoilt):
-    assert spoilt(lambda shard: shard, repeat=5) == []
+def reflected(run, what, row):
+    """Free nodes of one row mirrored in the middle of the body."""
 
-
-def reflected(shard):
-    """The reference's free nodes of frame 5 mirrored in the middle of the body."""
-    values = shard.simulations[0].runs["reference"].positions.copy()
-    middle = shard.points.mean(axis=0)
-    values[5] = np.where(shard.free, 2 * middle - values[5], values[5])
-    return with_run(shard, 0, "reference", positions=values)
-
-
-def test_a_reference_that_is_inside_out_is_found_by_its_positions(spoilt):
-    assert spoilt(reflected, repeat=0) == [
-        "simulation 0000: reference: a cell is inside out in its positions, first in row 5"
-    ]
-
-
-def test_predictions_that_are_inside_out_are_found(spoilt):
     def change(shard):
-        values = shard.simulations[0].runs["best"].predictions.copy()
-        values[7] = np.where(shard.free, 2 * shard.points.mean(axis=0) - values[7], values[7])
-        return with_run(shard, 0, "best", predictions=values)
+        values = getattr(shard.simulations[0].runs[run], what).copy()
+        mirrored = 2 * shard.points.mean(axis=0) - values[row]
+        values[row] = np.where(shard.free, mirrored, values[row])
+        return with_run(shard, 0, run, **{what: values})
 
-    assert spoilt(change, repeat=0) == [
-        "simulation 0000: best: a cell is inside out in its predictions, first in row 7"
-    ]
-
-
-def test_det_f_of_every_run_is_looked_at(spoilt):
-    def change(shard):
-        told = dict(shard.simulations[0].runs["plain"].statistics)
-        told["smallest_volume_ratios"] = np.full_like(told["smallest_volume_ratios"], -1.0)
-        return with_run(shard, 0, "plain", statistics=told)
-
-    assert spoilt(change) == ["simulation 0000: plain: det F is -1 after step 1"]
+    return change
 
 
-@pytest.mark.parametrize("name", ["smallest_volume_ratios", "error_estimates"])
-def test_a_run_without_figures_of_its_steps_is_found(spoilt, name):
+def inverted(shard):
+    told = dict(shard.simulations[0].runs["plain"].statistics)
+    told["smallest_volume_ratios"] = np.full_like(told["smallest_volume_ratios"], -1.0)
+    return with_run(shard, 0, "plain", statistics=told)
+
+
+def without(statistic):
     def change(shard):
         told = dict(shard.simulations[0].runs["reference"].statistics)
-        del told[name]
+        del told[statistic]
         return with_run(shard, 0, "reference", statistics=told)
 
-    assert spoilt(change) == [f"simulation 0000: reference: no {name}: expected those of its steps"]
+    return change
 
 
-def test_forces_that_are_not_the_loads_are_found(spoilt):
-    def change(shard):
-        forces = shard.simulations[0].forces.copy()
-        forces[-1] *= 1.001
-        return with_simulation(shard, 0, forces=forces)
-
-    (message,) = spoilt(change)
-    assert message == "simulation 0000: its forces in step 20 are not what config.toml draws"
+def pulled_harder(shard):
+    forces = shard.simulations[0].forces.copy()
+    forces[-1] *= 1.001
+    return with_simulation(shard, 0, forces=forces)
 
 
-@pytest.mark.parametrize(
-    ("run", "key", "value", "wanted"),
-    [
-        ("reference", "refine", 1, 4),
-        ("plain", "solver", "x", "'pd'"),
-        ("best", "time_step", 0.02, 0.01),
-    ],
-)
-def test_a_run_of_another_model_is_found(spoilt, run, key, value, wanted):
+def attribute(run, key, value):
     def change(shard):
         told = dict(shard.simulations[0].runs[run].attributes)
         return with_run(shard, 0, run, attributes={**told, key: value})
 
-    assert spoilt(change) == [f"simulation 0000: {run}: its {key} is {value!r}: expected {wanted}"]
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (reflected("reference", "positions", 5), ("reference", "positions", "row 5")),
+        (reflected("best", "predictions", 7), ("best", "predictions", "row 7")),
+        (inverted, ("plain", "-1", "step 1")),
+        (without("smallest_volume_ratios"), ("reference", "smallest_volume_ratios")),
+        (without("error_estimates"), ("reference", "error_estimates")),
+        (pulled_harder, ("forces", "step 20")),
+        (attribute("reference", "refine", 1), ("reference", "refine is 1", "4")),
+        (attribute("plain", "solver", "x"), ("plain", "solver is 'x'", "'pd'")),
+        (attribute("best", "time_step", 0.02), ("best", "time_step is 0.02", "0.01")),
+    ],
+)
+def test_what_no_solver_would_have_written_is_found_and_named(spoilt, change, named):
+    assert spoilt(lambda shard: shard, repeat=0) == []
+    (message,) = spoilt(change, repeat=0)
+    assert all(word in message for word in ("simulation 0000", *named)), message
 
 
 @pytest.mark.parametrize("what", ["positions", "predictions"])
@@ -120,11 +107,11 @@ def test_steps_that_the_model_would_not_take_are_found(spoilt, what):
         values[1:] += np.where(shard.free, 0.005, 0.0).astype(values.dtype)
         return with_run(shard, 0, "plain", **{what: values})
 
+    assert spoilt(lambda shard: shard, repeat=2) == []
     assert spoilt(change, repeat=0) == []
     (message,) = spoilt(change, repeat=2)
     assert message.startswith("simulation 0000: plain: step ")
-    assert f"of its {what} is 0.00" in message
-    assert "off when it is taken again: expected at most 5." in message
+    assert what in message
 
 
 def test_a_reference_in_reverse_is_found_by_what_is_predicted_from_it(spoilt):
@@ -136,29 +123,25 @@ def test_a_reference_in_reverse_is_found_by_what_is_predicted_from_it(spoilt):
     plain, best = spoilt(change, repeat=3)
     assert plain.startswith("simulation 0000: plain: step ")
     assert best.startswith("simulation 0000: best: step ")
-    assert all("of its predictions is" in message for message in (plain, best))
+    assert all("predictions" in message for message in (plain, best))
 
 
 @pytest.mark.parametrize("key", ["dataset", "config_hash", "content_hash"])
-def test_a_manifest_of_something_else_is_found(tmp_path, key):
+def test_a_manifest_or_statistics_of_something_else_are_found(tmp_path, key):
     folder = shutil.copytree(TINY, tmp_path / "tiny")
-    content = json.loads((folder / "manifest.json").read_text())
-    (folder / "manifest.json").write_text(json.dumps({**content, key: "other"}))
+    manifest, statistics = folder / "manifest.json", folder / "statistics.json"
+    before = manifest.read_text()
+    manifest.write_text(json.dumps({**json.loads(before), key: "other"}))
     (finding,) = check_dataset(folder, repeat=0)
-    assert finding.path == folder / "manifest.json"
-    assert finding.message == f"its {key} is not that of config.toml and of the files it lists"
-
-
-def test_statistics_of_other_files_are_found(tmp_path):
-    folder = shutil.copytree(TINY, tmp_path / "tiny")
-    content = json.loads((folder / "statistics.json").read_text())
-    content["shards"]["mesh-0001.h5"] = "other"
-    (folder / "statistics.json").write_text(json.dumps(content))
-    (finding,) = check_dataset(folder, repeat=0)
-    assert finding.path == folder / "statistics.json"
-    assert finding.message.startswith("stale: mesh-0001.h5 has changed since")
-
-
-def test_a_negative_number_of_steps_is_refused():
-    with pytest.raises(ValueError, match="repeat = -1: expected 0 or more"):
-        check_dataset(TINY, repeat=-1)
+    assert finding.path == manifest
+    assert key in finding.message
+    if key == "content_hash":
+        manifest.write_text(before)
+        content = json.loads(statistics.read_text())
+        content["shards"]["mesh-0001.h5"] = "other"
+        statistics.write_text(json.dumps(content))
+        (finding,) = check_dataset(folder, repeat=0)
+        assert finding.path == statistics
+        assert "mesh-0001.h5" in finding.message
+        with pytest.raises(ValueError, match="repeat = -1"):
+            check_dataset(folder, repeat=-1)

@@ -10,8 +10,8 @@ from dataset_configs import small
 from pdcorrect.data.generate import generate
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.training.config import Stage, TrainingConfig
 from pdcorrect.training.fitting import fit_normaliser
+from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.recordings import load_recordings
 from pdcorrect.training.windows import StepWindows
 

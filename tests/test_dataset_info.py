@@ -1,0 +1,215 @@
+"""What a summary says of a data set, in numbers, tables and pictures."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from dataset_samples import write_dataset
+from pdcorrect.data.info import dataset_info
+from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
+from pdcorrect.errors import FileFormatError, InputError, OutputError
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("original")
+    write_dataset(folder)
+    return folder
+
+
+@pytest.fixture
+def dataset(original, tmp_path):
+    """A data set to spoil."""
+    return shutil.copytree(original, tmp_path / "sample")
+
+
+def counted_shard(split, number, size):
+    """One cube of side 1; node 6 of the reference moves by 3 and 4 ``size`` in two steps."""
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    points = np.array(corners + [[x, y, 1] for x, y, _ in corners], dtype=float)
+
+    def run(factor, steps, **predictions):
+        positions = np.repeat(points[None], 3, axis=0)
+        positions[1, 6, 0] += factor * 3 * size
+        positions[2, 6, 0] += factor * 3 * size
+        positions[2, 6, 1] += factor * 4 * size
+        return Run(positions, **predictions, statistics={"iterations": np.array(steps)})
+
+    one_step = run(1.0, [0, 0]).positions[1:].copy()
+    one_step[:, 0, 2] += 0.2 * size
+    forces = np.zeros((2, 8, 3))
+    forces[1, 2] = [0.0, 6.0 * size, 8.0 * size]
+    runs = {
+        "reference": run(1.0, [10, 20]),
+        "plain": run(0.5, [2, 4], predictions=one_step),
+        "best": run(0.75, [5, 5 + number]),
+    }
+    seconds = {"reference": 8.0, "plain": 1.5}
+    simulation = Simulation(
+        forces, runs, attempt=number, rejected=("no",) * number, seconds=seconds
+    )
+    return Shard(
+        attributes={
+            "dataset": "counted", "split": split, "number": number, "setting": "exact",
+            "config_hash": "0", "time_step": 0.5, "tolerance": 1e-5,
+        },
+        points=points, cells=np.arange(8)[None], free=np.ones((8, 3), bool), mass=np.ones(8),
+        young=np.array([1e5 * (1 + number)]), poisson=np.array([0.3]), density=np.array([1e3]),
+        simulations=(simulation,),
+    )  # fmt: skip
+
+
+def test_the_summary_has_the_numbers_of_hand(tmp_path):
+    """Displacements 5 s, speeds 4 s / 0.5, forces 10 s with s = 1, 2, 4."""
+    for split, number, size in (("training", 0, 1.0), ("training", 1, 2.0), ("evaluation", 0, 4.0)):
+        write_shard(
+            tmp_path / split / f"mesh-{number:04d}.h5",
+            counted_shard(split, number, size),
+            "float64",
+        )
+    info = dataset_info(tmp_path)
+    assert list(info.splits) == ["training", "evaluation"]
+    whole, training = info.whole, info.splits["training"]
+    assert (whole.meshes, whole.simulations, whole.frames) == (3, 3, 6)
+    assert (training.meshes, training.simulations, training.frames) == (2, 2, 4)
+    assert whole.bytes == sum(path.stat().st_size for path in tmp_path.glob("*/*.h5"))
+    assert whole.nodes == (8, 8)
+    assert whole.cells == (1, 1)
+    assert whole.young == (1e5, 2e5)
+    assert info.splits["evaluation"].young == (1e5, 1e5)
+    for name, factor in (("displacement", 5.0), ("speed", 8.0), ("force", 10.0)):
+        spread = getattr(whole, name)
+        assert spread.mean == pytest.approx(factor * 7 / 3)
+        assert spread.smallest == pytest.approx(factor)
+        assert spread.median == pytest.approx(2 * factor)
+        assert spread.largest == pytest.approx(4 * factor)
+        assert spread.q05 == pytest.approx(1.1 * factor)
+        assert spread.q95 == pytest.approx(3.8 * factor)
+    assert (training.rejected, training.rejection_rate) == (1, pytest.approx(1 / 3))
+    assert training.seconds == {"reference": 16.0, "plain": 3.0, "total": 19.0}
+    assert whole.seconds["total"] == 28.5
+    assert list(whole.runs) == ["reference", "plain", "best"]
+    reference, plain, best = whole.runs.values()
+    assert (reference.iterations, reference.most_iterations) == (15, 20)
+    assert (best.iterations, best.most_iterations) == (pytest.approx(31 / 6), 6)
+    assert reference.rms_error is reference.omega is plain.omega is None
+    # squared distances (1.5 s)^2 and (2.5 s)^2 of one node of 8, over two frames
+    assert plain.rms_error == pytest.approx(np.sqrt((1.5**2 + 2.5**2) / 16) * 7 / 3)
+    assert best.rms_error == pytest.approx(0.5 * plain.rms_error)
+    assert plain.step_error == pytest.approx(0.2 / np.sqrt(8) * 7 / 3)
+    assert best.step_error is None
+    for value in dataclasses.asdict(best.omega).values():
+        assert value == pytest.approx(75.0)
+
+
+def test_omega_spreads_over_simulations(tmp_path):
+    """Displacements off by shares e of the plain run's error: Omega 100 (1 - e^2)."""
+    shard = counted_shard("training", 0, 1.0)
+    simulation = shard.simulations[0]
+    reference, plain = (simulation.runs[name].positions for name in ("reference", "plain"))
+    many = []
+    for share in (0.0, 0.5, 2.0):
+        best = Run(reference + share * (plain - reference))
+        many.append(dataclasses.replace(simulation, runs={**simulation.runs, "best": best}))
+    still = {**simulation.runs, "plain": simulation.runs["reference"]}
+    many.append(dataclasses.replace(simulation, runs=still))  # no error to correct
+    shard = dataclasses.replace(shard, simulations=tuple(many))
+    write_shard(tmp_path / "training/mesh-0000.h5", shard, "float64")
+    best = dataset_info(tmp_path).whole.runs["best"]
+    assert best.simulations == 4
+    assert best.omega.mean == pytest.approx((100 + 75 - 300) / 3)
+    assert best.omega.median == pytest.approx(75)
+    assert best.omega.smallest == pytest.approx(-300)
+    assert best.omega.q05 == pytest.approx(-300 + 0.1 * 375)
+
+
+def test_a_summary_of_nothing_or_of_a_damaged_file_is_refused(dataset, tmp_path):
+    with pytest.raises(InputError, match="none"):
+        dataset_info(tmp_path / "none")
+    path = dataset / "training" / "mesh-0000.h5"
+    path.write_bytes(b"")
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
+        dataset_info(dataset)
+
+
+# --- pictures ----------------------------------------------------------------------------
+
+
+def drawn(path):
+    iio = pytest.importorskip("imageio.v3")
+    return iio.imread(path)[..., :3].astype(int)
+
+
+@pytest.fixture(scope="module")
+def view():
+    pytest.importorskip("pyvista")
+    return pytest.importorskip("pdcorrect.data.pictures")
+
+
+def coloured(image):
+    """Whether each pixel is coloured, as bodies are and text is not."""
+    return np.ptp(image, axis=-1) > 25
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_thumbnails_show_a_body_in_every_panel(view, original, tmp_path, count):
+    path = view.thumbnails(original, tmp_path / "a.png", count)
+    image = drawn(path)
+    columns = min(4, count)
+    assert image.shape[1] == columns * view._WIDTH
+    rows = -(-count // 4)
+    panels = image[: image.shape[0] - round(4.2 * view._FONT)]
+    height = panels.shape[0] / rows
+    for k in range(columns * rows):
+        top, left = round(k // columns * height), k % columns * view._WIDTH
+        panel = panels[top : top + round(height), left : left + view._WIDTH]
+        assert (coloured(panel).mean() > 0.02) == (k < count)
+        assert not coloured(panel[:, [0, -1]]).any()
+
+
+def test_bad_pictures_are_refused(view, original, tmp_path):
+    for path, count in ((tmp_path / "a.jpg", 8), (tmp_path / "a.png", 0)):
+        with pytest.raises(InputError, match="count"):
+            view.thumbnails(original, path, count)
+    with pytest.raises(InputError, match=r"a\.txt2"):
+        view.histograms(original, tmp_path / "a.txt2")
+    with pytest.raises(OutputError, match="none"):
+        view.histograms(original, tmp_path / "none" / "a.png")
+
+
+# --- the program -------------------------------------------------------------------------
+
+
+def test_info_prints_tables_and_writes_json(program, dataset, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    status, out, _ = program("dataset", "info", dataset, "--json", tmp_path / "info.json")
+    assert status == 0
+    assert all(word in out for word in ("training", "evaluation", "Omega", "plain steps"))
+    record = json.loads((tmp_path / "info.json").read_text())
+    assert record["whole"]["simulations"] == 8
+    assert record["splits"]["training"]["runs"]["best"]["omega"]["mean"] == pytest.approx(
+        96, abs=0.1
+    )
+    again = tmp_path / "no" / "info.json"
+    assert program("dataset", "info", dataset, "--json", again)[0] == 0
+    assert json.loads(again.read_text()) == record
+    assert program("dataset", "info", dataset, "--json", again / "info.json")[0] == 1
+
+
+def test_info_without_statistics_or_costs_and_with_figures(program, view, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    shard = counted_shard("training", 0, 1.0)
+    simulation = shard.simulations[0]
+    bare = {"reference": dataclasses.replace(simulation.runs["reference"], statistics={})}
+    one = dataclasses.replace(simulation, runs=bare, seconds={})
+    root = tmp_path / "bare"
+    write_shard(root / "training/mesh-0000.h5", dataclasses.replace(shard, simulations=(one,)))
+    status, out, _ = program("dataset", "info", root, "--figures", tmp_path / "new")
+    assert status == 0
+    assert "iterations" not in out
+    names = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert names == ["histograms.png", "samples.png"]
+    assert coloured(drawn(tmp_path / "new" / "histograms.png")).mean() > 0.001
