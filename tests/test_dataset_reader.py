@@ -5,7 +5,6 @@ import json
 import os
 import pickle
 import shutil
-import signal
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from functools import partial
@@ -22,13 +21,16 @@ from torch_geometric.loader import DataLoader  # noqa: E402
 
 import pdcorrect.data.statistics as statistics_module  # noqa: E402
 import reader_samples as samples  # noqa: E402
-from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
-from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E402
-from pdcorrect.data.reader import ShardShuffle  # noqa: E402
+from pdcorrect.data.reader import (  # noqa: E402
+    ShardShuffle,
+    TrajectoryDataset,
+    TrajectoryLoader,
+)
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
 from pdcorrect.data.workers import Workers, mapped  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
+from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
 
 STEPS = 12  # of a mesh: simulations of 7 and 5
 
@@ -95,11 +97,7 @@ def test_a_sample_holds_the_window_of_its_simulation(folder, window):
     assert (found.cells.numpy() == shard.cells).all()
     assert [int(found[name]) for name in ("mesh", "simulation", "frame")] == [0, 1, 2]
     assert found.num_nodes == len(shard.points)
-
-
-def test_a_body_starts_without_velocity(folder):
-    assert not opened(folder)[0].velocities.any()
-    assert opened(folder)[1].velocities.any()
+    assert not dataset[0].velocities.any()  # a body starts without
 
 
 @pytest.mark.parametrize("window", [1, 5, 6, 7])
@@ -114,14 +112,11 @@ def test_windows_reach_the_last_frame_and_no_further(folder, window):
             expected[mesh, k] = list(range(steps - window + 1))
     assert frames == expected
     assert all(sample.targets.shape[1] == window for sample in found)
-
-
-def test_nothing_is_left_of_a_window_longer_than_every_simulation(folder):
-    with pytest.raises(InputError, match="no simulation has 8 steps, the longest 7"):
+    with pytest.raises(InputError, match=" 8 steps"):
         opened(folder, window=8)
 
 
-def test_edges_are_those_of_the_cells_once_in_both_directions(folder):
+def test_edges_are_those_of_the_cells_and_values_of_nodes_are_means_over_cells(folder):
     found = opened(folder)[0]
     expected = set()
     for a, b in itertools.combinations(range(len(found.rest)), 2):
@@ -132,9 +127,6 @@ def test_edges_are_those_of_the_cells_once_in_both_directions(folder):
     assert set(edges) == expected
     assert edges == sorted(edges)
     assert mesh_edges(np.arange(8)[None]).shape == (2, 24)
-
-
-def test_values_of_nodes_are_means_over_their_cells():
     cells = np.array([[0, 1, 2, 3, 4, 5, 6, 7], [1, 8, 9, 2, 5, 10, 11, 6]])
     means = node_means(np.array([1.0, 3.0]), cells, 12)
     assert means[[0, 1, 8]].tolist() == [1.0, 2.0, 3.0]
@@ -148,37 +140,37 @@ def test_changing_a_sample_leaves_the_data_set_alone(folder):
     assert torch.equal(dataset[3].positions, before)
 
 
-def test_numbers_come_in_the_type_asked_for(folder):
+def test_numbers_come_in_the_type_asked_for_and_are_stored_in_the_files_own(folder, tmp_path):
     found = TrajectoryDataset(folder, "training")[0]
     assert {found[n].dtype for n in ("positions", "velocities", "rest", "young", "time")} == {
         torch.float32
     }
     assert found.edge_index.dtype == found.cells.dtype == torch.int64
-
-
-def test_data_without_predictions_is_read_without_a_base(tmp_path):
-    samples.write(tmp_path, [samples.shard(models=())])
-    assert "predictions" not in opened(tmp_path, base=None)[0]
-    with pytest.raises(InputError, match="no predictions of run 'plain'.*base=None"):
-        opened(tmp_path)
+    samples.write(tmp_path, [samples.shard()], "float32")
+    _, motions = read_arrays(tmp_path / "training" / "mesh-0000.h5", ("plain",))
+    assert motions[0].positions.dtype == motions[0].predictions["plain"].dtype == np.float32
+    assert motions[0].velocities.dtype == np.float64
 
 
 def test_what_is_not_there_is_named(folder, tmp_path):
     for options, words in (
-        ({"split": "test"}, "no split 'test': expected one of training, validation, evaluation"),
-        ({"base": "fine"}, "no predictions of run 'fine': expected one of best, plain"),
-        ({"runs": ["fine"]}, "no positions of run 'fine'"),
+        ({"split": "test"}, "'test'"),
+        ({"base": "fine"}, "'fine'"),
+        ({"runs": ["fine"]}, "'fine'"),
         ({"window": 0}, "window = 0"),
-        ({"window": 2.5}, "window = 2.5: expected 1 step or more, a whole number"),
-        ({"runs": "best"}, r"runs = 'best': expected a list of names, such as \['best'\]"),
+        ({"window": 2.5}, r"window = 2\.5"),
+        ({"runs": "best"}, "runs = 'best'"),
     ):
         with pytest.raises(InputError, match=words):
             opened(folder, **options)
-    with pytest.raises(InputError, match="no data set"):
+    with pytest.raises(InputError, match=tmp_path.name):
         opened(tmp_path)
-    samples.dataset(tmp_path, splits=("training",))
-    with pytest.raises(InputError, match=r"no split 'validation' \(it has round\(validation_share"):
+    samples.write(tmp_path, [samples.shard(models=())])
+    with pytest.raises(InputError, match="'validation'"):
         opened(tmp_path, "validation")
+    with pytest.raises(InputError, match="'plain'"):
+        opened(tmp_path)
+    assert "predictions" not in opened(tmp_path, base=None)[0]
     with pytest.raises(IndexError):
         opened(folder).get(4 * STEPS)
 
@@ -187,12 +179,12 @@ def test_damaged_files_are_refused_by_name(folder, tmp_path):
     path = tmp_path / "training" / "mesh-0000.h5"
     path.parent.mkdir()
     path.write_bytes(b"nothing of the kind")
-    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: not a file of a data set"):
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
         opened(tmp_path)
     whole = (folder / "training" / "mesh-0000.h5").read_bytes()
     dataset = opened(samples.write(tmp_path, [samples.shard()]))
     path.write_bytes(whole[:-2000])
-    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5: .*truncated"):
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
         dataset[0]
 
 
@@ -206,7 +198,7 @@ def test_a_changed_bit_in_any_array_is_found_without_the_seal(folder, tmp_path):
         changed = bytearray(whole)
         changed[chunk.byte_offset + chunk.size // 2] ^= 4
         path.write_bytes(changed)
-        with pytest.raises(FileFormatError, match=rf"mesh-0000\.h5: {place} is damaged"):
+        with pytest.raises(FileFormatError, match=rf"mesh-0000\.h5: {place} "):
             opened(tmp_path / "set")[0]
         path.write_bytes(whole)
 
@@ -229,18 +221,19 @@ def test_a_batch_is_what_pytorch_geometric_makes_of_the_samples(folder, options)
     assert ours.num_graphs == len(chosen)
     for i, sample in zip(chosen, ours.to_data_list(), strict=True):
         same(sample, dataset[i])
-
-
-def test_a_batch_for_another_process_is_the_same(folder):
-    dataset = opened(folder, window=2)
-    same(dataset.packed([5, 1, 39]).batch(), dataset.batch([5, 1, 39]))
+    same(dataset.packed(chosen).batch(), ours)  # as it comes from another process
 
 
 def test_cells_and_edges_of_a_batch_stay_within_their_graphs(folder):
-    batch = opened(folder).batch([0, 20, 40])
+    dataset = opened(folder)
+    batch = dataset.batch([0, 20, 40])
     assert (batch.batch[batch.edge_index[0]] == batch.batch[batch.edge_index[1]]).all()
     assert (batch.batch[batch.cells] == batch.batch[batch.cells[:, :1]]).all()
     assert torch.equal(batch.cells.unique(), torch.arange(batch.num_nodes))
+    part = dataset[[40, 2, 17]]  # has numbers of its own
+    same(part.batch([0, 2]), dataset.batch([40, 17]))
+    assert part.shard_numbers().tolist() == [3, 0, 1]
+    assert sorted(ShardShuffle(part)) == [0, 1, 2]
 
 
 def test_the_loader_of_pytorch_geometric_works_too(folder):
@@ -249,21 +242,13 @@ def test_the_loader_of_pytorch_geometric_works_too(folder):
         same(ours, theirs)
 
 
-def test_part_of_a_data_set_is_batched_by_its_own_numbers(folder):
-    dataset = opened(folder)
-    part = dataset[[40, 2, 17]]
-    same(part.batch([0, 2]), dataset.batch([40, 17]))
-    assert part.shard_numbers().tolist() == [3, 0, 1]
-    assert sorted(ShardShuffle(part)) == [0, 1, 2]
-
-
-@pytest.mark.parametrize("method", ["fork", "spawn"])
-def test_workers_hand_out_what_one_process_does(folder, method):
+@pytest.mark.parametrize(("method", "count"), [("fork", 2), ("spawn", 1)])
+def test_workers_hand_out_what_one_process_does(folder, method, count):
     dataset = opened(folder)
     dataset[0]  # the parent has read something
     alone = list(TrajectoryLoader(dataset, 5, ShardShuffle(dataset, seed=3)))
     loader = TrajectoryLoader(
-        dataset, 5, ShardShuffle(dataset, seed=3), num_workers=2, multiprocessing_context=method
+        dataset, 5, ShardShuffle(dataset, seed=3), num_workers=count, multiprocessing_context=method
     )
     shared = list(loader)
     for one, other in zip(alone, shared, strict=True):
@@ -287,11 +272,11 @@ def test_no_file_stays_open(folder, tmp_path):
     expected = dataset.batch([0, 40])
     shutil.rmtree(tmp_path / "set")
     same(dataset.batch([0, 40]), expected)
-    with pytest.raises(FileFormatError, match="No such file"):
+    with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
         dataset[20]
 
 
-def test_memory_keeps_to_its_bound(folder):
+def test_memory_keeps_to_its_bound_and_the_least_recently_used_file_goes_first(folder):
     sizes = []
     for number in range(4):
         dataset = opened(folder)
@@ -308,11 +293,7 @@ def test_memory_keeps_to_its_bound(folder):
     for number in (0, 1, 0):
         tiny[number * STEPS]
         assert len(tiny._shards) == 1
-
-
-def test_the_least_recently_used_file_goes_first(folder):
-    dataset = opened(folder)
-    loaded = []
+    dataset, loaded = opened(folder), []
     load = dataset._shards.load
     dataset._shards.load = lambda number: loaded.append(number) or load(number)
     for number in (0, 1):
@@ -349,20 +330,33 @@ def test_files_are_read_block_by_block(folder, block):
     assert [len(each) for each in blocks] == [block] * (4 // block)
     assert set.union(*blocks) == {0, 1, 2, 3}
     assert (np.diff(order[:STEPS]) < 0).any()
+    assert ShardShuffle(dataset).block == 4  # all that memory holds
+    assert ShardShuffle(opened(folder, cache_bytes=1)).block == 1
 
 
-def test_orders_that_are_not_to_be_had_are_refused(folder):
+def test_impossible_samplers_and_states_of_another_order_are_refused(folder):
     dataset = opened(folder)
-    with pytest.raises(InputError, match="seed = -1: expected 0 or more"):
-        ShardShuffle(dataset, seed=-1)
-    with pytest.raises(InputError, match=r"shuffle = True: .*ShardShuffle\(dataset\)"):
+    for options, words in (
+        ({"seed": -1}, "seed = -1"),
+        ({"rank": 2, "world_size": 2}, "rank = 2 of 2"),
+        ({"block": 0}, "block = 0"),
+        ({"world_size": 49}, "48 windows for 49 ranks"),
+    ):
+        with pytest.raises(InputError, match=words):
+            ShardShuffle(dataset, **options)
+    with pytest.raises(InputError, match="shuffle = True"):
         TrajectoryLoader(dataset, 4, shuffle=True)
     assert len(TrajectoryLoader(dataset, 48, shuffle=False)) == 1
-
-
-def test_by_default_a_block_is_what_the_memory_holds(folder):
-    assert ShardShuffle(opened(folder)).block == 4
-    assert ShardShuffle(opened(folder, cache_bytes=1)).block == 1
+    state = ShardShuffle(dataset, seed=5).state_dict()
+    for other, words in (
+        (ShardShuffle(dataset, seed=6), "seed = 5, .* 6"),
+        (ShardShuffle(dataset, seed=5, world_size=2), "world_size = 1"),
+        (ShardShuffle(opened(folder, window=2), seed=5), "windows = 48, .* 40"),
+    ):
+        with pytest.raises(InputError, match=words):
+            other.load_state_dict(state)
+    with pytest.raises(InputError):
+        TrajectoryLoader(dataset, 5).state_dict()
 
 
 @pytest.mark.parametrize("ranks", [2, 3, 5])
@@ -379,8 +373,7 @@ def test_ranks_get_disjoint_parts_of_equal_size(folder, ranks):
         assert len(set(together)) == len(together)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("stop", [1, 4, 10])
+@pytest.mark.parametrize(("workers", "stop"), [(0, 1), (0, 4), (0, 10), (2, 4)])
 def test_training_goes_on_exactly_where_it_stopped(folder, workers, stop):
     dataset = opened(folder)
 
@@ -418,31 +411,6 @@ def test_a_sampler_alone_resumes_too(folder):
     other.load_state_dict(sampler.state_dict())
     assert before + list(other) == expected
     assert list(other) == expected
-
-
-def test_a_state_of_another_order_is_refused(folder):
-    dataset = opened(folder)
-    state = ShardShuffle(dataset, seed=5).state_dict()
-    for other, words in (
-        (ShardShuffle(dataset, seed=6), "seed = 5, the sampler 6"),
-        (ShardShuffle(dataset, seed=5, world_size=2), "world_size = 1"),
-        (ShardShuffle(opened(folder, window=2), seed=5), "windows = 48, the sampler 40"),
-    ):
-        with pytest.raises(InputError, match=words):
-            other.load_state_dict(state)
-    with pytest.raises(InputError, match="reads in order"):
-        TrajectoryLoader(dataset, 5).state_dict()
-
-
-def test_impossible_samplers_are_refused(folder):
-    dataset = opened(folder)
-    for options, words in (
-        ({"rank": 2, "world_size": 2}, "rank = 2 of 2"),
-        ({"block": 0}, "block = 0"),
-        ({"world_size": 49}, "48 windows for 49 ranks"),
-    ):
-        with pytest.raises(InputError, match=words):
-            ShardShuffle(dataset, **options)
 
 
 # --- statistics ------------------------------------------------------------------------
@@ -514,9 +482,9 @@ def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatc
         return by_several(work, paths, count)
 
     monkeypatch.setattr(statistics_module, "_moments_by_several", noted)
-    samples.write(tmp_path, [samples.shard(number) for number in range(13)])
+    samples.write(tmp_path, [samples.shard(number) for number in range(9)])
     one, several = (compute_statistics(tmp_path, processes=count) for count in (1, 8))
-    assert counts == [3]
+    assert counts == [2]
     assert several.quantities.keys() == one.quantities.keys()
     for name in one.quantities:
         close(several[name], one[name], 0)
@@ -524,8 +492,8 @@ def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatc
     content = bytearray(path.read_bytes())
     content[len(content) // 2 :] = bytes(len(content) - len(content) // 2)  # of the same size
     path.write_bytes(content)
-    for count in (1, 3):
-        with pytest.raises(FileFormatError, match=r"mesh-0005\.h5: damaged"):
+    for count in (1, 2):
+        with pytest.raises(FileFormatError, match=r"mesh-0005\.h5"):
             compute_statistics(tmp_path, processes=count)
 
 
@@ -541,25 +509,27 @@ def test_statistics_by_a_schedulers_workers_have_the_same_bits(tmp_path):
             close(several[name], one[name], 0)
         path = tmp_path / "training" / "mesh-0007.h5"
         path.write_bytes(path.read_bytes()[:-1])
-        with pytest.raises(FileFormatError, match=r"mesh-0007\.h5: truncated"):
+        with pytest.raises(FileFormatError, match=r"mesh-0007\.h5"):
             compute_statistics(tmp_path, spread=spread)
-
-
-def parts_of_no_other(path, process):
-    """Parts of a file; any other process than this one is killed."""
-    if os.getpid() != process:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return statistics_module._parts(path, ["plain"])
 
 
 def test_statistics_are_computed_here_if_a_process_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 4)
+    by_several, broken = statistics_module._moments_by_several, []
+
+    def noted(*arguments):
+        try:
+            return by_several(*arguments)
+        except BrokenProcessPool:
+            broken.append(arguments)
+            raise
+
+    monkeypatch.setattr(statistics_module, "_moments_by_several", noted)
     samples.write(tmp_path, [samples.shard(number) for number in range(8)])
     paths = sorted((tmp_path / "training").iterdir())
-    work = partial(parts_of_no_other, process=os.getpid())
-    with pytest.raises(BrokenProcessPool):
-        statistics_module._moments_by_several(work, paths, 2)
+    work = partial(samples.parts_of_no_other_process, process=os.getpid())
     one, other = (statistics_module._moments(work, paths, count) for count in (1, 2))
+    assert len(broken) == 1
     for name in one:
         close(other[name], one[name], 0)
 
@@ -572,39 +542,27 @@ def test_saved_statistics_are_loaded_as_they_were(folder):
     assert (loaded.config_hash, loaded.shards) == (statistics.config_hash, statistics.shards)
     for name in statistics.quantities:
         close(loaded[name], statistics[name], 0)
-    with pytest.raises(InputError, match="no statistics of 'speed'"):
+    with pytest.raises(InputError, match="'speed'"):
         loaded["speed"]
 
 
-def test_stale_and_damaged_statistics_are_refused(tmp_path):
+def test_stale_and_damaged_statistics_and_files_of_two_configurations_are_refused(tmp_path):
     samples.dataset(tmp_path, splits=("training", "validation"))
-    with pytest.raises(FileFormatError, match="there is no such file"):
+    with pytest.raises(FileFormatError, match=r"statistics\.json"):
         load_statistics(tmp_path)
     compute_statistics(tmp_path).save(tmp_path)
     samples.write(tmp_path, [samples.shard(9, "validation")])
     load_statistics(tmp_path)  # another split is no part of them
-    samples.write(tmp_path, [samples.shard(4)])
-    with pytest.raises(InputError, match=r"stale: mesh-0004\.h5 has changed"):
-        load_statistics(tmp_path)
-    compute_statistics(tmp_path).save(tmp_path)
-    samples.write(tmp_path, [samples.shard(0, steps=(3,))])
-    with pytest.raises(InputError, match=r"stale: mesh-0000\.h5 has changed"):
-        load_statistics(tmp_path)
+    for stale in (samples.shard(4), samples.shard(0, steps=(3,))):
+        samples.write(tmp_path, [stale])
+        with pytest.raises(InputError, match=rf"mesh-000{stale.attributes['number']}\.h5"):
+            load_statistics(tmp_path)
+        compute_statistics(tmp_path).save(tmp_path)
     (tmp_path / "statistics.json").write_text('{"version": 1}')
-    with pytest.raises(FileFormatError, match="damaged or something else"):
+    with pytest.raises(FileFormatError, match=r"statistics\.json"):
         load_statistics(tmp_path)
-
-
-def test_files_of_two_configurations_have_no_statistics(tmp_path):
     one = samples.shard(1)
     other = replace(one, attributes={**one.attributes, "config_hash": "another"})
-    samples.write(tmp_path, [samples.shard(0), other])
-    with pytest.raises(InputError, match="files of 2 configurations"):
+    samples.write(tmp_path, [other])
+    with pytest.raises(InputError, match="2 configurations"):
         compute_statistics(tmp_path)
-
-
-def test_arrays_come_in_the_files_own_precision(tmp_path):
-    samples.write(tmp_path, [samples.shard()], "float32")
-    _, motions = read_arrays(tmp_path / "training" / "mesh-0000.h5", ("plain",))
-    assert motions[0].positions.dtype == motions[0].predictions["plain"].dtype == np.float32
-    assert motions[0].velocities.dtype == np.float64
