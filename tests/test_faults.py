@@ -14,6 +14,7 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from conftest import beam  # noqa: E402
 from dataset_configs import small  # noqa: E402
-from pdcorrect.cli.main import TERMINATED  # noqa: E402
+from pdcorrect.cli.program import TERMINATED  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard, stored_hashes  # noqa: E402
 from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
@@ -69,27 +70,25 @@ once if that is 0."""
 
 CASE = """
 import time
-from pathlib import Path
-from pdcorrect.validation.outcome import Outcome, Picture, Table
-
-
-def draw(path):
-    from PIL import Image
-
-    Image.effect_noise((128, 128), 90).save(path)
+from harness import Outcome, Table
 
 
 def part(number):
     time.sleep(0.15)
     rows = tuple((float(k), float(k * number)) for k in range(300))
-    picture = Picture(f"noise-{number}", "Noise", draw)
-    tables = (Table(f"{number}", ("k", "x"), rows),)
-    return Outcome({f"{number}": float(number)}, tables, (picture,))
+    return Outcome({f"{number}": float(number)}, (Table(f"{number}", ("k", "x"), rows),))
 
 
 def parts(quick):
     return {f"part {n}": (lambda n=n: part(n)) for n in range(8)}
+
+
+def draw(record, path):
+    from PIL import Image
+
+    Image.effect_noise((128, 128), 90).save(path)
 """
+VALIDATION = Path(__file__).parents[1] / "validation"
 
 
 @dataclass(frozen=True)
@@ -175,6 +174,8 @@ def whole_training(output, killed):
 def case_input(folder):
     case = folder / "validation" / "noise"
     case.mkdir(parents=True)
+    for name in ("harness.py", "expectations.py", "report.py"):
+        shutil.copy(VALIDATION / name, case.parent)
     (case / "run.py").write_text(CASE)
     (case / "README.md").write_text("# Noise\n\n**Question.** Is it there?\n")
     (case / "expected.json").write_text(
@@ -186,7 +187,7 @@ def report(output):
     folder = output / "report"
     record = json.loads((folder / "noise.json").read_text())
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*"))
-    return record["figures"], record["tables"], sorted(record["pictures"]), names
+    return record["figures"], record["tables"], names
 
 
 def whole_report(output, killed):
@@ -238,7 +239,7 @@ class Bench:
 
     def command(self):
         own = self.program.arguments(self.given, self.output)
-        return [sys.executable, "-m", "pdcorrect.cli.main", *map(str, own)]
+        return [sys.executable, "-m", "pdcorrect", *map(str, own)]
 
     def environment(self, **more):
         paths = {"PYTHONPATH": os.pathsep.join(sys.path), "PDCORRECT_HOME": str(self.given)}

@@ -331,10 +331,10 @@ def verdict(case: Case, record: Record) -> str:
     if record.error:
         return "fail: the case ended with an error"
     words = [row[-1] for row in judged(case, record)]
-    told = f"{len(words)} figures"
-    if "known failure" in words:
-        told += f", {words.count('known failure')} known failures"
-    return f"fail: {len(record.outside)} of {told}" if record.outside else f"pass: {told}"
+    told = {"outside": "outside", "known failure": "known to fail"}
+    counts = [f"{words.count(word)} {told[word]}" for word in told if word in words]
+    head = "fail" if record.outside else "pass"
+    return f"{head}: {', '.join([f'{len(words)} judged', *counts])}"
 
 
 def run(

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import html
 import importlib.util
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import harness
 
-from pdcorrect._files import make_folder, write_text
+from pdcorrect._files import make_folder, write_bytes, write_text
 
 Sections = Sequence[tuple[harness.Case, harness.Record]]
 HERE = Path(__file__).parent
@@ -44,8 +45,11 @@ def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
     drawable = hasattr(case.module, "draw") and not (record.quick or record.error)
     if not drawable or importlib.util.find_spec("matplotlib") is None:
         return ""
-    case.module.draw(record, make_folder(folder / "figures") / f"{case.name}.png")
-    return f"figures/{case.name}.png"
+    place = make_folder(folder / "figures") / f"{case.name}.png"
+    with tempfile.TemporaryDirectory() as scratch:  # a figure is there whole or not at all
+        case.module.draw(record, Path(scratch) / place.name)
+        write_bytes(place, (Path(scratch) / place.name).read_bytes())
+    return f"figures/{place.name}"
 
 
 def finding(case: harness.Case, record: harness.Record) -> str:
@@ -64,7 +68,10 @@ def conditions(told: Told) -> str:
     period = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never"
     keys = ("processor", "threads", "dtype")
     machines = {", ".join(r.environment.get(k, "") for k in keys) for _, r, _ in told}
-    return f"Measured {period} on {'; '.join(sorted(machines))}."
+    return (
+        f"Measured {period} on {'; '.join(sorted(machines))} (processor, threads, precision). "
+        "Judged are figures whose expectation was written down before."
+    )
 
 
 def markdown(told: Told) -> Iterator[str]:

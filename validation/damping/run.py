@@ -106,8 +106,9 @@ def vibration(integrator: str, quick: bool) -> common.Outcome:
 
 
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
-    """A part for each integrator."""
-    return {name: partial(vibration, name, quick) for name in INTEGRATORS}
+    """A part for each integrator, but in quick runs for BDF2, whose line searches take long."""
+    chosen = [name for name in INTEGRATORS if name != "bdf2" or not quick]
+    return {name: partial(vibration, name, quick) for name in chosen}
 
 
 def finding(record: common.Record) -> str:
