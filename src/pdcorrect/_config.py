@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -142,7 +143,7 @@ def as_toml(value: object) -> str:
 
 def explained(error: ValidationError, model: type[BaseModel]) -> str:
     """One paragraph: each wrong key, its value, and what was expected."""
-    tables = list(_tables(model.model_json_schema()))
+    tables = _tables_of(model)
     sentences = dict.fromkeys(_sentence(item, tables) for item in error.errors())
     return " ".join(" ".join(sentences).split())
 
@@ -151,7 +152,7 @@ _Table = tuple[str, str, frozenset[str]]
 """Header as in TOML ("" for the top), what chooses it of several kinds, and its keys."""
 
 
-def _sentence(item: ErrorDetails, tables: list[_Table]) -> str:
+def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
     kind, location, value = item["type"], item["loc"], item["input"]
     context = item.get("ctx", {})
     key = _key(location, tables, kind == "extra_forbidden")
@@ -172,7 +173,7 @@ def _sentence(item: ErrorDetails, tables: list[_Table]) -> str:
     return told if told.endswith((".", "?")) else f"{told}."
 
 
-def _key(location: tuple[int | str, ...], tables: list[_Table], unknown: bool) -> str:
+def _key(location: tuple[int | str, ...], tables: Sequence[_Table], unknown: bool) -> str:
     """A key as the user wrote it, ``loads[0].force``: pydantic also names union members."""
     known = frozenset().union(*(keys for _, _, keys in tables))
     tagged = {header.strip("[]") for header, choice, _ in tables if choice}
@@ -196,7 +197,7 @@ def _shown(value: Any) -> str:
     return text if len(text) < _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
 
 
-def _advice(name: str, key: str, tables: list[_Table]) -> str:
+def _advice(name: str, key: str, tables: Sequence[_Table]) -> str:
     """What an unknown key was probably meant for."""
     header = ".".join(part for part in key.replace("]", "").replace("[", ".").split(".")[:-1])
     own = f"[{'.'.join(part for part in header.split('.') if not part.isdigit())}]".strip("[]")
@@ -216,6 +217,11 @@ def _advice(name: str, key: str, tables: list[_Table]) -> str:
             header = min(h for h, _, keys in tables if close[0] in keys) or "the top"
             return f"did you mean {close[0]}{'' if here else f' of {header}'}?"
     return "remove it or check its spelling."
+
+
+@functools.cache
+def _tables_of(model: type[BaseModel]) -> tuple[_Table, ...]:
+    return tuple(_tables(model.model_json_schema()))
 
 
 def _tables(schema: Mapping[str, Any]) -> Iterator[_Table]:

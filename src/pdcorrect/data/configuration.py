@@ -210,7 +210,7 @@ class DatasetConfig(TomlConfig):
         taken = {TRAINING, VALIDATION, EVALUATION}
         for number, split in enumerate(self.extra):
             if split.name in taken:
-                key = f"extra.{number}.name = {as_toml(split.name)}"
+                key = f"extra[{number}].name = {as_toml(split.name)}"
                 raise ValueError(f"{key}: is taken; expected a name of its own")
             taken.add(split.name)
         return self

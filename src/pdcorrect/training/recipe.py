@@ -351,19 +351,19 @@ class TrainingConfig(TomlConfig):
         for k, stage in enumerate(self.stages):
             if stage.loss.ahead is not None and self.velocity != "recomputed":
                 raise ValueError(
-                    f"stages.{k}: loss.ahead is of velocities that are differences of positions, "
+                    f"stages[{k}]: loss.ahead is of velocities that are differences of positions, "
                     "as the reference's are: expected velocity = 'recomputed'"
                 )
             if placement != "state" and stage.teacher is not None:
-                raise ValueError(f"stages.{k}: a teacher teaches corrections of states only")
+                raise ValueError(f"stages[{k}]: a teacher teaches corrections of states only")
             if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
                 raise ValueError(
-                    f"stages.{k}: a correction of forces is only learned through the solver: "
+                    f"stages[{k}]: a correction of forces is only learned through the solver: "
                     "expected kind = 'unrolled', through_solver = true"
                 )
             if placement == "guess" and stage.kind == "unrolled":
                 raise ValueError(
-                    f"stages.{k}: a first guess does not change a step's result: expected kind = "
+                    f"stages[{k}]: a first guess does not change a step's result: expected kind = "
                     "'one-step'"
                 )
         return self
