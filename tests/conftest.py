@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from pdcorrect.cli import main as cli
+from pdcorrect.cli import program as cli
+from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
 from pdcorrect.fem.operators import Space
 from pdcorrect.fem.problem import problem_from_body
-from pdcorrect.fem.clamps import Selector
 
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from pdcorrect.scene import voxels as shapes
 from pdcorrect.fem.mesh import refine as cut
 from pdcorrect.fem.mesh import voxel_mesh
+from pdcorrect.scene import voxels as shapes
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
