@@ -1,0 +1,556 @@
+"""Data sets of other solvers' results: arrays, files of arrays, and files of runs."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pdcorrect as pc
+import reader_samples as samples
+from conftest import beam
+from pdcorrect.data.check import check_dataset
+from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
+from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
+from pdcorrect.data.schema import write_shard
+from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.errors import FileFormatError, InputError, MeshError
+from pdcorrect.solvers.rollout import restrict
+
+# --- arrays ----------------------------------------------------------------------------
+
+
+def arguments(**changes):
+    """What another solver would give, from a synthetic file."""
+    shard = samples.shard(steps=(4, 3))
+
+    def held(positions):
+        return np.where(shard.free, positions, shard.points)
+
+    motions = [
+        ImportedMotion(
+            held(one.runs["reference"].positions),
+            one.forces,
+            held(one.runs["plain"].positions),
+            held(one.runs["plain"].predictions),
+        )
+        for one in shard.simulations
+    ]
+    return {
+        "points": shard.points, "cells": shard.cells, "motions": motions, "free": shard.free,
+        "young": shard.young, "poisson": 0.4, "density": shard.density, "time_step": 0.02,
+        **changes,
+    }  # fmt: skip
+
+
+def test_imported_arrays_are_a_file_of_a_data_set(tmp_path):
+    given = arguments()
+    shard = shard_from_arrays(**given)
+    path = tmp_path / "training" / "mesh-0000.h5"
+    write_shard(path, shard, "float64")
+    found = read_shard(path)
+    assert (found.points == given["points"]).all()
+    assert (found.young == given["young"]).all()
+    assert (found.poisson == 0.4).all()
+    assert found.attributes["setting"] == "imported"
+    volume = 0.1**3 * len(found.cells)
+    np.testing.assert_allclose(found.mass.sum(), given["density"].mean() * volume)
+    for one, motion in zip(found.simulations, given["motions"], strict=True):
+        assert (one.runs["reference"].positions == motion.reference).all()
+        assert (one.runs["plain"].positions == motion.coarse).all()
+        assert (one.runs["plain"].predictions == motion.predictions).all()
+        assert (one.forces == motion.forces).all()
+    alone = given["motions"][0]
+    (one,) = shard_from_arrays(**arguments(motions=alone)).simulations
+    assert (one.runs["reference"].positions == alone.reference).all()
+    (one,) = shard_from_arrays(**arguments(motions=[ImportedMotion(alone.reference)])).simulations
+    assert set(one.runs) == {"reference"}  # which is enough
+    assert one.forces.shape == (4, 24, 3)
+    assert not one.forces.any()
+
+
+def motion_with(**changes):
+    return [replace(arguments()["motions"][0], **changes)]
+
+
+def with_entry(values, place, value):
+    changed = np.array(values)
+    changed[place] = value
+    return changed
+
+
+REFERENCE = arguments()["motions"][0].reference
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"points": np.zeros((24, 2))}, r"nodes \(24, 2\)"),
+        ({"free": np.ones((24, 3))}, r"free: float64 of shape \(24, 3\)"),
+        ({"young": np.ones(5)}, r"young: shape \(5,\)"),
+        ({"young": 0.0}, "young: 0"),
+        ({"poisson": 0.5}, "poisson"),
+        ({"density": np.full(6, np.nan)}, r"density: not finite at \[0\]"),
+        ({"time_step": 0.0}, "time_step = 0.0"),
+        ({"mass": np.zeros(24)}, "mass"),
+        ({"motions": []}, "simulations"),
+        (
+            {"motions": motion_with(reference=REFERENCE[:, :20])},
+            r"simulation 0, reference: shape \(5, 20, 3\)",
+        ),
+        ({"motions": motion_with(reference=REFERENCE[:1])}, "reference: 1 frames"),
+        (
+            {"motions": motion_with(reference=with_entry(REFERENCE, (2, 3, 1), np.nan))},
+            r"reference: not finite at \[2, 3, 1\]",
+        ),
+        (
+            {"motions": motion_with(reference=REFERENCE + 0.01)},
+            "reference: in frame 0 node",
+        ),
+        (
+            {"motions": motion_with(coarse=REFERENCE + 0.01)},
+            "coarse: in frame 0 node",
+        ),
+        (
+            {"motions": motion_with(reference=with_entry(REFERENCE, (3, -1), 0))},
+            "reference: in frame 3 cell 5",
+        ),
+        (
+            {"motions": motion_with(reference=3.0)},
+            r"reference: shape \(\)",
+        ),
+        ({"motions": [REFERENCE]}, "simulation 0: ndarray"),
+        (
+            {"motions": motion_with(reference=with_entry(REFERENCE, (3, 0, 1), 0.01))},
+            r"simulation 0, reference\[3\]: node 0 .* y .*0.01 m",
+        ),
+        (
+            {"motions": motion_with(coarse=with_entry(REFERENCE, (2, 0, 0), 0.01))},
+            r"coarse\[2\]: node 0 .* x",
+        ),
+        (
+            {"motions": motion_with(predictions=with_entry(REFERENCE[1:], (0, -1, 2), 0.0))},
+            r"predictions\[0\]: node 23 .* z",
+        ),
+        (
+            {"motions": motion_with(forces=1j * np.zeros((4, 24, 3)))},
+            "forces: complex128",
+        ),
+        ({"motions": motion_with(reference=REFERENCE.astype(str))}, "reference: <U.*"),
+        ({"points": 1j * np.zeros((24, 3))}, "points: complex128"),
+        (
+            {"cells": arguments()["cells"] + 0.5},
+            r"cells: .*\.5 at \[0, 0\]",
+        ),
+        ({"cells": [[0, 1], [0]]}, "cells"),
+        ({"free": 2 * np.ones((24, 3), int)}, r"free: int64 of shape \(24, 3\)"),
+        ({"time_step": "0.02"}, "time_step: <U4"),
+        ({"motions": motion_with(forces=np.zeros((5, 24, 3)))}, r"forces: shape \(5, 24, 3\)"),
+        ({"motions": motion_with(predictions=REFERENCE)}, r"predictions: shape \(5, 24, 3\)"),
+    ],
+)
+def test_wrong_arrays_are_refused_with_the_place(changes, words):
+    with pytest.raises(InputError, match=words) as caught:
+        shard_from_arrays(**arguments(**changes))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["coarse", "predictions"])
+def test_simulations_of_a_mesh_have_the_same_runs(name):
+    first, second = arguments()["motions"]
+    with pytest.raises(InputError, match=f"simulation 1 .* {name}"):
+        shard_from_arrays(**arguments(motions=[first, replace(second, **{name: None})]))
+
+
+def test_an_inverted_mesh_is_refused():
+    cells = arguments()["cells"].copy()
+    cells[2] = cells[2][[4, 5, 6, 7, 0, 1, 2, 3]]
+    with pytest.raises(MeshError, match="cell 2 "):
+        shard_from_arrays(**arguments(cells=cells))
+
+
+def test_what_is_imported_is_what_the_check_accepts(tmp_path):
+    """Frame 0 and held nodes come as float32, far from the origin, and are stored as at rest."""
+    given = arguments()
+    away = np.array([30.0, -20.0, 10.0])
+    motions = [
+        ImportedMotion(*(
+            np.float32(x + away) if name != "forces" else x for name, x in vars(one).items()
+        ))
+        for one in given["motions"]
+    ]  # fmt: skip
+    shard = shard_from_arrays(**{**given, "points": given["points"] + away, "motions": motions})
+    for dtype in ("float32", "float64"):
+        root = tmp_path / dtype
+        write_shard(root / "training/mesh-0000.h5", shard, dtype)
+        assert check_dataset(root) == []
+
+
+def test_numbers_of_other_types_mean_the_same():
+    given = arguments()
+    shard = shard_from_arrays(
+        **{**given, "cells": given["cells"].astype(float), "free": given["free"].astype(np.int8)}
+    )
+    assert (shard.cells == given["cells"]).all()
+    assert (shard.free == given["free"]).all()
+    assert shard.free.dtype == bool
+
+
+def scene_arguments(**changes):
+    """A scene and what another solver would give on its mesh."""
+    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 3}, **changes)
+    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 3}))
+    materials = problem.materials
+    reference = pc.rollout(pc.ProjectiveDynamics(problem)).positions
+    return {
+        "points": problem.positions, "cells": problem.cells, "motions": ImportedMotion(reference),
+        "free": problem.free, "young": materials.young, "poisson": materials.poisson,
+        "density": materials.density, "time_step": 0.01, "scene": scene,
+    }  # fmt: skip
+
+
+def test_a_time_step_that_is_nearly_the_scenes_is_the_scenes():
+    given = scene_arguments()
+    for step, expected in ((0.009999999999999998, 0.01), (0.0125, 0.0125)):
+        shard = shard_from_arrays(**{**given, "time_step": step})
+        assert shard.attributes["time_step"] == expected
+        assert pc.Scene.from_toml(shard.simulations[0].scene_toml).time.step == expected
+
+
+MOVING = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"body": {"cells": [2, 1, 1]}}, "mesh"),
+        ({"material": {"young": 2e6}}, "young"),
+        ({"clamps": []}, "free"),
+        ({"time": {"step": 0.01, "frames": 3, "integrator": "bdf2"}}, "'bdf2'"),
+        ({"solver": {"element": "hex27"}}, "'hex27'"),
+        (
+            {"clamps": [{"region": {"plane": "x", "at": 0.0}, "motion": MOVING}]},
+            r"predictions\[2\]: node 0 .* z ",
+        ),
+    ],
+)
+def test_a_scene_of_something_else_is_refused(changes, words):
+    given = scene_arguments()
+    given["scene"] = given["scene"].with_changes(**changes)
+    with pytest.raises(InputError, match=words):
+        shard_from_arrays(**given)
+
+
+# --- files of arrays -------------------------------------------------------------------
+
+
+def saved_arrays(path, **changes):
+    given = arguments()
+    first, second = given.pop("motions")
+    arrays = {
+        **given, "reference_0": first.reference, "forces_0": first.forces,
+        "predictions_0": first.predictions, "reference_1": second.reference,
+        "predictions_1": second.predictions, **changes,
+    }  # fmt: skip
+    np.savez(path, **{name: values for name, values in arrays.items() if values is not None})
+    return path
+
+
+def test_an_npz_file_is_imported(tmp_path):
+    source = saved_arrays(tmp_path / "run.npz")
+    path = import_trajectories([source], tmp_path / "set", split="validation", number=3)
+    assert path == tmp_path / "set" / "validation" / "mesh-0003.h5"
+    one, other = read_shard(path).simulations
+    assert set(one.runs) == set(other.runs) == {"reference", "plain"}
+    assert one.runs["plain"].predictions.shape == (4, 24, 3)
+    assert other.runs["plain"].predictions.shape == (3, 24, 3)
+    assert one.runs["plain"].positions is None
+    assert one.forces.any()
+    assert not other.forces.any()
+    with pytest.raises(InputError, match=r"mesh-0003\.h5"):
+        import_trajectories([source], tmp_path / "set", split="validation", number=3)
+
+
+def test_an_imported_set_without_forces_passes_the_check(tmp_path):
+    moved = np.asarray(arguments()["motions"][0].reference).copy()
+    moved[1:] += 0.01 * (moved[1:] - moved[0])
+    still = np.zeros((len(moved) - 1, *moved.shape[1:]))
+    first = arguments()["motions"][0].reference
+    free = np.ones_like(arguments()["free"])
+    motions = [ImportedMotion(first, forces=still), ImportedMotion(moved, forces=still)]
+    path = tmp_path / "set" / "training" / "mesh-0000.h5"
+    write_shard(path, shard_from_arrays(**arguments(motions=motions, free=free)))
+    assert check_dataset(tmp_path / "set") == []
+    twice = [ImportedMotion(first, forces=still)] * 2
+    write_shard(path, shard_from_arrays(**arguments(motions=twice, free=free)), overwrite=True)
+    (finding,) = check_dataset(tmp_path / "set")
+    assert "simulation 0001" in finding.message
+    assert "simulation 0000" in finding.message
+
+
+def test_wrong_npz_files_are_refused_by_name(tmp_path):
+    (tmp_path / "text.npz").write_text("text")
+    with (tmp_path / "npy.npz").open("wb") as file:
+        np.save(file, REFERENCE)
+    for source, kind, words in (
+        (tmp_path / "none.npz", FileFormatError, "none.npz"),
+        (tmp_path / "text.npz", FileFormatError, "text.npz"),
+        (tmp_path / "npy.npz", FileFormatError, "npy.npz"),
+        (saved_arrays(tmp_path / "a.npz", free=None), InputError, "a.npz: .*'free'"),
+        (saved_arrays(tmp_path / "b.npz", young=[1.0]), InputError, "b.npz: young"),
+        (saved_arrays(tmp_path / "c.npz", reference_0=None), InputError, "c.npz: .*'reference"),
+        (saved_arrays(tmp_path / "d.npz", reference_1=3.0), InputError, r"1, reference: .*\(\)"),
+    ):
+        with pytest.raises(kind, match=words) as caught:
+            import_trajectories([source], tmp_path / "set")
+        assert str(caught.value).count(source.name) == 1
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "set").exists()
+
+
+NONE = {"reference_0": None, "reference_1": None}
+ALONE = {"reference": REFERENCE, **NONE}
+NO_MORE = {"forces_0": None, "predictions_0": None, "predictions_1": None}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"predicions_0": REFERENCE[1:]}, "'predicions_0'.*'predictions_0'"),
+        ({"colour": [1.0]}, "'colour'"),
+        ({"predictions": REFERENCE[1:]}, "'predictions'"),
+        ({"reference": REFERENCE}, "'reference' and 'reference_0'"),
+        ({"reference_3": REFERENCE}, "'reference_3'"),
+        ({"forces_2": REFERENCE[1:]}, "'forces_2'"),
+        (ALONE, "'forces_0'"),
+        ({**ALONE, **NO_MORE, "force": REFERENCE[1:]}, "'force'.*'forces'"),
+    ],
+)
+def test_arrays_that_would_be_left_out_are_refused(tmp_path, changes, words):
+    source = saved_arrays(tmp_path / "run.npz", **changes)
+    with pytest.raises(InputError, match=words):
+        import_trajectories([source], tmp_path / "set")
+
+
+def test_damaged_npz_files_are_refused_in_one_paragraph(tmp_path):
+    given = arguments()
+    arrays = {**given, "reference": given.pop("motions")[0].reference}
+    arrays.pop("motions")
+    source = tmp_path / "run.npz"
+    np.savez_compressed(source, **arrays)
+    whole = source.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for trial in range(150):
+        data = bytearray(whole)
+        if trial % 3 == 0:
+            data = data[: rng.integers(len(data))]
+        else:
+            place = rng.integers(len(data))
+            data[place : place + 4] = rng.bytes(4)
+        source.write_bytes(data)
+        shutil.rmtree(tmp_path / "set", ignore_errors=True)
+        try:
+            import_trajectories([source], tmp_path / "set")
+        except InputError as error:
+            assert str(error).startswith(f"{source}: ")
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 100
+
+
+def test_data_sets_neither_take_imports_nor_are_imported(tmp_path):
+    source = saved_arrays(tmp_path / "run.npz")
+    (tmp_path / "config.toml").write_text("")
+    with pytest.raises(InputError, match=r"config\.toml"):
+        import_trajectories([source], tmp_path, split="extra")
+    assert not (tmp_path / "extra").exists()
+    root = samples.write(tmp_path / "set", [samples.shard(steps=(3,))])
+    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
+        import_trajectories([root / "training/mesh-0000.h5"], tmp_path / "other")
+
+
+# --- files of runs ---------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """A fine and a coarse run of a beam."""
+    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4})
+    found = [
+        pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine=refine))) for refine in (2, 1)
+    ]
+    return [replace(run, scene_toml=scene.to_toml()) for run in found]
+
+
+def test_runs_of_simulate_become_a_file_with_predictions(runs):
+    fine, coarse = runs
+    shard = shard_from_trajectories(fine, coarse)
+    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}))
+    truth = restrict(fine, problem)
+    (found,) = shard.simulations
+    np.testing.assert_array_equal(found.runs["reference"].positions, truth.positions)
+    np.testing.assert_array_equal(found.runs["plain"].positions, coarse.positions)
+    np.testing.assert_allclose(shard.mass, problem.mass)
+    assert (shard.free == problem.free).all()
+    np.testing.assert_allclose(found.forces[2], problem.external_forces(0.02, 0.03))
+    # From rest, one step of the coarse model is the first of its own run.
+    step = found.runs["plain"].predictions
+    np.testing.assert_allclose(step[0], coarse.positions[1], atol=1e-7)
+    velocity = (truth.positions[2] - truth.positions[1]) / 0.01
+    expected = pc.ProjectiveDynamics(problem)(pc.State(truth.positions[2], velocity, 0.02))
+    np.testing.assert_allclose(step[2], expected.state.positions, atol=1e-7)
+
+
+def rerun(run, **changes):
+    """A run by whose file its scene is another."""
+    return replace(
+        run, scene_toml=pc.Scene.from_toml(run.scene_toml).with_changes(**changes).to_toml()
+    )
+
+
+def with_attributes(run, **attributes):
+    return replace(run, attributes={**run.attributes, **attributes})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda run: rerun(run, material={"young": 2e6}), "material"),
+        (lambda run: rerun(run, loads=[]), "loads"),
+        (lambda run: rerun(run, clamps=[]), "clamps"),
+        (lambda run: rerun(run, body={"cells": [3, 2, 1]}), "body"),
+        (lambda run: rerun(run, damping={"mass": 1.0}), "damping"),
+        (lambda run: replace(run, times=2 * run.times), "frame 1 .*0.02 s.*0.01 s"),
+        (
+            lambda run: replace(run, times=run.times[:-1], positions=run.positions[:-1]),
+            "coarse run .* 3 .* 4",
+        ),
+        (lambda run: replace(run, scene_toml=""), "coarse run"),
+        (
+            lambda run: with_attributes(run, material="changed after the scene"),
+            "coarse run .* material",
+        ),
+        (lambda run: with_attributes(run, integrator="midpoint"), "coarse run .*'midpoint'"),
+    ],
+)
+def test_a_coarse_run_of_another_simulation_is_refused(runs, change, words):
+    fine, coarse = runs
+    with pytest.raises(InputError, match=words):
+        shard_from_trajectories(fine, change(coarse))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda run: with_attributes(run, material="changed after the scene"),
+            "reference .* material",
+        ),
+        (lambda run: with_attributes(run, integrator="bdf2"), "reference .*'bdf2'"),
+        (
+            lambda run: rerun(run, time={"step": 0.01, "frames": 4, "integrator": "quasi-static"}),
+            "reference .*'quasi-static'",
+        ),
+        (lambda run: replace(run, times=run.times + 1.0), "reference .* 1 s"),
+        (lambda run: replace(run, velocities=run.velocities + 0.5), r"reference .* 0\.5 m/s"),
+    ],
+)
+def test_a_reference_that_its_scene_does_not_describe_is_refused(runs, change, words):
+    with pytest.raises(InputError, match=words):
+        shard_from_trajectories(change(runs[0]))
+
+
+def quadratic_run(refine):
+    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}, solver={"element": "hex27"})
+    return pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine=refine)))
+
+
+def test_runs_that_do_not_belong_together_are_refused(runs):
+    fine, coarse = runs
+    quadratic = quadratic_run(1)
+    softer = beam(cells=(3, 1, 1), material={"young": 9e5}).to_toml()
+    motion = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]}
+    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": motion}]
+    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 2}, clamps=clamps)
+    moving = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
+    for references, rollouts, words in (
+        ([fine, fine], [coarse], "2 references and 1 "),
+        ([replace(fine, scene_toml="")], [], "scene"),
+        ([fine, replace(fine, scene_toml=softer)], [], "simulations 0 and 1 .* young"),
+        ([], [], "reference"),
+        (coarse, fine, "63 nodes.* 16"),
+        (quadratic, [], "reference.*'hex27'"),  # as the coarse model
+        (fine, quadratic, "coarse run.*'hex27'"),
+        (moving, [], r"reference\[2\]"),
+    ):
+        with pytest.raises(InputError, match=words):
+            shard_from_trajectories(references, rollouts)
+
+
+@pytest.mark.parametrize("refine", [1, 2])
+def test_a_reference_may_have_nodes_between_the_corners(runs, refine):
+    reference, coarse = quadratic_run(refine), runs[1]
+    (found,) = shard_from_trajectories(reference, coarse).simulations
+    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}))
+    positions = found.runs["reference"].positions
+    np.testing.assert_array_equal(positions, restrict(reference, problem).positions)
+    np.testing.assert_array_equal(positions[0], problem.positions)
+
+
+def test_the_coarse_runs_scene_is_the_coarse_models(runs):
+    fine, coarse = runs
+    other = rerun(coarse, solver={"element": "hex8-mean", "mass": "averaged"})
+    shard = shard_from_trajectories(fine, other)
+    (found,) = shard.simulations
+    assert found.scene_toml == other.scene_toml
+    problem = pc.discretise(pc.Scene.from_toml(other.scene_toml))
+    expected = pc.ProjectiveDynamics(problem)(problem.rest_state()).state.positions
+    np.testing.assert_allclose(found.runs["plain"].predictions[0], expected, atol=1e-12)
+    assert np.abs(expected - coarse.positions[1]).max() > 1e-6
+
+
+def test_the_best_coarse_models_run_is_computed_if_wanted(runs):
+    fine, coarse = runs
+    shard = shard_from_trajectories(fine, coarse, best=True)
+    (found,) = shard.simulations
+    scene = pc.best_coarse(pc.Scene.from_toml(coarse.scene_toml))
+    stepper = pc.ProjectiveDynamics(pc.discretise(scene))
+    run = found.runs["best"]
+    np.testing.assert_allclose(run.positions, pc.rollout(stepper).positions, atol=1e-12)
+    np.testing.assert_allclose(run.predictions[0], run.positions[1], atol=1e-7)
+    assert np.abs(run.positions - found.runs["plain"].positions).max() > 1e-6
+    better = rerun(coarse, solver={"element": "hex8-bubble", "mass": "averaged"})
+    with pytest.raises(InputError, match="'hex8-bubble'"):
+        shard_from_trajectories(fine, better, best=True)
+    with pytest.raises(InputError, match="scene"):
+        shard_from_arrays(**arguments(), best=True)
+
+
+def test_models_of_the_best_coarse_model_are_trained_and_judged_on_an_import(runs, tmp_path):
+    pytest.importorskip("torch")
+    from pdcorrect.evaluation.evaluation import evaluate
+    from pdcorrect.training.recordings import load_recordings, make_problems
+
+    path = tmp_path / "evaluation" / "mesh-0000.h5"
+    write_shard(path, shard_from_trajectories(*runs, split="evaluation", best=True))
+    (recording,) = load_recordings(tmp_path, "evaluation", "best")
+    (problem,) = make_problems([recording], "best")
+    assert problem.element == "hex8-bubble"
+    values, _ = evaluate([], tmp_path).runs["best"].values("omega")
+    assert np.isfinite(values).all()
+
+
+def test_an_imported_mesh_in_two_splits_is_a_warning(runs, tmp_path):
+    fine, coarse = runs
+    write_shard(tmp_path / "training" / "mesh-0000.h5", shard_from_trajectories(fine, coarse))
+    stronger = [
+        rerun(run, loads=[{"kind": "gravity", "acceleration": [0.0, 0.0, -4.0]}]) for run in runs
+    ]
+    path = tmp_path / "evaluation" / "mesh-0000.h5"
+    write_shard(path, shard_from_trajectories(*stronger, split="evaluation"))
+    (found,) = check_dataset(tmp_path)
+    assert found.severity == "warning"
+    path.unlink()
+    write_shard(path, shard_from_trajectories(fine, coarse, split="evaluation"))
+    assert "error" in {finding.severity for finding in check_dataset(tmp_path)}
