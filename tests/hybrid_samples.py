@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import pdcorrect as pc
-from conftest import beam
+from conftest import beam, box_mesh, disturbed, problem_on
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_bodies import BatchBodies
 from pdcorrect.corrector.corrector import Corrector
@@ -16,6 +16,13 @@ from pdcorrect.corrector.normaliser import RunningMoments
 
 PLACEMENTS = ("state", "force", "guess")
 TORSION = {"kind": "torsion", "strength": 3e3, "stretch": 0.01}
+CELL = 0.02
+"""Of all bodies here, m."""
+TINY = {
+    "node_features": ("load", "previous-correction"), "edge_features": ("stretch",), "layers": 1,
+    "width": 3,
+}  # fmt: skip
+"""A network with few weights that remembers."""
 PRESSURE = {"kind": "pressure", "region": {"plane": "z", "at": "max"}, "pressure": 300.0}
 
 
@@ -130,3 +137,42 @@ def prescribed(problem, answer, **changes):
     corrector = fitted([problem], kind=Prescribed, **changes)
     corrector.answer = np.asarray(answer, dtype=float)
     return corrector
+
+
+# --- states and corrections ------------------------------------------------------------------
+
+
+def same(a, b):
+    return np.array_equal(a.positions, b.positions) and np.array_equal(a.velocities, b.velocities)
+
+
+def bumped(problem, size=0.1, seed=0):
+    """A displacement of some cells, (N, 3), zero where clamped."""
+    return disturbed(problem, size, seed) - problem.positions
+
+
+def shaken(problem, speed=0.3, seed=1):
+    """At rest positions, but in motion."""
+    velocities = speed * np.random.default_rng(seed).normal(size=problem.positions.shape)
+    return pc.State(problem.positions, velocities * problem.free)
+
+
+def folded(problem):
+    """A correction that pushes the end of the beam through its last cells."""
+    x = problem.positions[:, 0]
+    return np.outer(np.isclose(x, x.max()), [-1.5 * CELL, 0.0, 0.0])
+
+
+def wild(problem):
+    """One without inverted cells, but with far more energy than the step has."""
+    stretch = np.zeros_like(problem.positions)
+    stretch[:, 0] = 0.5 * problem.positions[:, 0]
+    return stretch * problem.free
+
+
+def flying(speed=0.5):
+    """A free body in uniform motion along x, and its state."""
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2))
+    velocities = np.zeros_like(problem.positions)
+    velocities[:, 0] = speed
+    return problem, pc.State(problem.positions, velocities)

@@ -7,11 +7,11 @@ import torch
 
 from conftest import box_mesh
 from pdcorrect.corrector import features
+from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, Snapshot, View
-from pdcorrect.corrector.normaliser import Moments
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
+from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.fem.graph import mesh_edges
 
 SIZE, STEP = 0.1, 0.02
@@ -120,9 +120,9 @@ def fit(corrector, view):
         (NODE_FEATURES, config.node_features), (EDGE_FEATURES, config.edge_features),
     ):  # fmt: skip
         for name, values in features.values(table, names, view).items():
-            found[name] = Moments()
+            found[name] = RunningMoments()
             found[name].add(values)
-    target, averages, shapes, steps = (Moments() for _ in range(4))
+    target, averages, shapes, steps = (RunningMoments() for _ in range(4))
     target.add(torch.tensor([[0.1], [-0.3]]))
     corrector.normaliser.fit(found, target)
     averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
@@ -139,7 +139,7 @@ SMALL = {"layers": 2, "width": 16}
 
 def corrector(name="compact", view=None, seed=0, dtype=torch.float64, **changes):
     """A small one, fitted to a view; networks of one seed are alike."""
-    view = View(body(), moving(body())) if view is None else view
+    view = FeatureView(body(), moving(body())) if view is None else view
     torch.manual_seed(seed)
     made = Corrector(preset(name, **{**SMALL, **changes}))
     made.network.to(dtype)

@@ -1,0 +1,414 @@
+"""What a gate refuses: by inputs, volumes, energy, and steps that failed."""
+
+import numpy as np
+import pytest
+import torch
+
+import pdcorrect as pc
+from conftest import box_mesh, disturbed, problem_on
+from hybrid_samples import (
+    CELL,
+    PLACEMENTS,
+    PRESSURE,
+    TORSION,
+    Prescribed,
+    bumped,
+    fitted,
+    flying,
+    folded,
+    prescribed,
+    problems,
+    same,
+    shaken,
+    soft_beam,
+    wild,
+)
+from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchHybrid, BatchParts
+from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.gate import Gate, GateMeasures, Reason
+from pdcorrect.corrector.hybrid import HybridStepper
+from pdcorrect.corrector.normaliser import RunningMoments
+from pdcorrect.corrector.single_step import SingleCoarseStep
+from pdcorrect.errors import InputError
+
+OPEN = Gate(body=None, margin=None, average=None, volume=None, crushing=None, energy=None)
+
+
+def strange(problem):
+    """Forces far outside what the network has seen, and so its inputs."""
+    return np.random.default_rng(0).normal(size=problem.positions.shape) * 0.5
+
+
+CASES = {
+    Reason.NOT_FINITE: (OPEN, lambda p: np.full(p.positions.shape, np.nan), False),
+    Reason.FEATURES: (
+        Gate(volume=None, crushing=None, energy=None),
+        lambda p: 0.01 * bumped(p),
+        True,
+    ),
+    Reason.INVERSION: (Gate(margin=None, average=None, energy=None), folded, False),
+    Reason.ENERGY: (Gate(margin=None, average=None, volume=None, crushing=None), wild, False),
+}
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize("reason", CASES)
+def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason, placement):
+    gate, answer, pushed = CASES[reason]
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    correction = answer(problem)
+    if placement == "force" and reason in (Reason.INVERSION, Reason.ENERGY):
+        correction = 100.0 * correction  # the body resists
+    corrector = prescribed(problem, correction, placement=placement)
+    coarse = pc.ProjectiveDynamics(problem)
+    stepper = HybridStepper(coarse, corrector, gate=gate)
+    push = strange(problem) if pushed else None
+    found, plain = stepper(problem.rest_state(), push), coarse(problem.rest_state(), push)
+    assert found.stats["gate"] == reason
+    assert found.stats["refused"] == 1.0
+    assert found.stats["correction"] == 0.0
+    assert same(found.state, plain.state)
+    if reason is not Reason.NOT_FINITE:
+        open_ = HybridStepper(coarse, corrector, gate=OPEN)(problem.rest_state(), push)
+        assert open_.stats["refused"] == 0.0
+        assert not same(open_.state, plain.state)
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize("reason", [Reason.NOT_FINITE, Reason.INVERSION, Reason.ENERGY])
+def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason, placement):
+    gate, answer, _ = CASES[reason]
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, kind=Prescribed, placement=placement)
+    factor = 100.0 if placement == "force" else 1.0
+    small = 1e-4 * bumped(scenes[1])
+    corrector.answer = np.concatenate([factor * answer(scenes[0]), small])
+    stepper = pc.BatchStepper(scenes)
+    result = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+    plain = stepper(stepper.rest_state())
+    assert result.reasons.tolist() == [reason, 0]
+    assert result.refused.tolist() == [True, False]
+    assert torch.equal(result.state.positions[0], plain.state.positions[0])
+    assert torch.equal(result.state.velocities[0], plain.state.velocities[0])
+    assert not torch.equal(result.state.positions[1], plain.state.positions[1])
+    assert torch.isfinite(result.state.positions).all()
+    assert torch.isfinite(result.correction).all()
+    first = len(scenes[0].positions)
+    assert not result.correction[:first].any()
+    assert result.correction[first:].any()
+
+
+def test_inputs_unlike_the_training_data_are_refused_in_a_batch():
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes)
+    stepper = pc.BatchStepper(scenes)
+    states = [pc.State(disturbed(scenes[0], 0.3), shaken(scenes[0], 5.0).velocities)]
+    state = stepper.state([*states, scenes[1].rest_state()])
+    result = BatchHybrid(stepper, corrector, gate=Gate(volume=None, energy=None))(state)
+    assert result.reasons.tolist() == [Reason.FEATURES, 0]
+    calm = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
+    assert calm.reasons.tolist() == [0, 0]
+    assert calm.correction.any()
+    wide = BatchHybrid(
+        stepper, corrector, gate=Gate(margin=1e9, average=1e9, volume=None, energy=None)
+    )
+    assert wide(state).reasons.tolist() == [0, 0]
+
+
+def test_a_body_whose_mean_inputs_are_strange_is_refused_though_every_node_is_familiar():
+    """Fitted to two beams, of which one moves as it did, and one all of whose means are new."""
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector, averages = fitted(scenes), RunningMoments()
+    stepper = pc.BatchStepper(scenes)
+    state = stepper.rest_state()
+    open_ = Gate(volume=None, energy=None)
+    assert BatchHybrid(stepper, corrector, gate=open_)(state).reasons.tolist() == [0, 0]
+    seen = []
+    answer, corrector.of_view = corrector.of_view, lambda view: seen.append(view) or answer(view)
+    BatchHybrid(stepper, corrector)(state)
+    corrector.of_view = answer
+    familiar = seen[0].bodies.body_means(corrector.inputs(seen[0])[0])[:1]
+    averages.add(familiar.detach())
+    corrector.normaliser.fit_averages(averages)
+    away = corrector.unlike(seen[0]).tolist()
+    assert away[0] < 1e-6 < 1.0 < away[1]
+    for average, reason in ((0.9 * away[1], Reason.FEATURES), (1.1 * away[1], 0), (None, 0)):
+        gate = open_.model_copy(update={"average": average})
+        assert BatchHybrid(stepper, corrector, gate=gate)(state).reasons.tolist() == [0, reason]
+    for scene, (problem, reason) in enumerate(zip(scenes, (0, Reason.FEATURES), strict=True)):
+        gate = open_.model_copy(update={"average": 0.5})
+        one = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+        assert one(problem.rest_state()).stats["gate"] == reason, scene
+
+
+def test_a_limited_correction_is_scaled_back_until_it_passes():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, folded(problem))
+    gate = Gate(margin=None, average=None, energy=None, limit=True)
+    coarse = pc.ProjectiveDynamics(problem)
+    result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
+    factor = result.stats["correction_factor"]
+    assert result.stats["refused"] == 0.0
+    assert factor in (0.5, 0.25, 0.125)
+    assert result.stats["smallest_volume_ratio"] > 0.0
+    way = result.state.positions - coarse(problem.rest_state()).state.positions
+    assert np.allclose(way, factor * corrector.answer, rtol=0, atol=1e-15)
+    stepper = pc.BatchStepper([problem])
+    many = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+    assert many.factors.tolist() == [factor]
+    assert many.reasons.tolist() == [0]
+    corrector.answer = 1e4 * corrector.answer  # which a limit does not mend
+    result = HybridStepper(coarse, corrector, gate=gate)(problem.rest_state())
+    assert result.stats["gate"] == Reason.INVERSION
+    assert same(result.state, coarse(problem.rest_state()).state)
+
+
+def test_a_correction_may_improve_what_the_coarse_step_inverted():
+    problem = pc.discretise(soft_beam(loads=[]))
+    bad = pc.State(problem.positions + folded(problem), np.zeros_like(problem.positions))
+    coarse = pc.ProjectiveDynamics(problem)
+    answer = coarse(bad).state.positions
+    corrector = prescribed(problem, 0.5 * (problem.positions - answer))
+    ratio = problem.volume_ratios(answer).min()
+    gate = Gate(margin=None, average=None, energy=None, volume=float(ratio) + 10.0)
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["refused"] == 0.0
+    corrector.answer = -corrector.answer
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["gate"] == Reason.INVERSION
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_failed_coarse_step_is_not_corrected(placement):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    corrector = prescribed(problem, bumped(problem), placement=placement)
+    coarse = pc.ProjectiveDynamics(problem, 1e-13, max_iterations=1, recover=False)
+    result, plain = (s(shaken(problem)) for s in (HybridStepper(coarse, corrector), coarse))
+    assert not plain.status.ok
+    assert result.status is plain.status
+    assert same(result.state, plain.state)
+    assert result.stats["gate"] == Reason.SOLVER
+    assert result.stats["correction"] == 0.0
+    scenes = problems((3, 1, 1), (2, 2, 1))
+    corrector = fitted(scenes, placement=placement)
+    stepper = pc.BatchStepper(scenes, 1e-13, max_iterations=1, recover=False)
+    state = stepper.state([shaken(p) for p in scenes])
+    result, plain = BatchHybrid(stepper, corrector)(state), stepper(state)
+    assert result.reasons.tolist() == [Reason.SOLVER] * 2
+    assert torch.equal(result.state.positions, plain.state.positions)
+    assert not result.correction.any()
+
+
+def measured(ratios, stored=1.0, work=0.0):
+    """Of scenes with some smallest det F in their cells."""
+    ratios = torch.tensor(ratios, dtype=torch.float64)
+    one = torch.ones(len(ratios), dtype=torch.float64)
+    return GateMeasures(ratios, stored * one, work * one)
+
+
+@pytest.mark.parametrize(
+    ("ratios", "passes"),
+    [
+        ([-1.0, 0.9], True),  # as it was
+        ([-0.5, 0.9], True),  # better, though not good
+        ([-1.0, -0.5], False),  # inverts a cell that was not the worst one
+        ([0.5, -1e-9], False),
+        ([-1.1, 0.9], False),  # worse than inverted
+        ([-1.0, 0.091], True),
+        ([-1.0, 0.089], False),  # below a tenth of the coarse answer's
+        ([np.nan, 0.9], False),
+        ([-1.0, np.nan], False),
+    ],
+)
+def test_a_gate_looks_at_each_cell(ratios, passes):
+    coarse = measured([[-1.0, 0.9, np.inf], [1.0, 1.0, 1.0]])
+    answer = measured([[*ratios, np.inf], [1.0, 1.0, 1.0]])
+    found = Gate().reasons(answer, coarse, None)
+    assert found.tolist() == [0 if passes else Reason.INVERSION, 0]
+    found = Gate().reasons(
+        measured([[1.0, 1.0, 1.0], [*ratios, 1.0]]), measured([[1.0] * 3, [-1.0, 0.9, 1.0]]), None
+    )
+    assert found.tolist() == [0, 0 if passes else Reason.INVERSION]
+
+
+def test_tests_of_volume_are_switched_off_one_by_one():
+    coarse = measured([[1.0, 1.0]])
+    crushed, inverted = measured([[1.0, 0.05]]), measured([[1.0, -0.5]])
+    for gate, expected in (
+        (Gate(crushing=None), (0, Reason.INVERSION)),
+        (Gate(volume=None), (Reason.INVERSION, Reason.INVERSION)),
+        (Gate(volume=None, crushing=None), (0, 0)),
+        (Gate(crushing=0.05), (0, Reason.INVERSION)),
+    ):
+        found = [int(gate.reasons(x, coarse, None)) for x in (crushed, inverted)]
+        assert found == list(expected)
+
+
+def test_a_crushed_cell_refuses_a_correction():
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    flat = -(problem.positions - problem.positions[0]) * [0.0, 0.0, 1.0]
+    held_at = problem.positions[:, :1] / (3 * CELL)  # the held end stays
+    corrector = prescribed(problem, flat * held_at)
+    stepper = pc.BatchStepper([problem])
+    for gate, reason in (
+        (Gate(margin=None, average=None, energy=None), Reason.INVERSION),
+        (Gate(margin=None, average=None, energy=None, crushing=None), Reason.NONE),
+    ):
+        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
+        assert hybrid(problem.rest_state()).stats["gate"] == reason
+        many = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
+        assert many.reasons.tolist() == [reason]
+
+
+@pytest.mark.parametrize("placement", ["state", "force"])
+@pytest.mark.parametrize(
+    ("push", "refused"), [(0.999, False), (1.001, True), (100.0, True), (-1.5, False), (-3.1, True)]
+)
+def test_the_bound_on_energy_does_not_grow_with_the_correction(placement, push, refused):
+    """A push of x times the way makes the energy (1 + x)^2 times as large; 4 is allowed."""
+    problem, before = flying()
+    way = np.zeros_like(problem.positions)
+    way[:, 0] = push * problem.time_step * before.velocities[:, 0]
+    corrector = prescribed(problem, way, placement=placement)
+    gate = Gate(margin=None, average=None, energy=3.0)
+    result = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)(before)
+    assert result.stats["gate"] == (Reason.ENERGY if refused else 0)
+    stepper = pc.BatchStepper([problem], 1e-10)
+    many = BatchHybrid(stepper, corrector, gate=gate)(stepper.state([before]))
+    assert many.reasons.tolist() == [Reason.ENERGY if refused else 0]
+
+
+@pytest.mark.parametrize(
+    ("gate", "heavier", "refused"),
+    [
+        (Gate(margin=None, average=None), 4.0, False),
+        (Gate(margin=None, average=None), 5.89, False),
+        (Gate(margin=None, average=None), 5.90, True),
+        (Gate(margin=None, average=None, energy=1.0), 2.73, False),
+        (Gate(margin=None, average=None, energy=1.0), 2.74, True),
+    ],
+)
+def test_a_kick_s_right_answer_passes_where_the_coarse_mass_is_four_times_too_heavy(
+    gate, heavier, refused
+):
+    """From rest energy less work rises by (r - 1)^2/3 of the coarse step's energy and work."""
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2))
+    kick = np.zeros_like(problem.positions)
+    kick[:, 0] = 10.0 * problem.mass
+    result = pc.ProjectiveDynamics(problem, 1e-10)(problem.rest_state(), kick)
+    way = result.state.positions - problem.positions
+    corrector = prescribed(problem, (heavier - 1.0) * way)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)
+    assert hybrid(problem.rest_state(), kick).stats["refused"] == refused
+
+
+@pytest.mark.parametrize(
+    ("push", "steps"), [(-0.5, ["forced"]), (0.5, ["forced", "plain"]), (9.0, ["forced", "plain"])]
+)
+def test_the_plain_step_is_solved_only_where_energy_rises_beyond_the_loads_work(push, steps):
+    problem, before = flying()
+    way = np.zeros_like(problem.positions)
+    way[:, 0] = push * problem.time_step * before.velocities[:, 0]
+    corrector = prescribed(problem, way, placement="force")
+    taken = []
+
+    class Counting(pc.ProjectiveDynamics):
+        def __call__(self, state, forces=None, *args, **options):
+            taken.append("plain" if forces is None else "forced")
+            return super().__call__(state, forces, *args, **options)
+
+    gate = Gate(margin=None, average=None, energy=3.0)
+    result = HybridStepper(Counting(problem), corrector, gate=gate)(before)
+    assert taken == steps
+    assert result.stats["refused"] == (push == 9.0)
+
+
+@pytest.mark.parametrize("push", [False, True])
+def test_the_work_of_a_correction_s_forces_is_no_work_of_loads(push):
+    problem = pc.discretise(soft_beam(loads=[PRESSURE]))
+    corrector = prescribed(problem, bumped(problem), placement="force")
+    stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+    before = shaken(problem)
+    extra = np.full(problem.positions.shape, 1e-3) if push else None
+    result = stepper(before, extra)
+    loads = problem.external_forces(0.0, problem.time_step) + (0.0 if extra is None else extra)
+    work = np.vdot(loads, result.state.positions - before.positions)
+    assert result.stats["correction"] > 0.0
+    assert result.stats["external_work"] == pytest.approx(work, rel=1e-9)
+    other = stepper.coarse(before, extra).stats["external_work"]
+    assert abs(other - work) > 0.1 * abs(work)
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("integrator", ["backward-euler", "midpoint"])
+def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element):
+    scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
+    corrector, shifts = fitted(scenes), [bumped(p) for p in scenes]
+    stepper = pc.BatchStepper(scenes, 1e-12, integrator=integrator)
+    states = [pc.State(disturbed(p, 0.1), shaken(p).velocities) for p in scenes]
+    many = BatchCoarseStep(
+        BatchParts(stepper, corrector, "recomputed"), stepper.state(states), None
+    )
+    answer = many.solved()
+    many.view(answer)
+    moved = many.moved(answer, torch.tensor(np.concatenate(shifts)))
+    for i, (problem, state, shift) in enumerate(zip(scenes, states, shifts, strict=True)):
+        coarse = pc.ProjectiveDynamics(problem, 1e-12, integrator=integrator)
+        bodies = BodyGraph.of([problem], dtype=torch.float64)
+        one = SingleCoarseStep(coarse, bodies, "recomputed", state)
+        alone = one.solved()
+        pairs = (
+            (many.measured(answer), one.measured(alone), True),
+            (many.measured(moved), one.measured(one.moved(alone, shift)), False),
+            (many.before(), one.before(), True),
+        )
+        for found, expected, same_modes in pairs:
+            if found is None:
+                assert element == "hex8-bubble"
+                continue
+            count = len(problem.cells)
+            ratios = found.ratios[i, :count].numpy()
+            assert ratios == pytest.approx(expected.ratios[0], rel=1e-8)
+            assert torch.isinf(found.ratios[i, count:]).all()
+            assert float(found.work[i]) == pytest.approx(expected.work[0], rel=1e-8)
+            stored, least = float(found.stored[i]), float(expected.stored[0])
+            if same_modes or element == "hex8" or integrator == "midpoint":
+                assert stored == pytest.approx(least, rel=1e-8)
+            else:
+                assert stored > least
+
+
+def test_a_gate_judges_arrays_as_it_judges_tensors():
+    rng, gates = np.random.default_rng(0), (Gate(), Gate(volume=None), Gate(crushing=None))
+    numbers = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    others = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
+    numbers[0][0, 0] = others[0][1, 1] = numbers[1][2] = others[2][3] = np.nan
+    arrays = GateMeasures(*numbers), GateMeasures(*others)
+    tensors = [GateMeasures(*map(torch.tensor, each)) for each in (numbers, others)]
+    for gate in gates:
+        for rise in (None, 0.0, 0.5):
+            found, expected = gate.reasons(*arrays, rise), gate.reasons(*tensors, rise)
+            assert found.dtype == np.int64
+            assert np.array_equal(found, expected.numpy())
+            assert len(set(found.tolist())) == (2 if rise is None else 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"margin": -1.0}, "margin = -1.0"),
+        ({"share": 1.0}, "share = 1.0"),
+        ({"energy": float("nan")}, "energy = nan"),
+        ({"time_step": -0.1}, "time_step = -0.1"),
+        ({"time_step": "0.1"}, 'time_step = "0.1"'),
+        ({"time_step": float("nan")}, "time_step = nan"),
+        ({"time_step": True}, "time_step = true"),
+        ({"pause": -1}, "pause = -1"),
+        ({"pause": 2.5}, "pause = 2.5"),
+        ({"pause": True}, "pause = true"),
+        ({"pause": "5"}, 'pause = "5"'),
+        ({"pause": None}, "pause = None"),
+        ({"step": 0.1}, "step: unknown key"),
+    ],
+)
+def test_bounds_without_meaning_are_refused_by_key_and_value(changes, told):
+    with pytest.raises(InputError, match=f"^gate: {told}"):
+        Gate(**changes)
