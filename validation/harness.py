@@ -355,5 +355,7 @@ def run(
         if record.error:
             tell(record.error)
         found.append((case, record))
+    if importlib.util.find_spec("matplotlib") is None:
+        tell("no figures: they need the extra 'view'")
     tell(f"report: {report.write(found, output)}")
     return all(record.passed for _, record in found)
