@@ -18,7 +18,7 @@ def runs() -> dict[str, pc.Trajectory]:
     """Four runs of one scene by their names in the picture, the reference last."""
     scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
     best = pc.best_coarse(scene)
-    steppers = {
+    steppers: dict[str, pc.Stepper] = {
         "coarse": pc.ProjectiveDynamics(pc.discretise(scene)),
         "best coarse": pc.ProjectiveDynamics(pc.discretise(best)),
         "corrected": pc.hybrid_of(scene, ROOT / "models" / "torsion-exact"),
@@ -43,15 +43,22 @@ def reduced(path: Path) -> None:
 def main(path: Path = IMAGE) -> None:
     """Run, draw, reduce."""
     found = runs()
-    *_, fine = found.values()
-    truth = pc.restrict(fine, to=next(iter(found.values())).problem)
+    fine = found["fine"]
+    truth = pc.restrict(fine, to=found["coarse"])
     labels = [
         f"{name}\n{len(run.points)} nodes"
         + ("" if run is fine else f", RMS {1e3 * pc.metrics.rms_error(run, truth):.1f} mm")
         for name, run in found.items()
     ]
-    options = {"colour": "error", "reference": fine, "fps": 10.0, "window": 1000}
-    pc.render(list(found.values()), path, labels=labels, **options)
+    pc.render(
+        list(found.values()),
+        path,
+        labels=labels,
+        colour="error",
+        reference=fine,
+        fps=10,
+        window=1000,
+    )
     reduced(path)
 
 
