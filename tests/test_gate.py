@@ -25,7 +25,7 @@ from hybrid_samples import (
 )
 from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchHybrid, BatchParts
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.gate import Gate, GateMeasures, Reason
+from pdcorrect.corrector.gate import Gate, GateMeasures, Reason, Refusal, refusals
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.corrector.single_step import SingleCoarseStep
@@ -412,3 +412,11 @@ def test_a_gate_judges_arrays_as_it_judges_tensors():
 def test_bounds_without_meaning_are_refused_by_key_and_value(changes, told):
     with pytest.raises(InputError, match=f"^gate: {told}"):
         Gate(**changes)
+
+
+def test_refusals_are_counted_by_reason_the_most_frequent_first():
+    assert refusals([0.0, 0.0]) == refusals([]) == ()
+    first, *others = refusals(np.array([0.0, 1.0, 3.0, 3.0, 9.0]))
+    assert first == Refusal(Reason.INVERSION, 2)
+    assert set(others) == {Refusal(Reason.NOT_FINITE, 1), Refusal(Reason.TIME_STEP, 1)}
+    assert len({reason.meaning for reason in Reason}) == len(Reason)

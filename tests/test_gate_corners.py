@@ -7,10 +7,9 @@ import torch
 import pdcorrect as pc
 from hybrid_samples import PLACEMENTS, Prescribed, fitted, problems, soft_beam
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
-from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.bodies import BodyGraph, corner_jacobians
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import Snapshot, View
-from pdcorrect.corrector.bodies import corner_jacobians
+from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.fem import hexahedron
@@ -66,16 +65,9 @@ def test_what_is_no_number_does_not_pass():
         if spoilt is not None:
             proposed[spoilt] = torch.nan
         still = torch.zeros_like(positions)
-        view = View(bodies, Snapshot(positions, still, proposed, still))
+        view = FeatureView(bodies, Snapshot(positions, still, proposed, still))
         assert Gate(corners=0.0).folded(corrector, view).tolist() == flags
     assert Gate().folded(corrector, view) is False
-
-
-def test_other_materials_leave_the_corners_at_rest_as_they_are():
-    bodies = graph(*problems((3, 1, 1), (2, 2, 1)))
-    known, cells = bodies.rest_corners, torch.ones(len(bodies.cells), dtype=torch.float64)
-    other = bodies.with_material(2.0 * bodies.mass, cells, 0.3 * cells, cells)
-    assert other.rest_corners is known
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)

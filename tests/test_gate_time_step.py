@@ -9,14 +9,13 @@ import torch
 
 import pdcorrect as pc
 from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, soft_beam
+from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.gate import Gate, Reason, refusals
+from pdcorrect.corrector.gate import Gate, Reason, Refusal, refusals
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.normaliser import Moments, Normaliser
-from pdcorrect.errors import InputError
+from pdcorrect.corrector.normaliser import RunningMoments
 
 H, C = 0.01, 0.02
 """Time step and cell size of the training, s and m."""
@@ -27,7 +26,7 @@ ONLY_STEPS = Gate(
 
 def logarithms(*steps):
     """Of time steps, s, over the cell size, as a normaliser takes them."""
-    found = Moments()
+    found = RunningMoments()
     found.add((torch.tensor(steps, dtype=torch.float64) / C).log()[:, None])
     return found
 
@@ -67,31 +66,24 @@ def test_no_time_step_is_known_before_data_were_seen_nor_is_what_is_no_number():
     known = ranged(H)
     assert known.time_step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
     assert np.isnan(corrector.normaliser.time_steps).all()
+    strange = fitted(problems((3, 1, 1)))
+    strange.normaliser.time_step_low.fill_(np.nan)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(stepped(1.0)), strange, gate=ONLY_STEPS)
+    assert (hybrid.trained_step, hybrid.time_step_excess()) == ("not known", np.inf)
 
 
 def test_time_steps_of_further_data_are_as_known_as_those_of_the_first():
-    corrector = ranged(H)
+    corrector = ranged(0.1 * H, 10.0 * H)
+    corrector.normaliser.fit_time_steps(logarithms(H))  # takes the place of what was known
+    state = corrector.state_dict()
+    for name in ("normaliser.time_step_low", "normaliser.time_step_high"):
+        assert state[name].tolist() == pytest.approx([np.log(H / C)])
     corrector.normaliser.widen_time_steps(logarithms(0.5 * H))
     assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, H / C))
     corrector.normaliser.widen_time_steps(logarithms(0.7 * H, 3.0 * H))
     assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, 3.0 * H / C))
     found = corrector.time_step_excess(graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H))
     assert found.tolist() == pytest.approx([np.log(2), 0.0, 0.0, np.log(2)], abs=1e-12)
-
-
-def test_a_fit_takes_the_place_of_what_was_known():
-    corrector = ranged(0.1 * H, 10.0 * H)
-    corrector.normaliser.fit_time_steps(logarithms(H))
-    assert corrector.normaliser.time_steps == pytest.approx((H / C, H / C))
-
-
-def test_the_range_is_part_of_a_corrector_s_values():
-    state = ranged(H, 2.0 * H).state_dict()
-    assert state["normaliser.time_step_low"].tolist() == pytest.approx([np.log(H / C)])
-    assert state["normaliser.time_step_high"].tolist() == pytest.approx([np.log(2.0 * H / C)])
-    empty = Normaliser({"a": 1}, {}).state_dict()
-    assert empty["time_step_low"].isnan().tolist() == [True]
-    assert empty["time_step_high"].isnan().tolist() == [True]
 
 
 # --- the gate ----------------------------------------------------------------------------------
@@ -111,17 +103,6 @@ def test_the_very_time_step_of_the_training_passes_the_narrowest_bound(step, dty
     gate, corrector = Gate(body=None, time_step=0.0), ranged(step)
     assert gate.foreign(corrector, graph(*[step] * 9, dtype=dtype)).tolist() == [0] * 9
     assert gate.foreign(corrector, graph(1.0001 * step, dtype=dtype)).tolist() == [Reason.TIME_STEP]
-
-
-@pytest.mark.parametrize("value", [-0.1, "0.1", float("nan"), True])
-def test_a_bound_that_is_no_number_from_0_on_is_refused(value):
-    with pytest.raises(InputError, match=r"gate: time_step = .*: expected|finite"):
-        Gate(time_step=value)
-
-
-def test_a_test_that_gates_do_not_have_is_refused():
-    with pytest.raises(InputError, match=r"gate: step: unknown key; did you mean time_step\?"):
-        Gate(step=0.1)
 
 
 def test_a_body_counts_before_its_time_step():
@@ -154,8 +135,7 @@ def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(
     assert corrector.calls == 0
     assert not hybrid(problem.rest_state()).state.memory  # nothing to pause for
     assert hybrid.time_step_excess() == pytest.approx(np.log(2.0))
-    counts = refusals(run.stats["gate"])
-    assert counts["time step"] == sum(counts.values()) == 4
+    assert refusals(run.stats["gate"]) == (Refusal(Reason.TIME_STEP, 4),)
     open_ = HybridStepper(coarse, corrector, gate=ONLY_STEPS.model_copy(update={"time_step": None}))
     found = open_(problem.rest_state())
     assert corrector.calls == 1
@@ -205,15 +185,6 @@ def test_of_a_refined_body_its_own_cells_count():
         assert hybrid.trained_step == f"{0.5 * H:g} s"
 
 
-def test_of_an_unknown_range_it_is_said_that_it_is_not_known():
-    corrector = fitted(problems((3, 1, 1)))
-    corrector.normaliser.time_step_low.fill_(np.nan)
-    corrector.normaliser.time_step_high.fill_(np.nan)
-    hybrid = HybridStepper(pc.ProjectiveDynamics(stepped(1.0)), corrector, gate=ONLY_STEPS)
-    assert hybrid.trained_step == "not known"
-    assert hybrid.time_step_excess() == np.inf
-
-
 SCALED = [(0.5, 1.0, Reason.TIME_STEP), (1.0, 2.0, Reason.TIME_STEP), (0.5, 0.5, 0), (3.0, 3.0, 0)]
 """Factors on all lengths and on the time step, and what a gate says."""
 
@@ -237,25 +208,6 @@ def test_half_the_lengths_are_refused_as_twice_the_step_is_and_both_alike_pass(
     assert hybrid.time_step_excess() == pytest.approx(excess, rel=1e-6)
     assert hybrid.trained_step == f"{lengths * H:g} s"
     assert (hybrid(problem.rest_state()).stats["gate"] == Reason.TIME_STEP) == (reason != 0)
-
-
-def test_a_body_s_excess_is_the_same_to_compiled_answers_and_in_a_batch():
-    problem = stepped(1.7)
-    corrector = fitted(problems((3, 1, 1)))
-    single = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
-    many = BatchHybrid(pc.BatchStepper([problem, problem]), corrector)._hybrid.nodes.graph
-    expected = corrector.time_step_excess(many)
-    assert single.compiled
-    assert single._answers.time_step_excess(single.bodies).tolist() == expected.tolist()[:1]
-    assert expected.tolist() == pytest.approx([np.log(1.7)] * 2, rel=1e-12)
-
-
-def test_compiled_answers_refuse_a_foreign_time_step_too():
-    hybrid = HybridStepper(
-        pc.ProjectiveDynamics(stepped(2.0)), fitted(problems((3, 1, 1))), gate=Gate()
-    )
-    assert hybrid.compiled
-    assert hybrid(hybrid.problem.rest_state()).stats["gate"] == Reason.TIME_STEP
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -294,18 +246,6 @@ def test_of_several_time_steps_only_the_foreign_one_is_refused():
     assert corrector.calls == 1
     assert torch.equal(result.state.positions[0], plain.state.positions[0])
     assert not torch.equal(result.state.positions[1], plain.state.positions[1])
-
-
-def test_a_correction_that_is_not_a_number_does_not_hide_that_the_time_step_is_foreign():
-    scenes = problems((3, 1, 1), (3, 1, 1))
-    corrector = fitted(scenes)
-    corrector.of_view = lambda view: torch.full_like(view.bodies.rest, torch.nan)
-    stepper = pc.BatchStepper(scenes)
-    hybrid = BatchHybrid(stepper, corrector, gate=Gate())
-    nodes = hybrid._hybrid.nodes
-    nodes._graph = replace(nodes.graph, time_step=torch.tensor([H, 2.0 * H], dtype=torch.float64))
-    result = hybrid(stepper.rest_state())
-    assert result.reasons.tolist() == [Reason.NOT_FINITE, Reason.TIME_STEP]
 
 
 # --- released models ---------------------------------------------------------------------------

@@ -9,13 +9,13 @@ import torch
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on, rotation
 from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, soft_beam
+from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.config import preset
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.normaliser import Moments, Normaliser
+from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.fem.mesh import voxel_mesh
 
@@ -121,10 +121,6 @@ def test_supports_that_slide_are_less_fixed_than_clamps():
         assert found["spread"] == pytest.approx(np.log1p(np.sqrt(0.5)))
 
 
-def test_a_body_of_one_cell_has_finite_measures():
-    assert all(np.isfinite(value).all() for value in measured(cantilever((1, 1, 1))).values())
-
-
 def test_measures_do_not_need_derivatives_or_double_precision():
     body = BodyGraph.of([cantilever((3, 2, 2))])
     exact = BodyGraph.of([cantilever((3, 2, 2))], dtype=torch.float64).shapes
@@ -134,10 +130,9 @@ def test_measures_do_not_need_derivatives_or_double_precision():
     assert torch.equal(moving.shapes, body.shapes)
 
 
-def test_a_flat_body_has_no_infinite_radius():
-    mesh = box_mesh((2, 2, 1), (2.0, 2.0, 1e-6))
-    found = measured(problem_on(mesh))
-    assert np.isfinite(found["smallest radius"]).all()
+def test_bodies_of_one_cell_and_flat_ones_have_finite_measures():
+    for body in (cantilever((1, 1, 1)), problem_on(box_mesh((2, 2, 1), (2.0, 2.0, 1e-6)))):
+        assert all(np.isfinite(value).all() for value in measured(body).values())
 
 
 # --- ranges ------------------------------------------------------------------------------------
@@ -145,7 +140,7 @@ def test_a_flat_body_has_no_infinite_radius():
 
 def ranged(*several):
     """A corrector that knows some bodies, otherwise without values."""
-    corrector, shapes = Corrector(preset("compact", layers=1, width=8)), Moments()
+    corrector, shapes = Corrector(preset("compact", layers=1, width=8)), RunningMoments()
     shapes.add(BodyGraph.of(several, 0.01, dtype=torch.float64).shapes)
     corrector.normaliser.fit_shapes(shapes)
     return corrector
@@ -165,30 +160,19 @@ def test_what_lies_between_two_known_bodies_is_known_and_what_is_larger_by_how_m
     assert 0.6 < found < np.log(2.0)
 
 
-def test_nobody_is_known_before_bodies_were_fitted():
+def test_nobody_is_known_before_bodies_were_fitted_and_further_data_widen_the_range():
     corrector = Corrector(preset("compact", layers=1, width=8))
     assert excess(corrector, cantilever()) == [np.inf]
     unknown = torch.full((1, len(SHAPE_MEASURES)), torch.nan, dtype=torch.float64)
-    known = ranged(cantilever()).normaliser
-    assert known.shape_excess(unknown).isposinf().all()
-
-
-def test_bodies_of_further_data_are_as_known_as_those_of_the_first():
     one, other = cantilever((4, 1, 1)), cantilever((3, 3, 3), clamps=[])
-    corrector, shapes = ranged(one), Moments()
+    corrector, shapes = ranged(one), RunningMoments()
+    assert corrector.normaliser.shape_excess(unknown).isposinf().all()
     assert excess(corrector, other)[0] > 1.0
     shapes.add(BodyGraph.of([other], dtype=torch.float64).shapes)
     corrector.normaliser.widen_shapes(shapes)
     assert excess(corrector, one, other) == [0.0, 0.0]
-
-
-def test_ranges_are_part_of_a_corrector_s_values():
-    corrector = ranged(cantilever())
     state = corrector.state_dict()
     assert torch.equal(state["normaliser.shape_low"], corrector.normaliser.shape_low)
-    empty = Normaliser({"a": 1}, {}).state_dict()
-    assert empty["shape_low"].isnan().all()
-    assert empty["shape_high"].shape == (len(SHAPE_MEASURES),)
 
 
 # --- the gate ----------------------------------------------------------------------------------
@@ -212,28 +196,26 @@ def test_a_foreign_body_keeps_all_its_coarse_steps_and_its_network_is_not_asked(
     assert corrector.calls == 1
 
 
-def test_a_hybrid_tells_by_which_measures_its_body_is_foreign():
+def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it():
     known = problems((3, 1, 1), (5, 1, 1))
     corrector = fitted(known)
 
-    def told(problem):
-        return HybridStepper(pc.ProjectiveDynamics(problem), corrector).body_excess()
+    def beyond(problem):
+        """Measures outside of their ranges, by name."""
+        shapes = BodyGraph.of([problem], dtype=torch.float64).shapes
+        far = corrector.normaliser.shape_excess(shapes)[0].tolist()
+        return {name: x for name, x in zip(SHAPE_MEASURES, far, strict=True) if x > 0.0}
 
-    assert told(known[0]) == told(known[1]) == {}
+    assert beyond(known[0]) == beyond(known[1]) == {}
     longer = pc.discretise(soft_beam((12, 1, 1), loads=[TORSION]))
-    found = told(longer)
+    found = beyond(longer)
     assert found["nodes"] == pytest.approx(np.log(52 / 24))
     assert {"largest radius", "supported", "distance"} < set(found)
     assert "smallest radius" not in found
     assert max(found.values()) == pytest.approx(excess(corrector, longer)[0])
-
-
-def test_compiled_answers_refuse_a_foreign_body_too():
-    corrector = fitted(problems((3, 1, 1)))
-    problem = pc.discretise(soft_beam((6, 1, 1), loads=[TORSION]))
-    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=Gate())
+    hybrid = HybridStepper(pc.ProjectiveDynamics(longer), corrector, gate=Gate()).prepare()
     assert hybrid.compiled
-    assert hybrid.prepare()(problem.rest_state()).stats["gate"] == Reason.BODY
+    assert hybrid(longer.rest_state()).stats["gate"] == Reason.BODY
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -304,7 +286,8 @@ def test_a_correction_that_is_not_a_number_does_not_hide_that_the_body_is_foreig
 
 def test_measures_are_kept_where_only_the_material_changes():
     body = BodyGraph.of([cantilever()], dtype=torch.float64)
-    shapes = body.shapes
+    shapes, corners = body.shapes, body.rest_corners
     cells = torch.ones(len(body.cells))
     other = body.with_material(2.0 * body.mass, cells, 0.3 * cells, cells)
     assert other.shapes is shapes
+    assert other.rest_corners is corners
