@@ -1,4 +1,7 @@
-"""`fitting` of a training that goes on with a model: ranges widened, left as they are, or anew."""
+"""Trainings that go on with a model: its weights, and ranges widened, left as they are or anew."""
+
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,16 +12,16 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
+from pdcorrect.corrector.normaliser import RunningMoments  # noqa: E402
+from pdcorrect.data.schema import write_shard  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.training import training as training_module  # noqa: E402
-from pdcorrect.training.config import TrainingConfig  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
+from training_samples import weights  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("few_threads")
-
-STAGE = '[[stages]]\nkind = "one-step"\niterations = 1\n'
-START = 'start_from = "tiny"\n'
 
 
 @pytest.fixture(scope="module")
@@ -45,55 +48,20 @@ def settings(start, fitting, **changes):
     return samples.config(stage, start_from=str(start), fitting=fitting, **changes)
 
 
-# --- the configuration -------------------------------------------------------------------------
-
-
-def test_choices_that_are_the_default_are_not_written():
-    assert "fitting" not in TrainingConfig.from_toml(STAGE).model_dump(exclude_defaults=True)
-    assert samples.config(samples.one_step()).model_dump()["fitting"] == {"windows": 10_000}
-    for fitting in ({"anew": True}, {"widen": False}):
-        config = settings("tiny", fitting)
-        assert config.model_dump()["fitting"] == {"windows": 10_000, **fitting}
-        assert TrainingConfig.from_toml(config.to_toml()) == config
-    config = settings("tiny", {"anew": False, "widen": True})
-    assert config == settings("tiny", {})
-    assert "anew" not in config.to_toml()
-    assert "widen" not in config.to_toml()
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        (START + "[fitting]\nanew = true\nwiden = false\n", "fitting .*expected one of both"),
-        ("[fitting]\nanew = true\n", "fitting.anew = true is about .*expected start_from"),
-        ("[fitting]\nwiden = false\n", "fitting.widen = false is about .*expected start_from"),
-        (START + '[fitting]\nanew = "yes"\n', 'fitting.anew = "yes"'),
-        (START + "[fitting]\nanew = 1\n", "fitting.anew = 1"),
-        (START + '[fitting]\nwiden = "yes"\n', 'fitting.widen = "yes"'),
-        (START + "[fitting]\nwiden = 0\n", "fitting.widen = 0"),
-    ],
-)
-def test_choices_that_mean_nothing_are_refused(text, told):
-    with pytest.raises(InputError, match=told):
-        TrainingConfig.from_toml(text + STAGE)
-
-
 # --- anew --------------------------------------------------------------------------------------
 
 
 def test_a_start_of_another_base_is_let_pass_if_the_normalisation_is_fitted_anew(
     data, earlier, tmp_path
 ):
-    for fitting, instead in (({}, ""), ({"widen": False}, " in place of fitting.widen = false")):
-        with pytest.raises(InputError) as refusal:
-            Training(settings(earlier, fitting, base="best"), data, tmp_path / "refused")
-        assert str(refusal.value) == (
-            f"start_from = {str(earlier)!r}: its base is 'plain': expected 'best', as here, or "
-            f"fitting.anew = true{instead}, which takes over that model's weights alone."
-        )
-    both = settings(earlier, {}, base="best", velocity="kept")
-    with pytest.raises(InputError, match=r"its velocity is .* expected 'kept', as here\.$"):
-        Training(both, data, tmp_path / "refused")  # which anew = true would not let pass
+    for fitting, changes, words in (
+        ({}, {"base": "best"}, r"'plain'.*'best'.*fitting\.anew"),
+        ({"widen": False}, {"base": "best"}, r"fitting\.anew = true"),
+        ({}, {"velocity": "kept"}, "'recomputed'.*'kept'"),
+        ({"anew": True}, {"velocity": "kept"}, "'recomputed'.*'kept'"),
+    ):
+        with pytest.raises(InputError, match=f"start_from = .*{words}"):
+            Training(settings(earlier, fitting, **changes), data, tmp_path / "refused")
     Training(settings(earlier, {"anew": True}, base="best"), data, tmp_path / "out").run()
     found = load_model(tmp_path / "out" / "model")
     assert found.base == "best"
@@ -101,10 +69,14 @@ def test_a_start_of_another_base_is_let_pass_if_the_normalisation_is_fitted_anew
     assert found.data_sets == load_model(earlier).data_sets
 
 
-def test_a_start_of_another_velocity_is_refused_also_then(data, earlier, tmp_path):
-    config = settings(earlier, {"anew": True}, velocity="kept")
-    with pytest.raises(InputError, match="its velocity is 'recomputed': expected 'kept'"):
-        Training(config, data, tmp_path / "out")
+def test_a_start_of_another_architecture_or_that_is_not_there_is_refused(data, earlier, tmp_path):
+    other = {"preset": "compact", "changes": {"layers": 2, "width": 8}}
+    for start, changes, words in (
+        (earlier, {"corrector": other}, "layers = 1"),
+        (tmp_path / "nothing", {}, "nothing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Training(settings(start, {}, **changes), data, tmp_path / "out")
 
 
 @pytest.mark.parametrize("base", ["plain", "best"])
@@ -136,7 +108,7 @@ def test_such_a_training_goes_on_with_the_same_bits_and_does_not_fit_again(
     for name, x in one.corrector.state_dict().items():
         assert torch.equal(x, two.corrector.state_dict()[name]), name
     changed = settings(earlier, {"widen": False}, checkpoint_every={"iterations": 1})
-    with pytest.raises(InputError, match="was begun with config.base"):
+    with pytest.raises(InputError, match=r"config\.base"):
         Training(changed, other, tmp_path / "broken", resume=True)
 
 
@@ -193,21 +165,115 @@ def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlie
             bound.fill_(np.log(step) + shift)
         start = save_model(model.corrector, tmp_path / "start", record=model.record)
         there = step * np.exp(shift)
-        told = (
-            "start_from = .* with fitting.widen = false: the data's time step over the cell size "
-            f"is {step:.4g} s/m, that of the ranges that stay {there:.4g} s/m, so a gate would"
-        )
+        told = rf"fitting\.widen = false.* {step:.4g} s/m.* {there:.4g} s/m"
         with pytest.raises(InputError, match=told):
             Training(settings(start, {"widen": False}), data, tmp_path / "out")
         for fitting, expected in (({}, sorted((step, there))), ({"anew": True}, [step, step])):
             found = Training(settings(start, fitting), data, tmp_path / "out").corrector
             assert found.normaliser.time_steps == pytest.approx(expected)
-
-
-def test_ranges_that_stay_may_differ_by_what_a_gate_lets_pass(data, earlier, tmp_path):
-    model = load_model(earlier)
-    model.corrector.normaliser.time_step_low += 0.05
-    model.corrector.normaliser.time_step_high += 0.05
+    for bound in (low, high):
+        bound.fill_(np.log(step) + 0.05)  # which a gate lets pass
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = Training(settings(start, {"widen": False}), data, tmp_path / "out").corrector
     assert found.normaliser.time_steps == model.corrector.normaliser.time_steps
+
+
+# --- weights and ranges of the start ----------------------------------------------------------
+
+
+def test_a_training_starts_from_a_models_weights_and_normalisation(earlier, tmp_path):
+    new = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
+    config = samples.config(samples.one_step(), start_from=str(earlier))
+    before = load_model(earlier).corrector
+    training = Training(config, new, tmp_path / "out")
+    assert torch.equal(weights(training.corrector), weights(before))
+    mine, theirs = training.corrector.normaliser, before.normaliser
+    assert mine.output_scale == theirs.output_scale
+    for name, known in theirs.named_buffers():
+        found = mine.get_buffer(name)
+        if name.endswith("__low"):
+            assert (found <= known).all()
+        elif name.endswith("__high"):
+            assert (found >= known).all()
+        else:
+            assert torch.equal(found, known), name
+    training.run()
+    assert not torch.equal(weights(training.corrector), weights(before))
+    found = load_model(tmp_path / "out" / "model")
+    assert found.record.training["config"]["start_from"] == str(earlier)
+    assert found.data_sets == load_model(earlier).data_sets  # of one configuration
+
+
+def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, tmp_path):
+    new = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
+    for path in new.rglob("*.h5"):
+        shard = read_shard(path)
+        other = {**shard.attributes, "dataset": "other", "config_hash": "0" * 64}
+        path.unlink()
+        write_shard(path, replace(shard, attributes=other), "float32")
+    config = samples.config(samples.one_step(), start_from=str(earlier))
+    Training(config, new, tmp_path / "out").run()
+    (before,) = load_model(earlier).data_sets
+    found = load_model(tmp_path / "out" / "model")
+    assert found.data_sets == [before, ("other", "0" * 64)]
+    assert found.record.dataset == "tiny+other"
+
+
+def test_the_ranges_of_a_start_grow_by_the_new_data(data, earlier, tmp_path):
+    config = samples.config(samples.one_step(), start_from=str(earlier))
+    training = Training(config, data, tmp_path / "same")
+    known = training.corrector.normaliser
+    fitted = known.get_buffer("deformation__high").clone()
+    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
+    further = {name: RunningMoments() for name in known.names}
+    for name, moments in further.items():
+        width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
+        moments.add(torch.full((1, width), 1e3))
+    known.widen(further)
+    assert known.get_buffer("deformation__high") == 1e3
+    assert known.get_buffer("deformation__low") < fitted
+
+
+def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(data, earlier, tmp_path):
+    model = load_model(earlier)
+    model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
+    model.corrector.normaliser.time_step_high += 1.0  # and of longer time steps, too
+    start = save_model(model.corrector, tmp_path / "start", record=model.record)
+    found = {}
+    for widen in (True, False):
+        config = samples.config(samples.one_step(), start_from=str(start), fitting={"widen": widen})
+        Training(config, data, tmp_path / str(widen)).run()
+        found[widen] = load_model(tmp_path / str(widen) / "model").corrector
+        assert ("widen" in config.model_dump()["fitting"]) is not widen
+    for name, known in model.corrector.normaliser.named_buffers():
+        assert torch.equal(found[False].normaliser.get_buffer(name), known), name
+    assert (found[True].normaliser.shape_high > model.corrector.normaliser.shape_high).all()
+    assert torch.equal(weights(found[True]), weights(found[False]))
+    assert not torch.equal(weights(found[True]), weights(model.corrector))
+
+
+def test_a_start_that_training_only_worsens_is_what_is_kept(data, earlier, tmp_path):
+    ruin = samples.one_step(iterations=3, rate={"peak": 1.0, "last": 1.0, "warmup": 0.0})
+    config = samples.config(ruin, start_from=str(earlier))
+    Training(config, data, tmp_path / "out").run()
+    kept = load_model(tmp_path / "out" / "model").corrector
+    assert torch.equal(weights(kept), weights(load_model(earlier).corrector))
+
+
+def test_a_training_does_not_go_on_from_another_start_or_with_another_teacher(
+    data, earlier, tmp_path
+):
+    start = tmp_path / "start"
+    shutil.copytree(earlier, start)
+    often = {"checkpoint_every": {"iterations": 1}}
+    from_start = samples.config(samples.one_step(), start_from=str(start), **often)
+    Training(from_start, data, tmp_path / "started").run()
+    assert Training(from_start, data, tmp_path / "started", resume=True).progress.stage == 1
+    taught = samples.config(samples.unrolled(teacher=str(start), iterations=3), **often)
+    assert not Training(taught, data, tmp_path / "taught").run(seconds=0.0)
+    altered = load_model(start).corrector
+    altered.network.decoder[0].bias.data += 1.0
+    save_model(altered, start, record=load_model(earlier).record)
+    for config, name, key in ((from_start, "started", "start"), (taught, "taught", "teachers")):
+        with pytest.raises(InputError, match=f"{key}.* = "):
+            Training(config, data, tmp_path / name, resume=True)

@@ -100,3 +100,8 @@ def fitted(folder, settings, silent=False):
             corrector.network.decoder[-1].weight.zero_()
             corrector.network.decoder[-1].bias.zero_()
     return corrector
+
+
+def weights(corrector):
+    """All weights of a corrector's network, one after another; a copy."""
+    return torch.cat([p.detach().reshape(-1).clone() for p in corrector.network.parameters()])

@@ -1,0 +1,337 @@
+"""Unrolled steps, teachers, and rollouts of a validation split."""
+
+import itertools
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import training_samples as samples  # noqa: E402
+from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.errors import InputError  # noqa: E402
+from pdcorrect.metrics import error_corrected  # noqa: E402
+from pdcorrect.scene import Scene  # noqa: E402
+from pdcorrect.training.distributed import joined  # noqa: E402
+from pdcorrect.training.recipe import Rate  # noqa: E402
+from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups, grouped  # noqa: E402
+from pdcorrect.training.training import Training  # noqa: E402
+from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
+from pdcorrect.training.validation import Validation  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return samples.dataset(tmp_path_factory.mktemp("tiny"))
+
+
+pytestmark = pytest.mark.usefixtures("few_threads")
+
+# --- scenes ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def group(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    return SceneGroup(recordings, "plain", "cpu")
+
+
+def started(group, frames):
+    positions, velocities = group.states(frames)
+    none = torch.zeros(int(group.counts.sum()), 3, dtype=torch.float64)
+    return Rollouts(positions, velocities, none, frames, np.zeros_like(frames))
+
+
+def test_groups_hold_all_simulations_once_and_meshes_stay_together():
+    recordings = load_recordings(samples.TINY, "training", "plain")
+    every = [
+        group
+        for rank in (0, 1)
+        for group in grouped(recordings, 3, seed=5, rank=rank, world_size=2)
+    ]
+    assert sorted(r.name for g in every for r in g) == sorted(r.name for r in recordings)
+    whole = [r for g in grouped(recordings, 3, seed=5) for r in g]
+    meshes = [r.mesh for r in whole]
+    assert len([1 for a, b in itertools.pairwise(meshes) if a != b]) == 5
+    assert meshes != [r.mesh for g in grouped(recordings, 3, seed=6) for r in g]
+
+
+def test_states_of_the_reference_have_backward_differences(group):
+    frames = np.array([0, 4, 20])
+    positions, velocities = group.states(frames)
+    truth = group.recordings[1].reference.astype(float)
+    count = truth.shape[1]
+    np.testing.assert_array_equal(positions[1, :count].numpy(), truth[4])
+    np.testing.assert_allclose(velocities[1, :count].numpy(), (truth[4] - truth[3]) / 0.01)
+    assert not velocities[0].any()
+    assert not positions[0, group.stepper.node_counts[0] :].any()
+
+
+def test_one_unrolled_step_without_correction_has_the_loss_of_the_stored_prediction(group, folder):
+    settings = samples.config(samples.unrolled())
+    silent = samples.fitted(folder, settings, silent=True)
+    frames = np.array([2, 7, 11])
+    found = unroll(group, silent, started(group, frames), 1, settings.stages[0])
+    windows, _ = samples.windows(folder, settings)
+    batch = windows.batch([2, 20 + 7, 40 + 11])
+    squares = batch.bodies.body_means(batch.target.square().sum(dim=1)) / batch.scale
+    assert found.alive.all()
+    torch.testing.assert_close(found.losses, squares, rtol=2e-3, atol=0)
+
+
+def test_unrolled_losses_are_means_over_steps_and_ages_count(group, folder):
+    settings = samples.config(samples.unrolled(steps=2))
+    silent = samples.fitted(folder, settings, silent=True)
+    start = replace(started(group, np.array([2, 7, 11])), ages=np.array([0, 3, 0]))
+    both = unroll(group, silent, start, 2, settings.stages[0])
+    first = unroll(group, silent, start, 1, settings.stages[0])
+    second = unroll(group, silent, first.end, 1, settings.stages[0])
+    torch.testing.assert_close(both.losses, (first.losses + second.losses) / 2)
+    assert both.end.ages.tolist() == [2, 5, 2]
+    assert both.end.frames.tolist() == [4, 9, 13]
+    errors = base_errors(group.recordings).after(torch.tensor([2, 5, 2]))
+    truth = group.truth(np.array([4, 9, 13]))
+    squares = group.sums((both.end.positions - truth).square().sum(dim=2)) / group.counts
+    torch.testing.assert_close(second.losses, squares / errors)
+
+
+@pytest.mark.parametrize("through_solver", [False, True])
+def test_weights_get_the_derivative_of_the_unrolled_loss(group, folder, through_solver):
+    settings = samples.config(samples.unrolled(through_solver=through_solver))
+    corrector = samples.fitted(folder, settings)
+    start = started(group, np.array([5, 6, 7]))
+    steps = 2 if through_solver else 1  # what is left out without is only what is earlier
+    bias = corrector.network.decoder[-1].bias
+
+    def loss():
+        return unroll(group, corrector, start, steps, settings.stages[0]).losses.mean()
+
+    loss().backward()
+    slope, h = float(bias.grad[1]), 1e-3
+    values = []
+    with torch.no_grad():
+        for sign in (1, -1):
+            bias[1] += sign * h
+            values.append(loss().item())
+            bias[1] -= sign * h
+    assert slope == pytest.approx((values[0] - values[1]) / (2 * h), rel=2e-3)
+
+
+def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
+    settings = samples.config(samples.unrolled(batch=3))
+    corrector = samples.fitted(folder, settings)
+    fine = unroll(group, corrector, started(group, np.array([5, 6, 7])), 2, settings.stages[0])
+    start = started(group, np.array([5, 6, 7]))
+    start.positions[1, 20] = torch.nan
+    found = unroll(group, corrector, start, 2, settings.stages[0])
+    assert found.alive.tolist() == [True, False, True]
+    assert found.losses[1] == 0.0
+    torch.testing.assert_close(found.losses[[0, 2]], fine.losses[[0, 2]])
+    batches = UnrolledBatches(SceneGroups(group.recordings, "plain"), settings.stages[0])
+    monkeypatch.setattr("pdcorrect.training.unrolled.unroll", lambda *_: found)
+    loss = batches.loss(corrector, 0, 2)
+    assert loss.item() == pytest.approx(found.losses[[0, 2]].mean().item())
+    assert batches.failed == 1
+
+
+def test_a_pool_goes_on_where_it_was(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(start="pool", restart=0.0, lost=1e9, steps=2)
+    corrector = samples.fitted(folder, samples.config(stage), silent=True)
+    batches = UnrolledBatches(SceneGroups(recordings, "plain"), stage)
+    ages = []
+    for iteration in range(3):
+        batches.loss(corrector, iteration, 2)
+        numbers, _ = batches.state_dict()
+        ages.append(numbers["pool"]["0"]["ages"])
+        assert all(f <= 20 for f in numbers["pool"]["0"]["frames"])
+    assert ages[0] == [2, 2, 2]
+    assert any(age == 4 for age in ages[1])
+    always = UnrolledBatches(
+        SceneGroups(recordings, "plain"), stage.model_copy(update={"restart": 1.0})
+    )
+    for iteration in range(2):
+        always.loss(corrector, iteration, 2)
+        assert always.state_dict()[0]["pool"]["0"]["ages"] == [2, 2, 2]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_states_of_the_reference_is_at_rest(folder, share):
+    recordings = load_recordings(folder, "training", "plain")
+    groups = SceneGroups(recordings, "plain")
+    batches = UnrolledBatches(groups, samples.unrolled(at_rest=share, steps=2))
+    group = groups(recordings)
+    starts = np.concatenate([
+        batches._start(0, group, 2, np.random.default_rng(k)).frames for k in range(100)
+    ])  # fmt: skip
+    expected = share + (1.0 - share) / 19  # of the frames 0 to 18 in any case
+    assert np.mean(starts == 0) == pytest.approx(expected, abs=0.08)
+
+
+def test_rollouts_that_are_lost_by_their_squared_distance_go_back_to_the_reference(group, folder):
+    frames = np.array([5, 6, 7])
+    truth = group.truth(frames)
+    rollout = torch.maximum(group.errors.rollout, group.errors.one_step)
+    away = torch.tensor([0.9, 1.1, 1.9]).double()
+    moved = truth.clone()
+    moved[..., 0] += (away * rollout).sqrt()[:, None]
+    assert group.lost(moved, frames, 1.0).tolist() == [False, True, True]
+    assert group.lost(moved, frames, 2.0).tolist() == [False, False, False]
+    assert group.lost(moved * torch.nan, frames, 2.0).all()
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(start="pool", restart=0.0, steps=2)
+    corrector = samples.fitted(folder, samples.config(stage), silent=True)
+    for lost, expected in ((1e9, [False] * 3), (1e-9, [True] * 3)):
+        chosen = stage.model_copy(update={"lost": lost})
+        batches = UnrolledBatches(SceneGroups(recordings, "plain"), chosen)
+        batches.loss(corrector, 0, 2)
+        ages = batches.state_dict()[0]["pool"]["0"]["ages"]
+        assert [age < 0 for age in ages] == expected
+
+
+def test_scenes_that_failed_count_once_after_several_processes_resume(folder):
+    recordings = load_recordings(folder, "training", "plain")
+    stage = samples.unrolled(steps=1)
+    numbers = {"failed": 3, "pool": {}}
+    counts = []
+    for rank in (0, 1):
+        batches = UnrolledBatches(
+            SceneGroups(recordings, "plain", rank=rank, world_size=2),
+            stage.model_copy(update={"batch": 1}),
+        )
+        batches.load_state_dict(numbers, {})
+        counts.append(batches.failed)
+    assert counts == [3, 0]
+    with pytest.raises(InputError, match="21 steps"):
+        UnrolledBatches(SceneGroups(recordings, "plain"), samples.unrolled(steps=21))
+
+
+def test_stages_share_the_groups_that_are_alike(folder, tmp_path, monkeypatch):
+    made = []
+
+    class Counted(SceneGroup):
+        def __init__(self, recordings, *others):
+            made.append([r.name for r in recordings])
+            super().__init__(recordings, *others)
+
+    monkeypatch.setattr("pdcorrect.training.scenes.SceneGroup", Counted)
+    settings = samples.config(
+        samples.unrolled(steps=1, iterations=2), samples.unrolled(steps=2, iterations=2)
+    )
+    Training(settings, folder, tmp_path / "out").run()
+    assert len(made) == len({tuple(names) for names in made}) == 1
+
+
+# --- teachers ----------------------------------------------------------------------------
+
+
+def test_a_teacher_is_asked_about_the_states_that_the_learner_meets(group, folder):
+    settings = samples.config(samples.unrolled(batch=3))
+    learner, teacher = (samples.fitted(folder, settings) for _ in range(2))
+    with torch.no_grad():
+        for weight in teacher.network.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+    stage, frames = settings.stages[0], np.array([5, 6, 7])
+    same = unroll(group, learner, started(group, frames), 2, stage, teacher=learner)
+    assert same.losses.tolist() == [0.0, 0.0, 0.0]
+    found = unroll(group, learner, started(group, frames), 1, stage, teacher=teacher)
+    layer = group.layer(learner, False, "recomputed")
+    before = started(group, frames)
+    assert layer.watch is None
+    layer.watch = (views := []).append
+    _, _, own = layer(before.positions, before.velocities, group.times(frames), before.correction)
+    layer.watch = None
+    (view,) = views
+    apart = layer.padded(own - teacher.of_view(view)).square().sum(dim=2)
+    expected = group.sums(apart) / (group.counts * group.errors.one_step)
+    torch.testing.assert_close(found.losses, expected)
+    assert (found.losses > 0).all()
+
+
+def test_what_a_teacher_knows_is_learned(folder, tmp_path):
+    settings = samples.config(samples.one_step(iterations=40, rate=Rate(peak=3e-3)))
+    Training(settings, folder, tmp_path / "teacher").run()
+    stage = samples.unrolled(
+        iterations=30, start="pool", teacher=str(tmp_path / "teacher" / "model"),
+        rate=Rate(peak=3e-3),
+    )  # fmt: skip
+    told = []
+    training = Training(
+        samples.config(stage, report_every=10, seed=1), folder, tmp_path / "learner",
+        on_report=lambda _, row: told.append(row),
+    )  # fmt: skip
+    training.run()
+    losses = [row["loss"] for row in told if "loss" in row]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_a_teacher_of_another_kind_is_refused(folder, tmp_path):
+    samples_of = samples.config(samples.one_step(iterations=1), base="best")
+    Training(samples_of, folder, tmp_path / "best").run()
+    stage = samples.unrolled(teacher=str(tmp_path / "best" / "model"))
+    missing = samples.unrolled(teacher=str(tmp_path / "nowhere"))
+    for settings, words in (
+        (samples.config(stage), "'best'.*'plain'"),
+        (samples.config(stage, base="best", velocity="kept"), "'recomputed'.*'kept'"),
+        (samples.config(missing), "nowhere"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Training(settings, folder, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+# --- validation --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("base", ["plain", "best"])
+def test_a_silent_corrector_has_the_omega_of_its_base_model(folder, base):
+    settings = samples.config(samples.one_step(), base=base)
+    recordings = load_recordings(folder, "validation", base)
+    scores = Validation(recordings, base)(samples.fitted(folder, settings, silent=True))
+    _, motions = read_arrays(folder / "validation" / "mesh-0001.h5", (), ("plain", "best"))
+    expected = [
+        error_corrected(m.rollouts[base], m.rollouts["plain"], m.positions) for m in motions
+    ]
+    assert scores.failed == 0
+    np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
+    assert scores.mean == pytest.approx(np.mean(scores.omegas))
+
+
+def test_where_the_plain_model_has_no_error_there_is_only_error_to_add(folder):
+    recordings = load_recordings(folder, "validation", "plain")
+    perfect = [replace(r, plain=r.reference) for r in recordings]
+    corrector = samples.fitted(folder, samples.config(samples.one_step()), silent=True)
+    assert Validation(perfect, "plain")(corrector).omegas.tolist() == [-100.0] * len(perfect)
+    same = [replace(r, reference=r.reference[:1].repeat(3, axis=0)) for r in recordings]
+    still = [replace(r, plain=r.reference, scene_toml=_unloaded(r)) for r in same]
+    assert (Validation(still, "plain")(corrector).omegas >= 0.0).all()
+    ruined = samples.fitted(folder, samples.config(samples.one_step()))
+    ruined.normaliser.output_scale.fill_(1e9)
+    assert Validation(recordings, "plain")(ruined).omegas.tolist() == [-100.0, -100.0]
+
+
+def _unloaded(recording):
+    scene = Scene.from_toml(recording.scene_toml)
+    return scene.model_copy(update={"loads": ()}).to_toml()
+
+
+def test_processes_that_are_to_share_a_gpu_are_refused(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="for 2 processes: expected 'cuda'"), joined("cuda:1"):
+        pass
+
+
+@pytest.mark.parametrize("split", ["training", "validation"])
+def test_splits_of_which_files_are_missing_are_refused_unless_asked_for(split, tmp_path):
+    data, output = tmp_path / "data", tmp_path / "out"
+    shutil.copytree(samples.TINY, data)
+    (data / split / "mesh-0001.h5").unlink()
+    settings = samples.config(samples.one_step(iterations=1))
+    with pytest.raises(InputError, match=rf"{split}: 1 .*mesh-0001\.h5"):
+        Training(settings, data, output)
+    assert not output.exists()
+    Training(settings, data, output, incomplete=True)

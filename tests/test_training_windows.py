@@ -1,0 +1,348 @@
+"""Windows of single steps, the normalisation that is fitted to them, and the optimiser."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("torch_geometric")
+
+import training_samples as samples  # noqa: E402
+from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
+from pdcorrect.corrector.features import FeatureView  # noqa: E402
+from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.training.distributed import World  # noqa: E402
+from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
+from pdcorrect.training.optimisation import Optimiser  # noqa: E402
+from pdcorrect.training.sources import one_step_loss  # noqa: E402
+from training_samples import weights  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return samples.dataset(tmp_path_factory.mktemp("tiny"))
+
+
+pytestmark = pytest.mark.usefixtures("few_threads")
+
+# --- windows -----------------------------------------------------------------------------
+
+
+def test_a_window_asks_for_what_the_base_model_lacks(folder):
+    settings = samples.config(samples.one_step())
+    windows, recordings = samples.windows(folder, settings)
+    batch = windows.batch([3, 20 + 5])  # frame 3 of the first mesh, 5 of the second's first
+    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", ("plain",))
+    nodes = len(recordings[0].points)
+    motion = motions[0]
+    wanted = motion.positions[6].astype(float) - motion.predictions["plain"][5]
+    np.testing.assert_allclose(batch.target[nodes:].numpy(), wanted, atol=1e-8)
+    np.testing.assert_array_equal(
+        batch.snapshot.proposed[nodes:].numpy(), motion.predictions["plain"][5]
+    )
+    assert batch.scale.tolist() == [r.one_step for r in recordings[:2]]
+    assert batch.snapshot.correction is None
+
+
+def remembering():
+    """A configuration whose network sees the correction of the step before."""
+    names = ("node-type", "previous-correction", "strain", "load", "acceleration")
+    changes = {**samples.SMALL["changes"], "node_features": names}
+    return samples.config(samples.one_step(), corrector={"preset": "compact", "changes": changes})
+
+
+@pytest.mark.parametrize("resident", [False, True])
+def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder, resident):
+    windows, _ = samples.windows(folder, remembering(), resident=resident)
+    plain, _ = samples.windows(folder, samples.config(samples.one_step()))
+    first, begins = windows.batch([3], last=False), plain.batch([3])
+    assert first.snapshot.correction is None
+    for name in ("positions", "velocities", "proposed", "forces"):
+        torch.testing.assert_close(getattr(first.snapshot, name), getattr(begins.snapshot, name))
+    torch.testing.assert_close(first.target, begins.target)
+    found, before, now = windows.batch([3]), plain.batch([3]), plain.batch([4])
+    torch.testing.assert_close(found.snapshot.correction, before.target)
+    torch.testing.assert_close(found.target, now.target)
+    torch.testing.assert_close(found.snapshot.positions, now.snapshot.positions)
+    torch.testing.assert_close(
+        found.snapshot.velocities, now.snapshot.velocities, rtol=1e-5, atol=1e-5
+    )
+
+
+def test_a_first_guess_is_to_become_the_base_models_answer(folder):
+    changes = {**samples.SMALL["changes"], "placement": "guess"}
+    settings = samples.config(
+        samples.one_step(), corrector={"preset": "compact", "changes": changes}
+    )
+    guess = samples.windows(folder, settings)[0].batch([7])
+    state = samples.windows(folder, samples.config(samples.one_step()))[0].batch([7])
+    torch.testing.assert_close(
+        guess.snapshot.proposed + guess.target, state.snapshot.proposed, rtol=0, atol=1e-12
+    )
+    h, bodies = 0.01, state.bodies
+    moved = h * state.snapshot.velocities
+    moved = moved + h**2 * state.snapshot.forces / bodies.mass[:, None] * bodies.free
+    torch.testing.assert_close(guess.snapshot.proposed, state.snapshot.positions + moved)
+
+
+@pytest.mark.parametrize("placement", ["force", "guess"])
+def test_what_is_proposed_before_the_step_holds_the_clamps_where_the_coarse_step_has_them(
+    folder, placement
+):
+    changes = {**samples.SMALL["changes"], "placement": placement}
+    architecture = {"preset": "compact", "changes": changes}
+    stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
+    windows, _ = samples.windows(folder, samples.config(stage, corrector=architecture))
+    found = windows.dataset.batch([7, 26])
+    batch = windows.step_batch(found)
+    held, state = ~batch.bodies.free, batch.snapshot
+    assert held.any()
+    ahead = state.positions + 0.01 * state.velocities  # as clamps that do not move always were
+    assert torch.equal(state.proposed[held], ahead[held])
+    found.predictions[:, -1][held] += 0.003
+    moved = windows.step_batch(found)
+    predicted = found.predictions[:, -1].to(torch.float64)
+    assert torch.equal(moved.snapshot.proposed[held], predicted[held])
+    assert torch.equal(moved.snapshot.proposed[~held], state.proposed[~held])
+    if placement == "guess":
+        assert not moved.target[held].any()
+
+
+@pytest.mark.parametrize("relative", [False, True])
+def test_noise_is_seen_and_to_be_corrected(folder, relative):
+    settings = samples.config(samples.one_step())
+    batch = samples.windows(folder, settings)[0].batch(list(range(0, 60, 4)))
+    generator = torch.Generator().manual_seed(1)
+    tau = 0.5 if relative else 2e-3
+    noisy = batch.with_noise(tau, relative, generator)
+    noise = noisy.snapshot.proposed - batch.snapshot.proposed
+    torch.testing.assert_close(
+        noisy.snapshot.proposed + noisy.target, batch.snapshot.proposed + batch.target
+    )
+    assert not noise[~batch.bodies.free].any()
+    free = batch.bodies.free.all(dim=1)
+    unit = batch.bodies.by_node((batch.scale / 3).sqrt())[:, None] if relative else 1.0
+    sizes = (noise / unit)[free]
+    assert float(sizes.square().mean().sqrt()) == pytest.approx(tau, rel=0.05)
+    assert abs(float(sizes.mean())) < 0.1 * tau
+    assert noisy.snapshot.positions is batch.snapshot.positions
+
+
+@pytest.mark.parametrize("features", [("node-type", "strain"), ("load", "previous-correction")])
+@pytest.mark.parametrize("placement", ["state", "force"])
+def test_windows_kept_in_memory_are_those_that_are_read(folder, features, placement):
+    changes = {**samples.SMALL["changes"], "node_features": features, "placement": placement}
+    stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
+    settings = samples.config(stage, corrector={"preset": "compact", "changes": changes})
+    kept, read = (
+        samples.windows(folder, settings, resident=resident)[0] for resident in (True, False)
+    )
+    chosen = [45, 3, 18, 45, 20, 56, 0]  # both meshes, all simulations, first and last windows
+    pairs = [(kept.batch(chosen), read.batch(chosen))]
+    several = kept.batches(8, seed=3), read.batches(8, seed=3)
+    pairs += [(next(several[0]), next(several[1])) for _ in range(2 * len(several[0]))]
+    assert several[0].state_dict() == several[1].state_dict()
+    for one, other in pairs:
+        assert torch.equal(one.target, other.target)
+        assert torch.equal(one.scale, other.scale)
+        for x, y in ((one.bodies, other.bodies), (one.snapshot, other.snapshot)):
+            for field in fields(x):
+                a, b = getattr(x, field.name), getattr(y, field.name)
+                assert (a is None and b is None) or (a.dtype == b.dtype and torch.equal(a, b))
+        for name in KNOWN:
+            assert torch.equal(vars(one.bodies)[name], vars(other.bodies)[name])
+
+
+def test_windows_that_memory_does_not_hold_are_read(folder, monkeypatch):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    assert windows.resident
+    assert len(windows.dataset) == 60
+    for index in (60, 10**6):
+        with pytest.raises(IndexError, match=str(index)):
+            windows.batch([0, index])
+    monkeypatch.setattr("pdcorrect.training.windows.CACHE_BYTES", 10**5)
+    assert not samples.windows(folder, settings)[0].resident
+
+
+def test_what_is_known_of_the_rest_is_that_of_the_bodies(folder):
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    bodies = windows.batch([3, 45, 4]).bodies
+    anew = bodies.to()
+    for name in KNOWN:
+        torch.testing.assert_close(vars(bodies)[name], getattr(anew, name))
+        assert len(getattr(bodies, name)) > 50 or name == "node_counts"
+
+
+# --- normalisation -----------------------------------------------------------------------
+
+
+def test_the_normaliser_has_zero_mean_and_unit_deviation_on_the_training_split(folder):
+    architecture = {"preset": "thesis", "changes": {"layers": 1, "width": 8}}
+    settings = samples.config(samples.one_step(), corrector=architecture)
+    corrector = samples.fitted(folder, settings)
+    windows, _ = samples.windows(folder, settings)
+    fit_normaliser(corrector, windows, 10**6)
+    every = windows.batch(range(len(windows.dataset)))
+    normaliser = corrector.normaliser
+    np.testing.assert_allclose(
+        normaliser.force__mean.numpy(), every.snapshot.forces.mean(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.force__deviation.numpy(),
+        every.snapshot.forces.std(dim=0, correction=0).numpy(),
+    )
+    target = every.target[every.bodies.free.all(dim=1)]
+    assert float(normaliser.output_scale) == pytest.approx(float(target.square().mean().sqrt()))
+
+
+def test_bodies_of_the_training_split_are_like_it(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector = samples.fitted(folder, settings)
+    fit_normaliser(corrector, windows, 10**6)
+    every = windows.batch(range(len(windows.dataset)))
+    view = FeatureView(every.bodies, every.snapshot)
+    averages = every.bodies.body_means(corrector.inputs(view)[0])
+    normaliser = corrector.normaliser
+    np.testing.assert_allclose(
+        normaliser.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        normaliser.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
+    )
+    assert 1.0 < float(corrector.unlike(view).max()) <= 3.5 + 1e-9
+
+
+def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector = samples.fitted(folder, settings)
+    corrector.normaliser.shape_low.fill_(torch.nan)
+    fit_normaliser(corrector, windows, 1)
+    bodies = windows.batch(range(len(windows.dataset))).bodies
+    assert len(torch.unique(bodies.shapes, dim=0)) > 1
+    assert not corrector.shape_excess(bodies).any()
+    normaliser = corrector.normaliser
+    assert torch.equal(normaliser.shape_low, bodies.shapes.double().amin(dim=0))
+    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
+    normaliser.shape_low += 1.0  # as of larger bodies
+    assert (corrector.shape_excess(bodies) > 0.5).any()
+    widen_ranges(corrector, windows, 1)
+    assert not corrector.shape_excess(bodies).any()
+    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
+
+
+def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    corrector, size = samples.fitted(folder, settings), 0.05
+    step = windows.dataset.headers[0].time_step / size
+    normaliser = corrector.normaliser
+    normaliser.time_step_low.fill_(torch.nan)
+    fit_normaliser(corrector, windows, 1)
+    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+    bodies = windows.batch([0]).bodies
+    assert bodies.time_steps.tolist() == pytest.approx([np.log(step)], abs=1e-6)
+    assert corrector.time_step_excess(bodies).tolist() == [0.0]
+    for shift in (np.log(2.0), -np.log(2.0)):  # as of data with another step
+        normaliser.time_step_low += shift
+        normaliser.time_step_high += shift
+        assert corrector.time_step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
+        both = sorted((step, step * np.exp(shift)))
+        widen_ranges(corrector, windows, 1)
+        assert normaliser.time_steps == pytest.approx(both, rel=1e-6)
+        fit_normaliser(corrector, windows, 1)
+        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+
+
+def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
+    settings = samples.config(samples.one_step())
+    windows, _ = samples.windows(folder, settings)
+    found = []
+    for seed in (0, 0, 1):
+        corrector = samples.fitted(folder, settings)
+        fit_normaliser(corrector, windows, 10, seed)
+        found.append(corrector.normaliser.state_dict())
+    for name, x in found[0].items():
+        assert torch.equal(x, found[1][name])
+    assert found[0]["output_scale"] != found[2]["output_scale"]
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers):
+    settings = remembering() if remembers else samples.config(samples.one_step())
+    # windows of one step, whatever the network asks for: what it sees when it begins
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    corrector = samples.fitted(folder, settings)
+    _, _, steps = windows.dataset.places(range(len(windows.dataset)))
+    first, others = np.flatnonzero(steps == 0), np.flatnonzero(steps == 10)
+    fit_normaliser(corrector, samples.windows(folder, settings)[0], len(first))
+
+    def outside(numbers):
+        batch = windows.batch(numbers.tolist())
+        return corrector.outside(FeatureView(batch.bodies, batch.snapshot), 0.0)
+
+    assert not outside(first).any()
+    assert outside(others).any()  # so few windows do not hold all of the rest
+
+
+# --- steps of the optimiser --------------------------------------------------------------
+
+
+def test_batches_without_a_finite_gradient_change_nothing_and_are_counted(folder):
+    settings = samples.config(samples.one_step())
+    corrector = samples.fitted(folder, settings)
+    optimiser = Optimiser(corrector, settings.stages[0], None, World())
+    some = next(iter(corrector.network.parameters()))
+
+    def loss(factor):
+        return factor * sum(p.square().sum() for p in corrector.network.parameters())
+
+    optimiser.step(loss(1.0), 0.5)
+    before, moments = weights(corrector), optimiser.state_dict()
+    moments = {n: x.clone() for n, x in moments.items() if n.startswith("adam")}
+    optimiser.step(loss(torch.nan), 0.5)
+    optimiser.step((some - some.detach()).abs().sqrt().sum(), 0.5)  # infinite derivatives only
+    assert torch.equal(weights(corrector), before)
+    for name, x in optimiser.state_dict().items():
+        if name.startswith("adam"):
+            assert torch.equal(x, moments[name]), name
+    told = optimiser.take_report()
+    assert (told["count"], told["skipped"], told["longest"]) == (1, 2, 2)
+    optimiser.step(loss(1.0), 0.5)
+    assert not torch.equal(weights(corrector), before)
+    optimiser.step(loss(torch.inf), 0.5)
+    told = optimiser.take_report()
+    assert (told["count"], told["skipped"], told["longest"]) == (1, 1, 2)
+    assert optimiser.take_report()["longest"] == 1
+
+
+def test_gradients_are_clipped_and_averaged_weights_follow_by_their_decay(folder):
+    settings = samples.config(samples.one_step(clip=0.25, ema=0.75))
+    corrector, averaged = samples.fitted(folder, settings), samples.fitted(folder, settings)
+    before = weights(averaged)
+    optimiser = Optimiser(corrector, settings.stages[0], averaged, World())
+    optimiser.step(1e3 * sum(p.square().sum() for p in corrector.network.parameters()), 0.5)
+    grads = [p.grad for p in corrector.network.parameters()]
+    assert float(torch.nn.utils.get_total_norm(grads)) == pytest.approx(0.25, rel=1e-4)
+    found = weights(averaged)
+    torch.testing.assert_close(found, 0.75 * before + 0.25 * weights(corrector))
+    assert not torch.equal(found, before)
+
+
+def test_bfloat16_is_close_to_full_precision_but_not_the_same(folder):
+    settings = samples.config(samples.one_step())
+    corrector = samples.fitted(folder, settings)
+    batch = samples.windows(folder, settings)[0].batch([3, 30])
+    full, half = (
+        one_step_loss(corrector, batch, samples.one_step(amp=amp)).item()
+        for amp in ("none", "bf16")
+    )
+    assert half == pytest.approx(full, rel=0.05)
+    assert half != full
+    assert one_step_loss(corrector, batch, samples.one_step()).item() == full
