@@ -11,11 +11,11 @@ import pdcorrect as pc
 from conftest import rotation
 from hybrid_samples import TORSION, Prescribed, fitted, soft_beam
 from network_samples import body, corrector, moving, turned_and_moved
+from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
 from pdcorrect.corrector.compiled_features import CompiledFeatures
 from pdcorrect.corrector.compiled_network import Groups
-from pdcorrect.corrector.config import preset
-from pdcorrect.corrector.features import Snapshot, View
+from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.products import normalise, product, strips
@@ -31,7 +31,7 @@ def views(cells=(3, 2, 1), **changes):
     """Bodies that are bent, less bent, and held nowhere."""
     for seed, strength, clamped in ((0, 0.15, True), (1, 1e-3, True), (2, 0.4, False)):
         bodies = body(cells, seed=seed, clamped=clamped, **changes)
-        yield View(bodies, moving(bodies, seed, strength))
+        yield FeatureView(bodies, moving(bodies, seed, strength))
 
 
 def inverted(bodies):
@@ -84,12 +84,16 @@ def test_products_are_those_of_matrices(sizes, dtype):
     assert np.abs(out[:, :b] - np.maximum(expected, 0.0)).max() < 50 * a * np.finfo(dtype).eps
 
 
-def test_what_is_not_a_number_passes_through_products():
-    x = np.ones((8, 2))
+def test_what_is_not_a_number_stays_in_its_row_of_products_and_norms():
+    x, out = np.ones((8, 2)), np.zeros((8, 16))
     x[3, 1] = np.nan
-    out = np.zeros((8, 16))
     product(x, strips(np.ones((2, 16))), np.zeros(16), 0.0, out)
     assert np.array_equal(np.isnan(out).all(axis=1), np.arange(8) == 3)
+    x = np.random.default_rng(0).normal(size=(3, 16))
+    x[1, 4] = np.nan
+    normalise(x, np.ones((2, 16)))
+    assert np.array_equal(np.isnan(x).all(axis=1), [False, True, False])
+    assert np.isfinite(x[[0, 2]]).all()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -103,14 +107,6 @@ def test_rows_are_normalised_as_by_torch(width, dtype):
     expected = layer_norm(torch.tensor(x.copy()), (width,), weight, bias).numpy()
     normalise(x, norm.astype(dtype))
     assert np.abs(x - expected).max() < 200 * np.finfo(dtype).eps
-
-
-def test_a_row_with_what_is_not_a_number_is_none_and_leaves_the_others():
-    x = np.random.default_rng(0).normal(size=(3, 16))
-    x[1, 4] = np.nan
-    normalise(x, np.ones((2, 16)))
-    assert np.array_equal(np.isnan(x).all(axis=1), [False, True, False])
-    assert np.isfinite(x[[0, 2]]).all()
 
 
 def test_arrays_that_vectors_would_misread_are_refused():
@@ -142,17 +138,6 @@ def test_features_are_those_of_torch(clip):
         assert np.abs(found.frames - view.frames.numpy()).max() < 1e-14
 
 
-def test_features_of_inverted_and_flat_cells_are_those_of_torch():
-    bodies = body((3, 1, 1))
-    view = View(bodies, inverted(bodies))
-    assert (torch.linalg.det(view.gradients) < 0.0).any()
-    made = corrector(node_features=REMEMBERING)
-    nodes, edges = made.inputs(view)
-    x, e, _ = inputs(made, view)
-    assert relative(x, nodes) < 1e-10
-    assert relative(e, edges) < 1e-10
-
-
 @pytest.mark.parametrize(
     "names", [(("strain", "load"), ("turn",)), (("node-type",), ("motion", "rest-edge"))]
 )
@@ -166,28 +151,21 @@ def test_features_come_in_the_order_that_they_are_named_in(names):
         assert relative(e, expected[1]) < 1e-10
 
 
-def test_the_share_outside_the_training_data_is_that_of_torch():
+def test_how_far_outside_the_training_data_a_body_is_agrees_with_torch():
     for view in views():
         other = body(seed=7)
-        made = corrector(view=View(other, moving(other, 7)), node_features=REMEMBERING)
+        made = corrector(view=FeatureView(other, moving(other, 7)), node_features=REMEMBERING)
         compiled = CompiledCorrector(made, view.bodies)
         for margin in (0.0, 0.1, 1.0, 10.0, 1e3):
             expected = made.outside(view, margin).numpy()
             assert np.array_equal(compiled.outside(view, margin), expected)
-
-
-def test_how_unlike_training_a_body_is_agrees_with_torch():
-    for view in views():
-        other = body(seed=7)
-        made = corrector(view=View(other, moving(other, 7)), node_features=REMEMBERING)
-        compiled = CompiledCorrector(made, view.bodies)
         compiled.of_view(view)
         found = compiled.unlike(view)
         assert found[0] > 0.0
         assert found[0] == pytest.approx(float(made.unlike(view)), rel=1e-12)
 
 
-def test_how_unlike_training_a_body_is_at_rest_is_told_as_by_torch_and_follows_the_normaliser():
+def test_bodies_and_time_steps_beyond_the_training_are_told_as_by_torch_and_by_the_normaliser():
     view = next(views())
     made = corrector(view=view)
     compiled = CompiledCorrector(made, view.bodies)
@@ -196,12 +174,6 @@ def test_how_unlike_training_a_body_is_at_rest_is_told_as_by_torch_and_follows_t
         expected = made.shape_excess(view.bodies).numpy()
         assert np.array_equal(compiled.shape_excess(view.bodies), expected)
     assert np.isinf(expected).all()
-
-
-def test_how_unlike_training_a_time_step_is_is_told_as_by_torch_and_follows_the_normaliser():
-    view = next(views())
-    made = corrector(view=view)
-    compiled = CompiledCorrector(made, view.bodies)
     found = []
     for low, high in ((0.0, 0.0), (0.25, 0.5), (-1.0, -0.5), (np.nan, 0.0)):
         made.normaliser.time_step_low += low
@@ -212,22 +184,14 @@ def test_how_unlike_training_a_time_step_is_is_told_as_by_torch_and_follows_the_
     assert found == pytest.approx([0.0, 0.25, 0.0, np.inf])
 
 
-def test_a_body_with_inputs_that_are_not_numbers_is_unlike_any():
+def test_inputs_that_are_not_numbers_are_outside_the_training_data():
     view = next(views())
     made = corrector(view=view)
     view.snapshot.velocities[4, 0] = np.nan
     for answers in (made, CompiledCorrector(made, view.bodies)):
-        assert answers.unlike(View(view.bodies, view.snapshot)).item() == np.inf
-
-
-def test_inputs_that_are_not_numbers_are_outside_the_training_data():
-    view = next(views())
-    made = corrector(view=view)
-    step = view.snapshot
-    step.velocities[4, 0] = np.nan
-    found = CompiledCorrector(made, view.bodies).outside(View(view.bodies, step), 1e9)
-    assert np.array_equal(found, made.outside(View(view.bodies, step), 1e9).numpy())
-    assert found[0] == pytest.approx(1 / len(view.bodies.rest))
+        anew = FeatureView(view.bodies, view.snapshot)
+        assert answers.unlike(anew).item() == np.inf
+        assert float(answers.outside(anew, 1e9)[0]) == pytest.approx(1 / len(view.bodies.rest))
 
 
 # --- corrections -----------------------------------------------------------------------------
@@ -270,16 +234,23 @@ def test_presets_are_those_of_torch_on_a_bent_cross(name):
         )
     )  # fmt: skip
     bodies = HybridStepper(pc.ProjectiveDynamics(problem), corrector()).bodies
-    view = View(bodies, moving(bodies))
+    view = FeatureView(bodies, moving(bodies))
     config = preset(name)
     made = corrector(name, view, dtype=torch.float32, layers=config.layers, width=config.width)
     found, expected = both(made, view)
     assert relative(found, expected) < 1e-5
 
 
-def test_inverted_cells_are_corrected_as_by_torch():
+def test_inverted_and_flat_cells_are_seen_and_corrected_as_by_torch():
     bodies = body((3, 1, 1))
-    found, expected = both(corrector(dtype=torch.float32), View(bodies, inverted(bodies)))
+    view = FeatureView(bodies, inverted(bodies))
+    assert (torch.linalg.det(view.gradients) < 0.0).any()
+    made = corrector(node_features=REMEMBERING)
+    nodes, edges = made.inputs(view)
+    x, e, _ = inputs(made, view)
+    assert relative(x, nodes) < 1e-10
+    assert relative(e, edges) < 1e-10
+    found, expected = both(corrector(dtype=torch.float32), FeatureView(bodies, inverted(bodies)))
     assert relative(found, expected) < 1e-5
 
 
@@ -290,7 +261,7 @@ def test_a_body_that_moves_rigidly_is_not_corrected_at_all():
     still = torch.zeros_like(there)
     compiled = CompiledCorrector(corrector(dtype=torch.float32), bodies)
     for proposed in (bodies.rest, there):
-        found = compiled.of_view(View(bodies, Snapshot(bodies.rest, still, proposed, still)))
+        found = compiled.of_view(FeatureView(bodies, Snapshot(bodies.rest, still, proposed, still)))
         assert not found.any()
 
 
@@ -300,8 +271,8 @@ def test_corrections_turn_with_the_scene():
     R = rotation(5)
     step = moving(bodies)
     turned_bodies, turned_step = turned_and_moved(bodies, step, R, [0.5, -1.0, 2.0])
-    here = CompiledCorrector(made, bodies).of_view(View(bodies, step))
-    there = CompiledCorrector(made, turned_bodies).of_view(View(turned_bodies, turned_step))
+    here = CompiledCorrector(made, bodies).of_view(FeatureView(bodies, step))
+    there = CompiledCorrector(made, turned_bodies).of_view(FeatureView(turned_bodies, turned_step))
     assert relative(there, here.numpy() @ R.T) < 1e-5
 
 
@@ -314,7 +285,7 @@ def test_numbers_of_threads_do_not_change_corrections():
     try:
         for count in range(1, numba.config.NUMBA_NUM_THREADS + 1):
             numba.set_num_threads(count)
-            found.append(compiled.of_view(View(view.bodies, view.snapshot)))
+            found.append(compiled.of_view(FeatureView(view.bodies, view.snapshot)))
     finally:
         numba.set_num_threads(before)
     assert all(torch.equal(one, found[0]) for one in found)
@@ -323,9 +294,9 @@ def test_numbers_of_threads_do_not_change_corrections():
 def test_answers_do_not_depend_on_what_was_asked_before():
     bodies = body()
     compiled = CompiledCorrector(corrector(dtype=torch.float32), bodies)
-    first = View(bodies, moving(bodies, 0))
+    first = FeatureView(bodies, moving(bodies, 0))
     before = compiled.of_view(first)
-    compiled.of_view(View(bodies, moving(bodies, 1)))
+    compiled.of_view(FeatureView(bodies, moving(bodies, 1)))
     assert torch.equal(compiled.of_view(first), before)
 
 
@@ -374,11 +345,11 @@ def other_clip(made):
 def test_changed_correctors_are_noticed(change):
     bodies = body()
     made = corrector(dtype=torch.float32)
-    compiled, view = CompiledCorrector(made, bodies), View(bodies, moving(bodies))
+    compiled, view = CompiledCorrector(made, bodies), FeatureView(bodies, moving(bodies))
     before = compiled.of_view(view)
     change(made)
     with torch.no_grad():
-        expected = made.of_view(View(bodies, view.snapshot))
+        expected = made.of_view(FeatureView(bodies, view.snapshot))
     assert relative(compiled.of_view(view), expected) < 1e-5
     assert relative(before, expected) > 1e-3
 
@@ -386,7 +357,7 @@ def test_changed_correctors_are_noticed(change):
 def test_a_change_of_precision_is_noticed():
     bodies = body()
     made = corrector(dtype=torch.float32)
-    compiled, view = CompiledCorrector(made, bodies), View(bodies, moving(bodies))
+    compiled, view = CompiledCorrector(made, bodies), FeatureView(bodies, moving(bodies))
     made.network.double()
     with torch.no_grad():
         assert relative(compiled.of_view(view), made.of_view(view)) < 1e-12
@@ -413,8 +384,12 @@ def test_torch_answers_where_loops_cannot(changes):
 
 
 def test_only_single_bodies_in_double_precision_are_compiled():
+    """The question draws no random numbers."""
     made, bodies = corrector(), body()
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
     assert compilable(made, bodies)
+    assert torch.equal(torch.random.get_rng_state(), before)
     assert not compilable(made, bodies.to(dtype=torch.float32))
     made.network.half()
     assert not compilable(made, bodies)
@@ -442,14 +417,6 @@ def test_networks_that_were_changed_are_not_compiled(change):
     assert compilable(made, body())
     change(made.network)
     assert not compilable(made, body())
-
-
-def test_the_question_draws_no_random_numbers():
-    made, bodies = corrector(), body()
-    torch.manual_seed(1)
-    before = torch.random.get_rng_state()
-    compilable(made, bodies)
-    assert torch.equal(torch.random.get_rng_state(), before)
 
 
 def test_edges_receive_in_groups_of_their_own():
