@@ -11,7 +11,7 @@ import pdcorrect as pc
 
 ROOT = Path(__file__).parents[1]
 IMAGE = ROOT / "docs" / "images" / "unseen_cross.gif"
-COLOURS = 64
+COLOURS = 48
 
 
 def runs() -> dict[str, pc.Trajectory]:
@@ -28,13 +28,13 @@ def runs() -> dict[str, pc.Trajectory]:
 
 
 def reduced(path: Path) -> None:
-    """Write a film again with few colours; the last frame stays for two seconds."""
+    """Write a film again with few colours and every second frame; the last one stays longer."""
     from PIL import Image, ImageSequence
 
     with Image.open(path) as film:
-        pages = [page.convert("RGB") for page in ImageSequence.Iterator(film)]
-        times = [film.info["duration"]] * (len(pages) - 1) + [2000]
-    sample = Image.fromarray(np.concatenate([np.asarray(page) for page in pages[::10]]))
+        pages = [page.convert("RGB") for page in ImageSequence.Iterator(film)][::2]
+        times = [2 * film.info["duration"]] * (len(pages) - 1) + [2000]
+    sample = Image.fromarray(np.concatenate([np.asarray(page) for page in pages[::5]]))
     palette = sample.quantize(COLOURS, method=Image.Quantize.FASTOCTREE)
     drawn = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=times, loop=0)

@@ -16,11 +16,11 @@ import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
 from pdcorrect.batch import decomposition, minimise
 from pdcorrect.batch import gpu as recording
-from pdcorrect.batch.sharing import Bodies
 from pdcorrect.batch.cells import Sizes
-from pdcorrect.batch.states import expected_bytes
-from pdcorrect.batch.points import Points
 from pdcorrect.batch.gpu import tall_product
+from pdcorrect.batch.points import Points
+from pdcorrect.batch.sharing import DistinctBodies
+from pdcorrect.batch.states import expected_bytes
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
@@ -250,7 +250,7 @@ def test_scenes_that_differ_by_loads_alone_step_as_if_they_shared_nothing(elemen
 def test_bodies_with_other_materials_or_mass_rules_are_not_one():
     problem = pc.discretise(unlike(1))
     twins = [problem, problem.with_loads([]), problem.with_material(density=900.0)]
-    found = Bodies.of([*twins, pc.discretise(unlike(1)), problem])
+    found = DistinctBodies.of([*twins, pc.discretise(unlike(1)), problem])
     assert found.owners.tolist() == [0, 0, 1, 2, 0]
     assert [p is q for p, q in zip(found.distinct, (twins[0], twins[2]), strict=False)] == [
         True
@@ -333,10 +333,10 @@ def test_single_precision_reaches_a_loose_tolerance(device):
 
 def test_the_memory_formula_fits_what_was_measured_on_a_gpu():
     """Where it matters: batches that take more than half a gigabyte."""
-    results = Path(__file__).parents[1] / "benchmarks" / "results"
-    record = json.loads((results / "nvidia-h200.json").read_text())
+    records = Path(__file__).parents[1] / "benchmarks" / "results"
+    results = json.loads((records / "nvidia-h200.json").read_text())["batch"]["results"]
     checked = 0
-    for row in record["coarse"] + record["fine"]:
+    for row in results["coarse"] + results["fine"]:
         sizes = Sizes(row["scenes"], row["nodes"], 0, row["cells"], 8, 8)
         width = 3 if row["first_hessian"] == "rest" else 1
         if row["memory_bytes"] > 1e9:

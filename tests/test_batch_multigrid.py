@@ -7,13 +7,11 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh
-from pdcorrect.batch.elimination import summed_blocks
-from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks
-from pdcorrect.batch.multigrid import largest_eigenvalue
+from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, summed_blocks
 from pdcorrect.batch.inverses import LARGEST_REST, FirstHessian, chosen
 from pdcorrect.batch.levels import hierarchy
+from pdcorrect.batch.multigrid import largest_eigenvalue, with_mass
 from pdcorrect.batch.states import expected_bytes
-from pdcorrect.batch.multigrid import with_mass
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import interpolation, refine
 

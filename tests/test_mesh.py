@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from block_meshes import o_grid, spokes, warped
-from pdcorrect.scene import voxels as shapes
 from pdcorrect.errors import MeshError, SceneError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import (
@@ -19,6 +18,7 @@ from pdcorrect.fem.mesh import (
     refine,
     voxel_mesh,
 )
+from pdcorrect.scene import voxels as shapes
 
 
 def cross_mesh():
