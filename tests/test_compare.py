@@ -225,23 +225,6 @@ def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
     assert meshio.read(folder / "vtu" / "coarse-pd-hex27_0002.vtu").cells[0].type == "hexahedron27"
 
 
-def test_labels_that_become_one_file_name_are_told_apart(thick, tmp_path):
-    case = CASES[2]
-    other = dataclasses.replace(case, label="coarse, PD")
-    written = report.write_series(pc.compare(thick, 1, (case, other)), tmp_path)
-    assert [path.name for path in written] == ["coarse-pd.pvd", "coarse-pd-again.pvd"]
-
-
-def test_compare_with_a_model_and_no_torch_names_the_extra(program, thick, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    (tmp_path / "scene.toml").write_text(thick.to_toml())
-    arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
-    status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
-    assert status == cli.BAD_INPUT
-    assert "pdcorrect[learn]" in err
-    assert not (tmp_path / "r").exists()
-
-
 @pytest.mark.parametrize("length", [20, 60, 160])
 def test_no_text_of_a_plot_leaves_it_and_axes_keep_their_height(tmp_path, monkeypatch, length):
     pytest.importorskip("matplotlib")
@@ -289,11 +272,14 @@ def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkey
 
 
 def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_path):
+    again = dataclasses.replace(CASES[2], label="coarse, PD")  # of the same file name
     first = pc.compare(thick, 1, CASES[1:3])
     report.write_series(first, tmp_path)
     (tmp_path / "vtu" / "mine.vtu").write_text("")
     second = pc.compare(thick, 1, CASES[2:3])
     report.write_series(second, tmp_path)
+    written = report.write_series(pc.compare(thick, 1, (CASES[2], again)), tmp_path / "again")
+    assert [path.name for path in written] == ["coarse-pd.pvd", "coarse-pd-again.pvd"]
     assert {path.name for path in (tmp_path / "vtu").iterdir()} == {
         "coarse-pd.pvd", "coarse-pd_0000.vtu", "coarse-pd_0001.vtu", "mine.vtu"
     }  # fmt: skip

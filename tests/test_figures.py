@@ -283,7 +283,7 @@ def test_runs_over_each_other_are_seen_where_they_differ(run, fine, tmp_path):
     assert figures.render_overlay([run, fine], tmp_path / "b.png", labels=["1", "2"]).exists()
 
 
-def test_unwritable_outputs_are_named(run, tmp_path):
+def test_unwritable_outputs_and_missing_libraries_are_named(run, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.png").mkdir()
     for path in (
@@ -293,9 +293,6 @@ def test_unwritable_outputs_are_named(run, tmp_path):
     ):
         with pytest.raises(OutputError, match=path.name):
             figures.render(run, path, window=100)
-
-
-def test_missing_libraries_are_named(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(MissingExtraError, match=r"pdcorrect\[view\]"):
         figures.render(run, tmp_path / "a.png")

@@ -169,25 +169,6 @@ def test_a_limited_correction_is_no_refusal():
     assert not first.state.memory
 
 
-class FailsFirst(pc.ProjectiveDynamics):
-    """Says of every step from time 0 that it failed."""
-
-    def __call__(self, state, *args, **options):
-        result = super().__call__(state, *args, **options)
-        failed = pc.Status.ITERATION_LIMIT
-        return replace(result, status=failed) if state.time == 0.0 else result
-
-
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_failed_coarse_step_shuts_the_gate(placement):
-    problem = pushed_in()
-    hybrid = HybridStepper(
-        FailsFirst(problem), wary(problem, placement=placement), gate=Gate(**NOTHING, pause=2)
-    )
-    found = [r.stats["gate"] for _, r in results_of(hybrid, 5)]
-    assert found == [Reason.SOLVER, P, P, 0, 0]
-
-
 class FailsThird(pc.ProjectiveDynamics):
     """Says of every step of the scene's own loads from time 2 h that it failed."""
 

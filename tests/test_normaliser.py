@@ -142,13 +142,10 @@ def test_inputs_bend_towards_the_clip():
     assert (bent.diff(dim=0) > 0).all()
 
 
-def test_excess_counts_deviations_outside_the_range_seen():
+def test_excess_counts_deviations_outside_the_range_seen_of_which_the_farthest_is_3_5_at_most():
     x = tensor([[0.0, -1.0], [4.0, 1.0]])  # deviations 2 and 1
     found = fitted(a=x).excess({"a": tensor([[2.0, 0.0], [-3.0, 1.0], [5.0, -1.5], [4.0, 3.0]])})
     assert torch.equal(found, tensor([[0.0, 0.0], [1.5, 0.0], [0.5, 0.5], [0.0, 2.0]]))
-
-
-def test_the_farthest_value_seen_counts_as_three_and_a_half_deviations_at_most():
     kicks = torch.zeros(100, 1).double()
     kicks[0] = 7.0  # ten deviations from the mean
     normaliser = fitted(a=kicks)
