@@ -29,7 +29,7 @@ from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
-from pdcorrect.data.info import dataset_info
+from pdcorrect.data.summary import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import InputError

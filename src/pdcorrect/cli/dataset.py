@@ -105,10 +105,6 @@ def info(
     json: Annotated[
         Optional[Path], typer.Option(help="Also write all numbers to this file.")
     ] = None,
-    figures: Annotated[
-        Optional[Path],
-        typer.Option(help="Also draw histograms and samples into this folder (extra 'view')."),
-    ] = None,
     skip_damaged: Annotated[
         bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
     ] = False,
@@ -116,25 +112,16 @@ def info(
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
     from rich.console import Console
 
-    from pdcorrect.data.info import summarise
-    from pdcorrect.data.measuring import dataset_files, measure_dataset
+    from pdcorrect.data.summary import dataset_files, dataset_info
 
-    damaged: dict[Path, str] = {}
     with _progress("reading", len(dataset_files(folder))) as advance:
-        meshes = measure_dataset(folder, advance, damaged if skip_damaged else None)
-    found = summarise(folder.resolve().name, meshes, damaged)
-    Console().print(found.tables())
-    for text in damaged.values():
+        found = dataset_info(folder, advance, skip_damaged=skip_damaged)
+    console = Console() if sys.stdout.isatty() else Console(width=200)
+    console.print(found.tables())
+    for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:
         _write(json, found.to_json() + "\n")
-    if figures:
-        from pdcorrect._files import make_folder
-        from pdcorrect.data.pictures import histograms, thumbnails
-
-        make_folder(figures)
-        typer.echo(f"wrote {histograms(folder, figures / 'histograms.png', meshes)}")
-        typer.echo(f"wrote {thumbnails(folder, figures / 'samples.png')}")
 
 
 @app.command("export")
@@ -270,7 +257,7 @@ def card(
 ) -> None:
     """Write the card of a complete data set: what it is, its errors, cost and limits."""
     from pdcorrect.data.card import dataset_card
-    from pdcorrect.data.info import dataset_info
+    from pdcorrect.data.summary import dataset_info
 
     _write(output or folder / "README.md", dataset_card(folder, dataset_info(folder)))
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.info import DatasetInfo, SplitInfo
 from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN
 from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.summary import DatasetInfo, SplitInfo
 from pdcorrect.errors import FileFormatError, InputError
 
 _BODIES = {
@@ -127,7 +127,7 @@ def _split_cells(name: str, split: SplitInfo) -> tuple[object, ...]:
     return (
         name, split.meshes, split.simulations, f"{split.nodes[0]:.0f} to {split.nodes[1]:.0f}",
         f"{100 * split.rejection_rate:.2g}", "" if error is None else f"{1e3 * error:.3g}",
-        "" if best is None else best.omega_texts()[0],
+        "" if best is None or best.omega is None else f"{best.omega.mean:.3g}",
     )  # fmt: skip
 
 

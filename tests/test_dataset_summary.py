@@ -1,4 +1,4 @@
-"""What a summary says of a data set, in numbers, tables and pictures."""
+"""What a summary says of a data set, in numbers and tables."""
 
 import dataclasses
 import json
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dataset_samples import write_dataset
-from pdcorrect.data.info import dataset_info
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
-from pdcorrect.errors import FileFormatError, InputError, OutputError
+from pdcorrect.data.summary import dataset_info
+from pdcorrect.errors import FileFormatError, InputError
 
 
 @pytest.fixture(scope="module")
@@ -135,51 +135,6 @@ def test_a_summary_of_nothing_or_of_a_damaged_file_is_refused(dataset, tmp_path)
         dataset_info(dataset)
 
 
-# --- pictures ----------------------------------------------------------------------------
-
-
-def drawn(path):
-    iio = pytest.importorskip("imageio.v3")
-    return iio.imread(path)[..., :3].astype(int)
-
-
-@pytest.fixture(scope="module")
-def view():
-    pytest.importorskip("pyvista")
-    return pytest.importorskip("pdcorrect.data.pictures")
-
-
-def coloured(image):
-    """Whether each pixel is coloured, as bodies are and text is not."""
-    return np.ptp(image, axis=-1) > 25
-
-
-@pytest.mark.parametrize("count", [1, 6])
-def test_thumbnails_show_a_body_in_every_panel(view, original, tmp_path, count):
-    path = view.thumbnails(original, tmp_path / "a.png", count)
-    image = drawn(path)
-    columns = min(4, count)
-    assert image.shape[1] == columns * view._WIDTH
-    rows = -(-count // 4)
-    panels = image[: image.shape[0] - round(4.2 * view._FONT)]
-    height = panels.shape[0] / rows
-    for k in range(columns * rows):
-        top, left = round(k // columns * height), k % columns * view._WIDTH
-        panel = panels[top : top + round(height), left : left + view._WIDTH]
-        assert (coloured(panel).mean() > 0.02) == (k < count)
-        assert not coloured(panel[:, [0, -1]]).any()
-
-
-def test_bad_pictures_are_refused(view, original, tmp_path):
-    for path, count in ((tmp_path / "a.jpg", 8), (tmp_path / "a.png", 0)):
-        with pytest.raises(InputError, match="count"):
-            view.thumbnails(original, path, count)
-    with pytest.raises(InputError, match=r"a\.txt2"):
-        view.histograms(original, tmp_path / "a.txt2")
-    with pytest.raises(OutputError, match="none"):
-        view.histograms(original, tmp_path / "none" / "a.png")
-
-
 # --- the program -------------------------------------------------------------------------
 
 
@@ -187,7 +142,7 @@ def test_info_prints_tables_and_writes_json(program, dataset, tmp_path, monkeypa
     monkeypatch.setenv("COLUMNS", "100")
     status, out, _ = program("dataset", "info", dataset, "--json", tmp_path / "info.json")
     assert status == 0
-    assert all(word in out for word in ("training", "evaluation", "Omega", "plain steps"))
+    assert all(word in out for word in ("training", "evaluation", "Omega", "plain"))
     record = json.loads((tmp_path / "info.json").read_text())
     assert record["whole"]["simulations"] == 8
     assert record["splits"]["training"]["runs"]["best"]["omega"]["mean"] == pytest.approx(
@@ -199,17 +154,13 @@ def test_info_prints_tables_and_writes_json(program, dataset, tmp_path, monkeypa
     assert program("dataset", "info", dataset, "--json", again / "info.json")[0] == 1
 
 
-def test_info_without_statistics_or_costs_and_with_figures(program, view, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
+def test_info_without_statistics_or_costs(program, tmp_path):
     shard = counted_shard("training", 0, 1.0)
     simulation = shard.simulations[0]
     bare = {"reference": dataclasses.replace(simulation.runs["reference"], statistics={})}
     one = dataclasses.replace(simulation, runs=bare, seconds={})
     root = tmp_path / "bare"
     write_shard(root / "training/mesh-0000.h5", dataclasses.replace(shard, simulations=(one,)))
-    status, out, _ = program("dataset", "info", root, "--figures", tmp_path / "new")
-    assert status == 0
-    assert "iterations" not in out
-    names = sorted(path.name for path in (tmp_path / "new").iterdir())
-    assert names == ["histograms.png", "samples.png"]
-    assert coloured(drawn(tmp_path / "new" / "histograms.png")).mean() > 0.001
+    assert program("dataset", "info", root)[0] == 0
+    reference = dataset_info(root).whole.runs["reference"]
+    assert reference.iterations is reference.omega is None
