@@ -295,7 +295,7 @@ def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_pa
 def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program, tmp_path):
     pytest.importorskip("torch_geometric")
     scene, folder = EXAMPLES / "unseen_cross.toml", tmp_path / "report"
-    command = ("compare", scene, "-o", folder, "--frames", 6, "--no-figures")
+    command = ("compare", scene, "-o", folder, "--frames", 4, "--no-figures")
     assert program(*command, "--model", MODEL)[0] == 0
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     coarse = ["coarse PD", "coarse Newton", "best coarse PD", f"hybrid {MODEL}"]
@@ -350,7 +350,7 @@ def test_compare_writes_its_report(program, tmp_path):
     scene = tmp_path / "cross.toml"
     scene.write_text(cross(0.4, solver={"tolerance": 1e-4}).to_toml())
     folder = tmp_path / "report"
-    status, out, _ = program("compare", scene, "-o", folder, "--frames", 3)
+    status, out, _ = program("compare", scene, "-o", folder, "--frames", 2)
     assert status == 0
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     best = ["best coarse PD", "intermediate PD", "fine best PD"]
@@ -401,7 +401,10 @@ def test_compare_goes_on_after_a_case_that_fails(
     nodes = nodes_of(pc.Scene.load(scene_file), refine)
     failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes})
     folder = tmp_path / "report"
-    status, out, err = program("compare", scene_file, "-o", folder)
+    drawn = failing == "coarse PD"
+    status, out, err = program(
+        "compare", scene_file, "-o", folder, "--figures" if drawn else "--no-figures"
+    )
     assert (status, err) == (cli.FAILED, "")
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     others = ["coarse PD", "coarse Newton", "best coarse PD", "intermediate PD", "fine best PD"]
@@ -412,7 +415,7 @@ def test_compare_goes_on_after_a_case_that_fails(
     assert (record["solver_error"] is None) == (failing == "coarse PD")
     assert f"| {failing} |  | failed |" in (folder / "report.md").read_text()
     assert f"{failing} failed: frame 2" in " ".join(out.split())
-    assert (folder / "comparison.png").stat().st_size > 5000
+    assert not drawn or (folder / "comparison.png").stat().st_size > 5000
 
 
 def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, monkeypatch):

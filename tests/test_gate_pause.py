@@ -102,20 +102,21 @@ def left_after(result):
 N, P = Reason.NOT_FINITE, Reason.PAUSE
 
 
+COUNTS = [
+    (3, (2,), [0, N, P, P, P, 0, 0], [0, 3, 2, 1, 0, 0, 0]),
+    (3, (1, 3), [N, P, N, P, P, P, 0], [3, 2, 3, 2, 1, 0, 0]),
+    (3, (1, 4), [N, P, P, N, P, P, P], [3, 2, 1, 3, 2, 1, 0]),
+    (1, (2, 3, 5), [0, N, N, P, N, P, 0], [0, 1, 1, 0, 1, 0, 0]),
+    (0, (2, 3), [0, N, N, 0, 0, 0, 0], [0] * 7),
+]
+
+
 @pytest.mark.parametrize(
-    ("pause", "pushes", "reasons", "left"),
-    [
-        (3, (2,), [0, N, P, P, P, 0, 0], [0, 3, 2, 1, 0, 0, 0]),
-        (3, (1, 3), [N, P, N, P, P, P, 0], [3, 2, 3, 2, 1, 0, 0]),
-        (3, (1, 4), [N, P, P, N, P, P, P], [3, 2, 1, 3, 2, 1, 0]),
-        (1, (2, 3, 5), [0, N, N, P, N, P, 0], [0, 1, 1, 0, 1, 0, 0]),
-        (0, (2, 3), [0, N, N, 0, 0, 0, 0], [0] * 7),
-    ],
+    ("placement", "count"),
+    [*(("state", count) for count in COUNTS), ("force", COUNTS[1]), ("guess", COUNTS[1])],
 )
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_corrections_count_again_after_so_many_steps_that_would_pass(
-    placement, pause, pushes, reasons, left
-):
+def test_corrections_count_again_after_so_many_steps_that_would_pass(placement, count):
+    pause, pushes, reasons, left = count
     problem = pushed_in(*pushes)
     coarse = pc.ProjectiveDynamics(problem)
     gate = Gate(**NOTHING, pause=pause)
