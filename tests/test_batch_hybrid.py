@@ -40,7 +40,7 @@ def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
 
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_scenes_of_a_batch_are_corrected_as_each_alone(placement, element):
+def test_scenes_of_a_batch_are_corrected_as_single_ones_are(placement, element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
     names = (*preset("compact").node_features, "previous-correction")
     corrector = fitted(scenes, placement=placement, node_features=names)

@@ -227,13 +227,13 @@ def test_what_cannot_be_used_is_not_saved(tmp_path):
     broken = made()
     with torch.no_grad():
         broken.network.decoder[0].weight[0, 0] = torch.nan
-    for corrector, words in (
+    for corrector, told in (
         (fresh, "normaliser"),
         (broken, r"decoder\.0\.weight"),
         (made().double(), r"torch\.float64: .*torch\.float32"),
         (made().to(torch.float32), r"normaliser.* torch\.float32: .*torch\.float64"),
     ):
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=told):
             save_model(corrector, tmp_path / "model", record=RECORD)
     other = made()
     other.network.decoder = torch.nn.Sequential(torch.nn.Linear(8, 3))

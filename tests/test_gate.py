@@ -98,7 +98,7 @@ def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason, plac
     assert result.correction[first:].any()
 
 
-def test_inputs_unlike_the_training_data_are_refused_in_a_batch():
+def test_out_of_distribution_inputs_are_refused_in_a_batch():
     scenes = problems((3, 1, 1), (2, 2, 1))
     corrector = fitted(scenes)
     stepper = pc.BatchStepper(scenes)
@@ -115,7 +115,7 @@ def test_inputs_unlike_the_training_data_are_refused_in_a_batch():
     assert wide(state).reasons.tolist() == [0, 0]
 
 
-def test_a_body_whose_mean_inputs_are_strange_is_refused_though_every_node_is_familiar():
+def test_a_body_with_out_of_distribution_means_is_refused_though_each_node_is_within():
     """Fitted to two beams, of which one moves as it did, and one all of whose means are new."""
     scenes = problems((3, 1, 1), (2, 2, 1))
     corrector, averages = fitted(scenes), RunningMoments()

@@ -217,7 +217,7 @@ def test_of_a_batch_the_scene_whose_step_fails_in_a_pause_begins_it_anew(placeme
     assert reasons == [[N, N], [P, Reason.SOLVER], [P, P], [0, P], [0, 0]]
 
 
-def test_inputs_unlike_the_training_shut_the_gate():
+def test_out_of_distribution_inputs_shut_the_gate():
     """Without the test of them the same steps are corrected."""
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     corrector, coarse = fitted([problem]), pc.ProjectiveDynamics(problem)
@@ -230,7 +230,7 @@ def test_inputs_unlike_the_training_shut_the_gate():
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_foreign_body_leaves_nothing_to_remember(placement):
+def test_an_out_of_distribution_body_leaves_nothing_to_remember(placement):
     known, strange = problems((3, 1, 1)), pc.discretise(soft_beam((6, 1, 1), loads=[TORSION]))
     corrector = fitted(known, placement=placement)
     hybrid = HybridStepper(pc.ProjectiveDynamics(strange), corrector, gate=Gate())
@@ -321,7 +321,7 @@ def test_what_counts_has_passed_and_so_have_all_steps_of_the_pause_before(pause,
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_one_scene_of_a_batch_pauses_as_alone_and_the_other_does_not(placement):
+def test_one_scene_of_a_batch_pauses_as_a_single_one_does_and_the_other_does_not(placement):
     scenes = [pushed_in(2), pushed_in(cells=(2, 2, 1))]
     corrector, gate = wary(*scenes, placement=placement), Gate(**NOTHING, pause=2)
     stepper = pc.BatchStepper(scenes, 1e-12)
@@ -354,7 +354,7 @@ def test_one_scene_of_a_batch_pauses_as_alone_and_the_other_does_not(placement):
     assert shut == [set(), {PAUSE}, {PAUSE}, set(), set(), set()]
 
 
-def test_scenes_of_a_batch_go_on_alone_in_the_middle_of_a_pause():
+def test_scenes_of_a_batch_go_on_as_single_ones_in_the_middle_of_a_pause():
     scenes = [pushed_in(1), pushed_in(cells=(2, 2, 1))]
     corrector, gate = wary(*scenes), Gate(**NOTHING, pause=2)
     stepper = pc.BatchStepper(scenes)

@@ -233,7 +233,7 @@ def test_a_batch_of_another_time_step_is_refused_as_a_whole_each_scene_by_its_re
     assert result.correction[: len(known.positions)].any()
 
 
-def test_of_several_time_steps_only_the_foreign_one_is_refused():
+def test_of_several_time_steps_only_the_out_of_distribution_one_is_refused():
     """Steppers have one for all scenes; graphs of bodies have one each."""
     scenes = problems((3, 1, 1), (3, 1, 1))
     corrector = fitted(scenes, kind=Watched)

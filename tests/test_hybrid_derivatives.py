@@ -173,7 +173,7 @@ def fast(p, v):
 
 
 @pytest.mark.parametrize("through_solver", [True, False])
-def test_loads_that_are_not_finite_fail_their_scene_alone(through_solver):
+def test_loads_that_are_not_finite_fail_their_own_scene_only(through_solver):
     scenes = problems((3, 1, 1), (2, 1, 1))
     corrector = fitted(scenes, kind=Overflowing, placement="force")
     found = gradients_beside(scenes, corrector, through_solver, fast)

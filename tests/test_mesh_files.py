@@ -272,11 +272,11 @@ VTU = """<?xml version="1.0"?>
 """
 
 
-@pytest.mark.parametrize(("kind", "words"), [(11, "11"), (72, "LAGRANGE")])
-def test_solid_cells_of_other_types_are_never_left_out(tmp_path, kind, words):
+@pytest.mark.parametrize(("kind", "named"), [(11, "11"), (72, "LAGRANGE")])
+def test_solid_cells_of_other_types_are_never_left_out(tmp_path, kind, named):
     path = tmp_path / "cells.vtu"
     path.write_text(VTU.replace("TYPE", str(kind)))
-    with pytest.raises(MeshError, match=words):
+    with pytest.raises(MeshError, match=named):
         read_hex_mesh(path)
 
 
@@ -289,19 +289,7 @@ def test_other_solid_cells_are_counted_and_placed(tmp_path):
     meshio.write(path, meshio.Mesh(mesh.positions, blocks))
     with pytest.raises(MeshError, match="6 of type hexahedron, 3 of type tetra") as refused:
         read_hex_mesh(path, scale=2.0)
-    assert f"the first tetra around {2 * mesh.positions[tetra[0]].mean(axis=0)} m" in str(
-        refused.value
-    )
-
-
-def test_a_bad_mesh_in_a_file_is_refused_with_the_files_name(tmp_path):
-    mesh = o_grid()
-    apart = HexMesh.create(mesh.positions[mesh.cells[:1]].reshape(8, 3), np.arange(8)[None])
-    points = np.concatenate([mesh.positions, apart.positions])
-    cells = np.concatenate([mesh.cells[1:], apart.cells + len(mesh.positions)])
-    write_vtu(tmp_path / "parts.vtu", points, cells)
-    with pytest.raises(MeshError, match=r"parts.vtu: nodes \d+ at .* are at the same place"):
-        read_hex_mesh(tmp_path / "parts.vtu")
+    assert f"{2 * mesh.positions[tetra[0]].mean(axis=0)} m" in str(refused.value)
 
 
 @pytest.mark.parametrize("suffix", ["msh", "inp", "vtu", "vtk"])
@@ -345,13 +333,19 @@ def test_unusable_files_are_refused_by_name(tmp_path):
     (tmp_path / "text.vtu").write_text("not a mesh")
     (tmp_path / "what.xyz9").write_text("?")
     write_vtu(tmp_path / "inverted.vtu", mesh.positions * [1, 1, -1], mesh.cells)
-    for name, words in {
+    good = o_grid()
+    apart = HexMesh.create(good.positions[good.cells[:1]].reshape(8, 3), np.arange(8)[None])
+    cells = np.concatenate([good.cells[1:], apart.cells + len(good.positions)])
+    points = np.concatenate([good.positions, apart.positions])
+    write_vtu(tmp_path / "twice.vtu", points, cells)  # nodes at one place
+    for name, told in {
         "tetra.vtu": "tetra",
         "mixed.vtu": "tetra",
-        "text.vtu": "text.vtu",
-        "what.xyz9": "what.xyz9",
-        "none.vtu": "none.vtu",
-        "inverted.vtu": "inverted.vtu",
+        "text.vtu": "",
+        "what.xyz9": "",
+        "none.vtu": "",
+        "inverted.vtu": "",
+        "twice.vtu": r"nodes \d+",
     }.items():
-        with pytest.raises(MeshError, match=words):
+        with pytest.raises(MeshError, match=rf"{name}.*{told}"):
             read_hex_mesh(tmp_path / name)

@@ -63,11 +63,11 @@ def test_momenta_of_a_turning_pair():
 
 
 def test_wrong_input_is_named(reference):
-    with pytest.raises(InputError, match="restrict"):
+    with pytest.raises(InputError, match="7.*3"):
         metrics.rms_error(reference, reference[:, :3])
     with pytest.raises(InputError, match="5 and 3 frames"):
         metrics.rms_error(reference, reference[:3])
-    with pytest.raises(InputError, match="as many"):
+    with pytest.raises(InputError, match="1.*2"):
         metrics.error_corrected([reference], [reference, reference], [reference])
-    with pytest.raises(InputError, match="equals the reference"):
+    with pytest.raises(InputError, match="reference"):
         metrics.error_corrected(reference, reference, reference)

@@ -103,7 +103,7 @@ def averaged(*rows):
     return normaliser
 
 
-def test_bodies_are_as_strange_as_deviations_of_their_mean_inputs():
+def test_out_of_distribution_scores_of_bodies_are_deviations_of_their_mean_inputs():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(4000, 2)) * [1.0, 3.0] + [5.0, -2.0]
     normaliser = averaged(*rows)
@@ -122,7 +122,7 @@ def test_bodies_are_as_strange_as_deviations_of_their_mean_inputs():
     assert float(beyond[1, 0]) > 6.0  # on the other side, where none was
 
 
-def test_mean_inputs_of_further_data_are_as_familiar_as_those_of_the_first():
+def test_mean_inputs_of_further_data_widen_the_range():
     normaliser = averaged([0.0, 0.0], [1.0, 1.0], [0.5, 0.2])
     further, averages = tensor([[9.0, 0.5]]), RunningMoments()
     averages.add(further)
@@ -164,14 +164,14 @@ def test_a_normaliser_needs_values_to_be_fitted_to():
     full.add(torch.ones(3, 1))
     empty.add(torch.ones(0, 1))
     zero.add(torch.zeros(3, 1))
-    for found, target, words in (
+    for found, target, told in (
         ({}, full, "features a"),
         ({"a": empty}, full, "features a"),
         ({"a": full}, empty, "targets"),
         ({"a": full}, zero, "targets"),
     ):
         normaliser = Normaliser({"a": 1}, {})
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=told):
             normaliser.fit(found, target)
         assert not normaliser.fitted
 

@@ -342,7 +342,7 @@ def test_inference_mode_makes_no_difference(device, made):
     assert_equal(found, hybrid(state).correction)
 
 
-def test_of_a_recorded_batch_the_foreign_body_alone_is_refused(device, made):
+def test_of_a_recorded_batch_the_out_of_distribution_body_is_refused(device, made):
     several = [*problems(*CELLS), *problems((14, 1, 1))]
     stepper = pc.BatchStepper(several, device=device)
     gate = pc.Gate(margin=None, average=None, volume=None, crushing=None, energy=None)

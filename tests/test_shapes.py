@@ -78,7 +78,7 @@ def test_measures_do_not_depend_on_place_orientation_units_or_numbering(rng):
         assert after[name] == pytest.approx(before[name], abs=1e-9), name
 
 
-def test_bodies_of_a_batch_have_the_measures_that_they_have_alone():
+def test_bodies_of_a_batch_have_the_measures_of_single_ones():
     several = [cantilever(), cantilever((3, 3, 2)), cantilever((2, 2, 2), clamps=[])]
     together = measured(*several)
     for k, one in enumerate(several):
@@ -86,7 +86,7 @@ def test_bodies_of_a_batch_have_the_measures_that_they_have_alone():
             assert together[name][k] == pytest.approx(float(value[0]), abs=1e-12), name
 
 
-def test_a_body_that_nothing_holds_has_finite_measures_unlike_those_of_a_held_one():
+def test_a_body_that_nothing_holds_has_finite_measures_and_others_than_a_held_one():
     found = measured(cantilever(), cantilever(clamps=[]))
     assert all(np.isfinite(value).all() for value in found.values())
     for name in ("fixity", "distance", "overhang", "spread"):
@@ -179,7 +179,7 @@ def test_nobody_is_known_before_bodies_were_fitted_and_further_data_widen_the_ra
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_foreign_body_keeps_all_its_coarse_steps_and_its_network_is_not_asked(placement):
+def test_an_out_of_distribution_body_keeps_its_coarse_steps_and_the_network_is_not_asked(placement):
     known = problems((3, 1, 1))
     corrector = fitted(known, kind=Watched, placement=placement)
     scene = soft_beam((6, 1, 1), loads=[TORSION])
@@ -190,6 +190,12 @@ def test_a_foreign_body_keeps_all_its_coarse_steps_and_its_network_is_not_asked(
     assert run.stats["gate"].tolist() == [Reason.BODY] * 5
     assert run.stats["refused"].tolist() == [1.0] * 5
     assert not run.stats["correction"].any()
+    assert corrector.calls == 0
+    others = [pc.discretise(soft_beam(cells, loads=[TORSION])) for cells in ((6, 1, 1), (3, 3, 3))]
+    stepper = pc.BatchStepper(others)
+    result = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
+    assert result.reasons.tolist() == [Reason.BODY] * 2
+    assert not result.correction.any()
     assert corrector.calls == 0
     known_body = HybridStepper(pc.ProjectiveDynamics(known[0]), corrector, gate=Gate())
     assert known_body(known[0].rest_state()).stats["gate"] == 0.0
@@ -219,7 +225,7 @@ def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it
 
 
 @pytest.mark.parametrize("recorded", [False, True])
-def test_a_batch_refuses_the_foreign_body_and_not_the_others(recorded):
+def test_a_batch_refuses_the_out_of_distribution_body_and_not_the_others(recorded):
     known, strange = problems((3, 1, 1)), pc.discretise(soft_beam((6, 1, 1), loads=[TORSION]))
     corrector = fitted(known)
     stepper = pc.BatchStepper([known[0], strange])
@@ -233,16 +239,6 @@ def test_a_batch_refuses_the_foreign_body_and_not_the_others(recorded):
         assert not torch.equal(state.positions[0], plain.positions[0])
         assert not result.correction[len(known[0].positions) :].any()
     assert result.correction.any()
-
-
-def test_a_batch_of_foreign_bodies_does_not_ask_the_network():
-    corrector = fitted(problems((3, 1, 1)), kind=Watched)
-    strange = [pc.discretise(soft_beam(cells, loads=[TORSION])) for cells in ((6, 1, 1), (3, 3, 3))]
-    stepper = pc.BatchStepper(strange)
-    result = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
-    assert result.reasons.tolist() == [Reason.BODY] * 2
-    assert not result.correction.any()
-    assert corrector.calls == 0
 
 
 def unlike_supports():
@@ -265,7 +261,7 @@ def test_a_known_shape_on_unknown_supports_is_refused(kind):
     assert Gate().foreign(corrector, body).tolist() == [Reason.BODY]
 
 
-def test_how_foreign_a_body_may_be_is_an_argument():
+def test_the_bound_on_bodies_is_an_argument():
     corrector = fitted(problems((3, 1, 1)))
     problem = pc.discretise(soft_beam((4, 1, 1), loads=[TORSION]))
     (away,) = excess(corrector, problem)
@@ -275,7 +271,7 @@ def test_how_foreign_a_body_may_be_is_an_argument():
         assert hybrid(problem.rest_state()).stats["gate"] == reason, bound
 
 
-def test_a_correction_that_is_not_a_number_does_not_hide_that_the_body_is_foreign():
+def test_a_correction_that_is_not_a_number_does_not_hide_an_out_of_distribution_body():
     known, strange = problems((3, 1, 1)), pc.discretise(soft_beam((6, 1, 1), loads=[TORSION]))
     corrector = fitted(known)
     corrector.of_view = lambda view: torch.full_like(view.bodies.rest, torch.nan)

@@ -167,11 +167,11 @@ def test_a_problem_in_place_of_the_models_own_is_checked(learned):
     scene = pc.Scene.load(SCENE)
     model = pc.load_model(MODEL)
     assert pc.hybrid_of(scene, model, problem=pc.coarse_model(scene, "best")).origin == {}
-    for problem, words in (
+    for problem, told in (
         (pc.discretise(scene), "hex8 and mass lumped"),
         (pc.discretise(pc.best_coarse(scene), 2), "refined 2"),
     ):
-        with pytest.raises(pc.errors.InputError, match=words):
+        with pytest.raises(pc.errors.InputError, match=told):
             pc.hybrid_of(scene, model, problem=problem)
 
 
