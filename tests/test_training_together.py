@@ -16,7 +16,7 @@ pytest.importorskip("torch_geometric")
 import pdcorrect as pc  # noqa: E402
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
-from pdcorrect.data.config import DatasetConfig  # noqa: E402
+from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import make_plan  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.data.schema import write_shard  # noqa: E402
@@ -24,7 +24,7 @@ from pdcorrect.data.shard_arrays import read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
-from pdcorrect.training.config import TrainingConfig  # noqa: E402
+from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from pdcorrect.training.recordings import data_hash, load_recordings, make_problems  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
@@ -68,10 +68,13 @@ def test_windows_of_several_data_sets_follow_one_another(folders):
     for found, expected in ((first, each[1][0]), (last, each[1][len(each[1]) - 1])):
         assert torch.equal(found.targets, expected.targets)
         assert torch.equal(found.cells, expected.cells)
+    together, recordings = samples.windows(folders, settings(samples.one_step()), resident=True)
+    owners = {r.one_step: r.dataset for r in recordings}
+    batch = next(together.batches(12, seed=0))  # mixes them
+    assert {owners[scale] for scale in batch.scale.tolist()} == {"tiny", "other"}
 
 
-@pytest.mark.parametrize("resident", [True, False])
-@pytest.mark.parametrize("remembers", [False, True])
+@pytest.mark.parametrize(("resident", "remembers"), [(True, False), (False, True)])
 def test_steps_of_several_data_sets_are_those_of_each(folders, resident, remembers):
     changes = {"changes": {"node_features": ("previous-correction",)}} if remembers else {}
     config = settings(samples.one_step(), corrector={**samples.SMALL, **changes})
@@ -91,13 +94,6 @@ def test_steps_of_several_data_sets_are_those_of_each(folders, resident, remembe
         begin += len(alone.dataset)
 
 
-def test_batches_mix_the_data_sets(folders):
-    together, recordings = samples.windows(folders, settings(samples.one_step()), resident=True)
-    owners = {r.one_step: r.dataset for r in recordings}
-    batch = next(together.batches(12, seed=0))
-    assert {owners[scale] for scale in batch.scale.tolist()} == {"tiny", "other"}
-
-
 def test_recordings_of_several_data_sets_have_their_own_bodies(folders):
     recordings = load_recordings(folders, "training", "plain")
     assert [r.dataset for r in recordings] == ["tiny"] + ["other"] * 4
@@ -110,6 +106,13 @@ def test_recordings_of_several_data_sets_have_their_own_bodies(folders):
     assert group.steps.tolist() == [5, 8, 8, 8, 8]
     for end, recording in zip(ends.numpy(), recordings, strict=True):
         np.testing.assert_array_equal(end[: len(recording.points)], recording.reference[-1])
+    paths = list(dict.fromkeys(r.path for r in recordings))
+    some = load_recordings(folders, "training", "plain", meshes=2)
+    assert list(dict.fromkeys(r.path for r in some)) == [paths[0], paths[len(paths) // 2]]
+    names = [r.name for r in load_recordings(folders, "training", "plain", meshes=99)]
+    assert names == [r.name for r in recordings]
+    with pytest.raises(InputError, match="meshes = 0"):
+        load_recordings(folders, "training", "plain", meshes=0)
 
 
 def test_rollouts_of_unlike_lengths_have_the_omegas_that_they_have_alone(folders):
@@ -144,28 +147,17 @@ def test_a_training_learns_several_data_sets_and_goes_on_bit_by_bit(folders, tmp
     for name, x in one.corrector.state_dict().items():
         assert torch.equal(x, other.corrector.state_dict()[name]), name
     record = one.record
+    digest = hashlib.sha256()  # of the files in their order
+    for split in ("training", "validation"):
+        for path in (p for folder in folders for p in sorted((folder / split).iterdir())):
+            digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
+    assert record.dataset_hash == digest.hexdigest()
     assert record.dataset == "tiny+other"
     assert record.dataset_hash == data_hash(folders, ("training", "validation"))
     own = load_recordings(folders[0], "training", "plain")[0].config_hash
     assert one.data_sets == [("tiny", own), ("other", "0" * 64)]
-    with pytest.raises(InputError, match="was begun with data"):
+    with pytest.raises(InputError, match="data = "):
         Training(config, folders[:1], tmp_path / "whole", resume=True)
-
-
-def test_the_hash_is_that_of_the_files_in_their_order(folders):
-    def by_hand(*chosen):
-        digest = hashlib.sha256()
-        for split in ("training", "validation"):
-            for folder in chosen:
-                for path in sorted((folder / split).iterdir()):
-                    digest.update(
-                        f"{split}/{path.name} {read_header(path).content_hash}\n".encode()
-                    )
-        return digest.hexdigest()
-
-    splits = ("training", "validation")
-    assert data_hash(folders[0], splits) == by_hand(folders[0])
-    assert data_hash(list(folders), splits) == by_hand(*folders)
 
 
 LEFT_OUT = ("training/mesh-0003", "validation/mesh-0000")
@@ -189,7 +181,7 @@ def test_what_is_left_out_might_as_well_not_be_there(several, tmp_path, few_thre
         assert torch.equal(x, other.corrector.state_dict()[name]), name
     assert one.record.dataset_hash == other.record.dataset_hash
     assert _omegas(tmp_path / "left out") == _omegas(tmp_path / "removed")
-    with pytest.raises(InputError, match="was begun with config.without"):
+    with pytest.raises(InputError, match=r"config\.without"):
         Training(whole, several, tmp_path / "left out", incomplete=True, resume=True)
     assert TrainingConfig.load(tmp_path / "left out" / "config.toml").without == LEFT_OUT
     assert "without" not in (tmp_path / "removed" / "config.toml").read_text(encoding="utf-8")
@@ -203,23 +195,18 @@ def _omegas(folder):
     return found
 
 
-def test_readers_leave_out_files_by_name(several):
+def test_readers_leave_out_files_by_name_and_of_several_sets_by_the_folders(several, tmp_path):
+    other = tmp_path / "other set"
+    shutil.copytree(several, other)
     for split, name in (("training", LEFT_OUT[0]), ("validation", LEFT_OUT[1])):
         found = TrajectoryDataset(several, split, without=LEFT_OUT)
         recordings = load_recordings(several, split, "plain", without=LEFT_OUT)
         (kept,) = {header.path for header in found.headers}
         assert {recording.path for recording in recordings} == {kept}
         assert kept != several / f"{name}.h5"
-        with pytest.raises(InputError, match=rf"{split}: all 2 files are left out"):
-            TrajectoryDataset(several, split, without=[name, f"{split}/{kept.stem}"])
-        with pytest.raises(InputError, match="expected a list of names"):
-            TrajectoryDataset(several, split, without=name)
-
-
-def test_of_several_data_sets_files_are_left_out_by_the_name_of_the_folder(several, tmp_path):
-    other = tmp_path / "other set"
-    shutil.copytree(several, other)
-    for split, name in (("training", LEFT_OUT[0]), ("validation", LEFT_OUT[1])):
+        for without in ([name, f"{split}/{kept.stem}"], name):
+            with pytest.raises(InputError, match=split):
+                TrajectoryDataset(several, split, without=without)
         found = TrajectoryDataset([several, other], split, without=[f"other set/{name}"])
         left = {header.path for header in found.headers}
         assert len(left) == 3
@@ -230,31 +217,24 @@ def test_of_several_data_sets_files_are_left_out_by_the_name_of_the_folder(sever
 
 def test_files_that_cannot_be_left_out_are_refused(folders, several, tmp_path):
     one, other = (folder.name for folder in folders)
-    config = settings(*STAGES).model_copy(update={"without": LEFT_OUT})
-    with pytest.raises(InputError, match=rf"such as '{one}/training/mesh-0003'"):
-        Training(config, folders, tmp_path / "two")
-    for name, told in (
-        ("third/training/mesh-0003", f"expected a data set among {one}, {other}"),
-        (f"{other}/training/mesh-0042", f"{other} has no training/mesh-0042"),
-    ):
-        of_one = config.model_copy(update={"without": (name,)})
-        with pytest.raises(InputError, match=told):
-            Training(of_one, folders, tmp_path / "two")
     alike = [several, tmp_path / "elsewhere" / several.name]
     shutil.copytree(*alike)
-    of_one = config.model_copy(update={"without": (f"{several.name}/training/mesh-0003",)})
-    with pytest.raises(InputError, match="expected folders of different names"):
-        Training(of_one, alike, tmp_path / "alike")
-    unknown = config.model_copy(update={"without": ("training/mesh-0042",)})
-    with pytest.raises(InputError, match="has no training/mesh-0042"):
-        Training(unknown, several, tmp_path / "unknown", incomplete=True)
-    for names, told in (
-        (["mesh-0042"], "such as 'training/mesh-0042'"),
-        (["evaluation/mesh-0042"], "such as 'training/mesh-0042'"),
-        (["training/mesh-0042.h5"], "such as 'training/mesh-0042'"),
-        (["training/mesh-0042"] * 2, "each file once"),
+    plain = settings(*STAGES)
+    for data, names, words in (
+        (folders, LEFT_OUT, f"{one}/training/mesh-0003"),
+        (folders, ("third/training/mesh-0003",), f"third.*{one}, {other}"),
+        (folders, (f"{other}/training/mesh-0042",), f"{other} .*training/mesh-0042"),
+        (alike, (f"{several.name}/training/mesh-0003",), several.name),
+        (several, ("training/mesh-0042",), "training/mesh-0042"),
     ):
-        with pytest.raises(ValueError, match=told):
+        config = plain.model_copy(update={"without": names})
+        with pytest.raises(InputError, match=words):
+            Training(config, data, tmp_path / "out", incomplete=True)
+    for names in (
+        ["mesh-0042"], ["evaluation/mesh-0042"], ["training/mesh-0042.h5"],
+        ["training/mesh-0042"] * 2,
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=names[0]):
             settings(*STAGES, without=names)
 
 
@@ -268,25 +248,19 @@ def trained(folders, tmp_path_factory):
 def test_such_a_model_knows_each_of_its_data_sets(folders, trained):
     (found,) = saved_candidates([trained])
     known = [r.config_hash for r in load_recordings(folders, "training", "plain")]
-    for name, config_hash in (("tiny", known[0]), ("other", known[-1])):
+    for name, config_hash in (
+        ("tiny", known[0]), ("other", known[-1]), ("other", "1" * 64), ("other", known[0]),
+        ("third", known[0]),
+    ):  # fmt: skip
         (told,) = found.warnings(name, config_hash, "evaluation")
-        assert "may be among the training meshes of the other sets" in told
-        assert f"trained on 'tiny+other', among them '{name}' of this configuration" in told
-    for config_hash in ("1" * 64, known[0]):
-        (told,) = found.warnings("other", config_hash, "evaluation")
-        assert "'tiny+other', of which 'other' was of another configuration than here" in told
-        assert "not on" not in told
-    (told,) = found.warnings("third", known[0], "evaluation")
-    assert "trained on 'tiny+other', not on 'third': " in told
-    assert "not unseen" in found.warnings("other", known[-1], "training")[0]
-
-
-def test_of_a_data_set_whose_configuration_is_not_recorded_that_is_told(trained):
-    (found,) = saved_candidates([trained])
+        assert "'tiny+other'" in told
+        assert f"'{name}'" in told
+    (told,) = found.warnings("other", known[-1], "training")
+    assert "'tiny+other'" not in told
     sets = found.model.record.training["data_sets"]
     sets[1] = {**sets[1], "config_hash": None}
     (told,) = found.warnings("other", "1" * 64, "evaluation")
-    assert "among them 'other' of an unrecorded configuration: meshes of this split" in told
+    assert "'other'" in told
 
 
 def test_the_command_takes_several_data_sets_and_judges_each(folders, program, tmp_path):
@@ -301,25 +275,6 @@ def test_the_command_takes_several_data_sets_and_judges_each(folders, program, t
         (path,) = (tmp_path / "out" / "evaluation" / folder.name).glob("*.json")
         name = "other" if folder == folders[1] else "tiny"
         assert json.loads(path.read_text())["data"]["name"] == name
-
-
-def test_a_data_set_that_comes_twice_is_refused(folders, program, tmp_path):
-    recipe = tmp_path / "recipe.toml"
-    recipe.write_text(settings(samples.one_step(iterations=2)).to_toml())
-    data = [word for folder in (*folders, folders[0]) for word in ("--data", folder)]
-    status, _, err = program("train", recipe, *data, "-o", tmp_path / "out")
-    assert status == 2
-    assert err == f"error: {folders[0]}: expected each data set once.\n"
-    with pytest.raises(InputError, match="expected the folder of one or more"):
-        TrajectoryDataset([], "training")
-
-
-def test_a_validation_split_in_one_of_two_is_refused(folders, tmp_path):
-    without = samples.dataset(tmp_path / "without", training=(2,), validation=(), frames=5)
-    (without / "validation").rmdir()
-    config = settings(samples.one_step(iterations=2))
-    with pytest.raises(InputError, match=r"without: no split 'validation', which .* has"):
-        Training(config, (folders[0], without), tmp_path / "out")
 
 
 def test_sets_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tmp_path):
@@ -339,25 +294,37 @@ def test_sets_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tm
     without.mkdir(parents=True)
     shutil.copy(folders[0] / "training" / "mesh-0000.h5", without)
     config = settings(samples.one_step(iterations=2))
-    told = r"mesh-0000.h5: time_step 0.02, unlike 0.01 of .*mesh-0000.h5: expected the same in all"
+    told = r"mesh-0000\.h5: time_step 0\.02, .*0\.01 of .*mesh-0000\.h5"
     with pytest.raises(InputError, match=told):
         Training(config, (without.parent, other), tmp_path / "out")
     recordings = load_recordings((without.parent, other), "training", "plain")
-    with pytest.raises(InputError, match=r"time\.step .*expected the same"):
+    with pytest.raises(InputError, match=r"time\.step"):
         SceneGroup(recordings, "plain", "cpu")
+
+
+def test_sets_that_do_not_go_together_are_refused(folders, program, tmp_path):
+    recipe = tmp_path / "recipe.toml"
+    config = settings(samples.one_step(iterations=2))
+    recipe.write_text(config.to_toml())
+    data = [word for folder in (*folders, folders[0]) for word in ("--data", folder)]
+    status, _, err = program("train", recipe, *data, "-o", tmp_path / "out")
+    assert status == 2
+    assert str(folders[0]) in err  # which comes twice
+    with pytest.raises(InputError):
+        TrajectoryDataset([], "training")
+    without = samples.dataset(tmp_path / "without", training=(2,), validation=(), frames=5)
+    (without / "validation").rmdir()
+    with pytest.raises(InputError, match="without: .*'validation'"):
+        Training(config, (folders[0], without), tmp_path / "out")
+    recordings = load_recordings(folders[1], "training", "plain")
+    others = load_recordings(folders[0], "training", "plain")
+    for wrong in (recordings[1:], others, [recordings[0], *recordings[:-1]]):
+        with pytest.raises(InputError, match="4 simulations"):
+            StepWindows(folders[1], wrong, config.architecture(), "plain")
 
 
 def doubled(text, step):
     return pc.Scene.from_toml(text).with_changes(time={"step": step}).to_toml()
-
-
-def test_recordings_that_are_not_the_windows_own_are_refused(folders):
-    architecture = settings(samples.one_step()).architecture()
-    recordings = load_recordings(folders[1], "training", "plain")
-    others = load_recordings(folders[0], "training", "plain")
-    for wrong in (recordings[1:], others, [recordings[0], *recordings[:-1]]):
-        with pytest.raises(InputError, match=r"recordings for 4 simulations: expected those of"):
-            StepWindows(folders[1], wrong, architecture, "plain")
 
 
 def test_ranks_share_the_groups_of_all_data_sets(folders):
@@ -368,44 +335,6 @@ def test_ranks_share_the_groups_of_all_data_sets(folders):
     assert len(set(names)) == 5
 
 
-def test_so_many_meshes_are_spread_over_a_split(folders):
-    every = load_recordings(folders, "training", "plain")
-    paths = list(dict.fromkeys(r.path for r in every))
-    some = load_recordings(folders, "training", "plain", meshes=2)
-    assert list(dict.fromkeys(r.path for r in some)) == [paths[0], paths[len(paths) // 2]]
-    names = [r.name for r in load_recordings(folders, "training", "plain", meshes=99)]
-    assert names == [r.name for r in every]
-    with pytest.raises(InputError, match="meshes = 0: expected 1 or more"):
-        load_recordings(folders, "training", "plain", meshes=0)
-
-
-def test_models_of_before_know_their_one_data_set():
-    name = "torsion-exact-compact"
-    record = json.loads((MODELS / name / "model.json").read_text())["record"]
-    expected = ("torsion-exact", record["training"]["config_hash"])
-    assert load_model(name).data_sets == [expected]
-
-
-def test_published_sets_share_a_few_meshes():
-    folder = MODELS.parent / "datasets"
-    designs = {}
-    for motion in ("impulse", "stretch", "torsion"):
-        config = DatasetConfig.load(folder / f"{motion}-as-published" / "config.toml")
-        for plan in make_plan(config):
-            designs.setdefault((motion, plan.split), set()).add(plan.design.key())
-    shared = {
-        (one, other): len(designs[one] & designs[other])
-        for one in designs for other in designs
-        if one[0] != other[0] and one[1] == "training" and designs[one] & designs[other]
-    }  # fmt: skip
-    assert shared == {
-        (("impulse", "training"), ("stretch", "training")): 3,
-        (("stretch", "training"), ("impulse", "training")): 3,
-        (("impulse", "training"), ("stretch", "evaluation")): 1,
-        (("stretch", "training"), ("impulse", "validation")): 1,
-    }
-
-
 RECIPES = MODELS / "recipes"
 LEAVING_OUT = sorted(
     path.relative_to(RECIPES).with_suffix("").as_posix()
@@ -414,14 +343,6 @@ LEAVING_OUT = sorted(
 )
 EVALUATION_ONLY = ("torsion-many",)
 """Sets whose recipes do not leave out bodies of the other set's extra splits."""
-
-
-def test_recipes_for_sets_that_share_bodies_with_others_leave_some_out():
-    assert len(LEAVING_OUT) >= 10
-    assert {name.partition("/")[0] for name in LEAVING_OUT} == {
-        "impulse-exact-more", "impulse-more", "stretch-exact-more", "stretch-more",
-        "torsion-many", "torsion-more",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("recipe", LEAVING_OUT)
@@ -446,8 +367,6 @@ def test_a_recipe_leaves_out_the_bodies_that_another_set_keeps_for_evaluation(re
 
 RELEASED = sorted(path.parent.name for path in MODELS.glob("*/model.json"))
 SEVERAL = {
-    "all-as-published-total-mass":
-        ["impulse-as-published", "stretch-as-published", "torsion-as-published"],
     "impulse-as-published": ["impulse-as-published", "impulse-more"],
     "stretch-as-published": ["stretch-as-published", "stretch-more"],
     "torsion-exact": ["torsion-exact", "torsion-many", "torsion-more"],
@@ -459,10 +378,8 @@ FEWER_RUNS = {"impulse-exact": {"converged_steps": 0, "finest_meshes": 0}}
 
 @pytest.mark.parametrize("name", RELEASED)
 def test_a_released_model_names_the_data_sets_of_all_its_trainings(name):
-    assert len(RELEASED) == 12
     found = load_model(name).data_sets
-    own = [name.removesuffix("-total-mass").removesuffix("-compact")]
-    assert [dataset for dataset, _ in found] == SEVERAL.get(name, own)
+    assert [dataset for dataset, _ in found] == SEVERAL.get(name, [name])
     for dataset, config_hash in found:
         config = DatasetConfig.load(MODELS.parent / "datasets" / dataset / "config.toml")
         assert config_hash == config.model_copy(update=FEWER_RUNS.get(name, {})).hash()
