@@ -53,7 +53,9 @@ def stepped(factor, cells=(3, 1, 1)):
 
 
 def test_time_steps_lie_outside_their_range_by_the_logarithm_of_a_factor():
-    found = ranged(0.02, 0.005, 0.01).time_step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
+    corrector = ranged(0.02, 0.005, 0.01)
+    assert corrector.normaliser.trained_step(C) == "0.005 to 0.02 s"
+    found = corrector.time_step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
     expected = [np.log(5 / 4), 0.0, 0.0, 0.0, np.log(3 / 2)]
     assert found.tolist() == pytest.approx(expected, abs=1e-12)
 
