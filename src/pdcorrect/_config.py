@@ -144,7 +144,9 @@ def as_toml(value: object) -> str:
 def explained(error: ValidationError, model: type[BaseModel]) -> str:
     """One paragraph: each wrong key, its value, and what was expected."""
     tables = _tables_of(model)
-    sentences = dict.fromkeys(_sentence(item, tables) for item in error.errors())
+    items = error.errors()
+    nested = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
+    sentences = dict.fromkeys(_sentence(x, tables) for x in items if x["loc"] not in nested)
     return " ".join(" ".join(sentences).split())
 
 

@@ -123,26 +123,20 @@ class FileLines:
         self.done = self.total = 0
 
     def begin(self, done: int, total: int, damaged: Sequence[str]) -> None:
-        """Say what is computed, and why the first file takes longest: see `OnBegin`."""
+        """Say what is computed: see `OnBegin`."""
         self._started = time.monotonic()
         self.done, self.total = done, total
         for name in damaged:
-            self.say(f"{name} is damaged: computed again")
+            print(f"{name} is damaged: computed again", flush=True)
         if done < total:
-            self.say(
-                f"{done} of {total} simulations are there, computing {total - done}; on first use "
-                "kernels are compiled before, which takes a few minutes"
-            )
+            print(f"{done} of {total} simulations are there, computing {total - done}", flush=True)
 
     def __call__(self, name: str, done: int, total: int, new: int) -> None:
         self.done, self.total = done, total
         elapsed = time.monotonic() - self._started
         rest = elapsed / new * (total - done)
-        self.say(f"{elapsed:.0f} s: {name}, {done} of {total} simulations, about {rest:.0f} s left")
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        print(text, flush=True)
+        told = f"{elapsed:.0f} s: {name}, {done} of {total} simulations, about {rest:.0f} s left"
+        print(told, flush=True)
 
     def interrupted(self) -> str:
         """What to tell after an interruption."""
@@ -150,30 +144,3 @@ class FileLines:
             return "interrupted before anything was computed; the same command goes on"
         counts = f"{self.done} of {self.total} simulations are there"
         return f"interrupted: {counts}; the same command goes on"
-
-
-class FileBar(FileLines):
-    """The same as a bar with the time that is left.
-
-    Parameters
-    ----------
-    progress : rich.progress.Progress
-    """
-
-    def __init__(self, progress: Any) -> None:
-        super().__init__()
-        self._progress = progress
-        self._task = progress.add_task("generating", total=None)
-
-    def begin(self, done: int, total: int, damaged: Sequence[str]) -> None:
-        """Say it above the bar."""
-        super().begin(done, total, damaged)
-        self._progress.update(self._task, completed=done, total=total)
-
-    def __call__(self, name: str, done: int, total: int, new: int) -> None:
-        self.done, self.total = done, total
-        self._progress.update(self._task, completed=done, total=total, description=name)
-
-    def say(self, text: str) -> None:
-        """Print a line above the bar."""
-        self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)

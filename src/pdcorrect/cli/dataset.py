@@ -228,18 +228,12 @@ def import_(
 
 @contextlib.contextmanager
 def _simulations() -> Iterator[FileLines]:
-    """A bar with the time that is left; where there is no terminal, a line for each file.
+    """A line for each file; an interruption ends the program, and says what is there."""
+    from pdcorrect.cli.common import FileLines
 
-    An interruption ends the program, and says what is there.
-    """
-    from pdcorrect.cli.common import FileBar, FileLines, progress_bar
-
-    terminal = sys.stdout.isatty()
-    bar = progress_bar("simulations", apart=True, hidden=not terminal)
-    shown = FileBar(bar) if terminal else FileLines()
+    shown = FileLines()
     try:
-        with bar:
-            yield shown
+        yield shown
     except KeyboardInterrupt:
         typer.echo(shown.interrupted(), err=True)
         raise typer.Exit(INTERRUPTED) from None
