@@ -23,14 +23,15 @@ import traceback
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from pathlib import Path
 
+from card import dataset_card
+
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.cli.common import FileLines
-from pdcorrect.data.card import dataset_card
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
-from pdcorrect.data.summary import dataset_info
 from pdcorrect.data.schema import CONFIG, MANIFEST
+from pdcorrect.data.summary import dataset_info
 from pdcorrect.data.workers import Workers, local_scheduler
 from pdcorrect.errors import InputError
 

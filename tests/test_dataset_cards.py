@@ -1,22 +1,32 @@
 """Cards of data sets, and counts of rejected loads."""
 
+import importlib
 from pathlib import Path
 
+import pytest
+
 from dataset_samples import sample_shard, with_simulation, write_dataset
-from pdcorrect.data.card import card_text, dataset_card
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.summary import dataset_info
 
-TINY = Path(__file__).parents[1] / "datasets" / "tiny"
+DATASETS = Path(__file__).parents[1] / "datasets"
+TINY = DATASETS / "tiny"
 
 
-def test_the_card_of_the_tiny_set_is_that_of_its_files():
+@pytest.fixture
+def card(monkeypatch):
+    """The module that writes cards."""
+    monkeypatch.syspath_prepend(DATASETS)
+    return importlib.import_module("card")
+
+
+def test_the_card_of_the_tiny_set_is_that_of_its_files(card):
     info = dataset_info(TINY)
-    assert dataset_card(TINY, info) == (TINY / "README.md").read_text(encoding="utf-8")
+    assert card.dataset_card(TINY, info) == (TINY / "README.md").read_text(encoding="utf-8")
 
 
-def test_rejected_loads_are_counted_by_split_run_and_reason(program, tmp_path):
+def test_rejected_loads_are_counted_by_split_run_and_reason(card, program, tmp_path):
     config = write_dataset(tmp_path / "set")
     for mesh in make_plan(config):
         shard = sample_shard(config, mesh)
@@ -30,5 +40,5 @@ def test_rejected_loads_are_counted_by_split_run_and_reason(program, tmp_path):
     assert info.splits["training"].rejections == {"reference, a cell is inverted": 4}
     assert info.splits["evaluation"].rejections == {"intermediate, a cell is inverted": 2}
     assert sum(info.whole.rejections.values()) == info.whole.rejected == 8
-    assert config.name in card_text(config, info, {}, "0")
+    assert config.name in card.card_text(config, info, {}, "0")
     assert program("dataset", "info", tmp_path / "set")[0] == 0

@@ -242,20 +242,6 @@ def _simulations() -> Iterator[FileLines]:
         raise
 
 
-@app.command()
-def card(
-    folder: Folder,
-    output: Annotated[
-        Optional[Path], typer.Option("-o", "--output", help="File; the folder's README.md.")
-    ] = None,
-) -> None:
-    """Write the card of a complete data set: what it is, its errors, cost and limits."""
-    from pdcorrect.data.card import dataset_card
-    from pdcorrect.data.summary import dataset_info
-
-    _write(output or folder / "README.md", dataset_card(folder, dataset_info(folder)))
-
-
 def _write(path: Path, text: str) -> None:
     from pdcorrect._files import make_folder, write_text
 
