@@ -9,7 +9,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect.cli import main as cli
+from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh_files import write_vtu
 from pdcorrect.io.trajectory_reader import problem_of
@@ -59,18 +59,14 @@ def test_a_run_file_becomes_a_series_with_stresses(program, short, tmp_path, ele
 def test_every_second_frame_and_no_stresses_if_asked(program, short, tmp_path):
     path, _ = stored(tmp_path, short)
     arguments = ("-o", tmp_path / "out", "--every", 2, "--no-stress")
-    status, out, _ = program("export", path, *arguments)
+    status, _, _ = program("export", path, *arguments)
     assert status == 0
-    assert "without" not in out
     entries = ET.parse(tmp_path / "out" / "run.pvd").getroot().findall("Collection/DataSet")
     assert [e.get("file") for e in entries] == [f"run_{k:04d}.vtu" for k in (0, 2, 4)]
     data = meshio.read(tmp_path / "out" / "run_0004.vtu")
     assert set(data.point_data) == {"displacement", "velocity"}
     assert not data.cell_data
-
-
-def test_runs_share_a_folder_and_replace_only_their_own_series(program, short, tmp_path):
-    for name in ("a[1].h5", "a1.h5"):
+    for name in ("a[1].h5", "a1.h5"):  # several runs share a folder
         path, _ = stored(tmp_path, short, name=name)
         assert program("export", path, "-o", tmp_path / "out", "--no-stress")[0] == 0
     assert program("export", tmp_path / "a[1].h5", "-o", tmp_path / "out", "--every", 4)[0] == 0
@@ -79,61 +75,39 @@ def test_runs_share_a_folder_and_replace_only_their_own_series(program, short, t
     assert sum(n.startswith("a1_") for n in names) == 5
 
 
-def test_a_file_that_is_no_run_or_is_damaged_is_refused(program, short, tmp_path):
+def test_files_that_are_no_runs_and_folders_that_cannot_be_made_are_refused(
+    program, short, tmp_path
+):
     path, _ = stored(tmp_path, short)
     cut = tmp_path / "cut.h5"
     cut.write_bytes(path.read_bytes()[:-1000])
     (tmp_path / "scene.toml").write_text(short.to_toml())
-    for given, words in (
-        (tmp_path / "none.h5", "cannot be read"),
-        (tmp_path / "scene.toml", "not an HDF5 file"),
-        (cut, "truncated"),
-    ):
+    for given in (tmp_path / "none.h5", tmp_path / "scene.toml", cut):
         status, out, err = program("export", given, "-o", tmp_path / "out")
-        assert status == cli.BAD_INPUT
-        assert words in err
+        assert status == BAD_INPUT
         assert given.name in err
         assert "Traceback" not in out + err
         assert not (tmp_path / "out").exists()
-    assert program("export", path)[0] == cli.BAD_INPUT
-    assert program("export", path, "-o", tmp_path / "out", "--every", 0)[0] == cli.BAD_INPUT
-
-
-def test_a_folder_that_cannot_be_made_is_named(program, short, tmp_path):
-    path, _ = stored(tmp_path, short)
+    assert program("export", path)[0] == BAD_INPUT
+    assert program("export", path, "-o", tmp_path / "out", "--every", 0)[0] == BAD_INPUT
     (tmp_path / "file").write_text("")
-    status, _, err = program("export", path, "-o", tmp_path / "file" / "out")
-    assert status == cli.FAILED
-    assert "file/out" in err
-    status, _, err = program("export", path, "-o", tmp_path / "file")
-    assert status == cli.FAILED
-    assert "file: is a file: expected a folder" in err
+    for folder in ("file/out", "file"):
+        status, _, err = program("export", path, "-o", tmp_path / folder)
+        assert status == FAILED
+        assert folder in err
 
 
 def test_what_survives_of_a_file_is_written_if_asked(program, short, tmp_path):
     path, _ = stored(tmp_path, short.with_changes(time={"frames": 60}))
     path.write_bytes(path.read_bytes()[: int(0.7 * path.stat().st_size)])
     status, _, err = program("export", path, "-o", tmp_path / "out")
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     left = len(pc.load_trajectory(path, salvage=True))
     assert 0 < left < 60
-    assert f"export --salvage writes {left} steps of it" in err
+    assert f" {left} steps" in err
     arguments = ("-o", tmp_path / "out", "--salvage", "--no-stress")
     assert program("export", path, *arguments)[0] == 0
     assert len(list((tmp_path / "out").glob("run_*.vtu"))) == left + 1
-
-
-def test_a_run_of_another_material_is_written_without_stresses(program, short, tmp_path):
-    problem = pc.discretise(short).with_material(young=2e6, poisson=0.3)
-    path = tmp_path / "run.h5"
-    pc.save_trajectory(path, pc.rollout(pc.ProjectiveDynamics(problem)))
-    status, out, _ = program("export", path, "-o", tmp_path / "out")
-    assert status == 0
-    assert "without stresses and volume ratios" in out
-    assert "its material was changed after the scene had been read" in out
-    assert set(meshio.read(tmp_path / "out" / "run_0001.vtu").point_data) == {
-        "displacement", "velocity"
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
@@ -142,8 +116,7 @@ def test_a_run_of_another_total_mass_has_its_stresses(program, short, tmp_path, 
     problem = pc.discretise(scene).with_total_mass(0.1)
     path, run = tmp_path / "run.h5", pc.rollout(pc.ProjectiveDynamics(problem))
     pc.save_trajectory(path, run)
-    status, out, _ = program("export", path, "-o", tmp_path / "out")
-    assert (status, "without" in out) == (0, False)
+    assert program("export", path, "-o", tmp_path / "out")[0] == 0
     write_vtu_series(run, tmp_path / "own", stress_of=problem)
     read, own = (meshio.read(tmp_path / f / "run_0004.vtu").point_data for f in ("out", "own"))
     np.testing.assert_array_equal(read["stress"], own["stress"])
@@ -157,23 +130,25 @@ def test_what_a_file_does_not_say_is_told(short, tmp_path):
     run = pc.load_trajectory(path)
     assert problem_of(run).refine == 2
     for changes, words in (
-        ({"scene_toml": ""}, "holds no scene"),
-        ({"scene_toml": "[body"}, "its scene: not valid TOML"),
-        ({"attributes": {**run.attributes, "refine": "two"}}, "its refinement is 'two'"),
-        ({"attributes": {**run.attributes, "refine": "1"}}, "is not the one that its scene has"),
-        ({"points": run.points + 1e-4}, "is not the one that its scene has"),
-        ({"cells": run.cells[::-1]}, "is not the one that its scene has"),
+        ({"scene_toml": ""}, "scene"),
+        ({"scene_toml": "[body"}, "scene"),
+        ({"attributes": {**run.attributes, "refine": "two"}}, "'two'"),
+        ({"attributes": {**run.attributes, "refine": "1"}}, "mesh"),
+        ({"points": run.points + 1e-4}, "mesh"),
+        ({"cells": run.cells[::-1]}, "mesh"),
     ):
         with pytest.raises(InputError, match=words):
             problem_of(dataclasses.replace(run, **changes))
     part = pc.restrict(run, to=pc.discretise(short))
-    with pytest.raises(InputError, match="expected all nodes of the run"):
+    with pytest.raises(InputError, match="nodes"):
         problem_of(part)
     fresh = pc.rollout(pc.ProjectiveDynamics(problem), 1)
     assert problem_of(fresh) is problem
 
 
-def test_a_run_whose_mesh_file_is_gone_is_written_without_stresses(program, short, tmp_path):
+def test_runs_whose_mesh_file_is_gone_or_of_another_material_are_written_without_stresses(
+    program, short, tmp_path
+):
     mesh = pc.discretise(short).mesh
     write_vtu(tmp_path / "mesh.vtu", mesh.positions, mesh.cells)
     body = {"shape": "file", "path": str(tmp_path / "mesh.vtu")}
@@ -184,7 +159,15 @@ def test_a_run_whose_mesh_file_is_gone_is_written_without_stresses(program, shor
     (tmp_path / "mesh.vtu").unlink()
     with pytest.raises(MeshError, match="mesh.vtu"):
         problem_of(run)
+    status, _, _ = program("export", path, "-o", tmp_path / "out")
+    assert status == 0
+    assert (tmp_path / "out" / "run_0001.vtu").exists()
+    other = pc.discretise(short).with_material(young=2e6, poisson=0.3)
+    path = tmp_path / "other.h5"
+    pc.save_trajectory(path, pc.rollout(pc.ProjectiveDynamics(other)))
     status, out, _ = program("export", path, "-o", tmp_path / "out")
     assert status == 0
-    assert "without stresses" in out
-    assert (tmp_path / "out" / "run_0001.vtu").exists()
+    assert "material" in out
+    assert set(meshio.read(tmp_path / "out" / "other_0001.vtu").point_data) == {
+        "displacement", "velocity"
+    }  # fmt: skip

@@ -41,15 +41,11 @@ def used(tmp_path_factory):
     return found
 
 
-def test_no_volume_projection_is_computed_without_a_volume_term(used):
-    assert used["bare"]["counts"]["volume"] > 0  # the kernel is called, for no lane
-    assert used["bare"]["counts"]["volume lanes"] == 0
-    assert used["volume"]["counts"]["volume lanes"] > 0
-
-
-def test_the_volume_term_is_projected_at_its_own_points_only(used):
+def test_the_volume_term_is_projected_where_there_is_one_and_at_its_own_points_only(used):
     """At all points of hex8 in blocks of 32; of the mean elements at one point a cell."""
     counts = {name: one["counts"] for name, one in used.items()}
+    assert counts["bare"]["volume"] > 0  # the kernel is called, for no lane
+    assert counts["bare"]["volume lanes"] == 0
     for name in ("volume", "loaded"):
         assert counts[name]["volume lanes"] == 32 * counts[name]["volume"]
     for name in ("best", "full"):
@@ -73,10 +69,6 @@ def test_a_term_is_evaluated_where_the_scene_has_it(used, what, users):
 def test_only_the_packages_that_a_scene_needs_are_imported(used, name):
     packages = {module.split(".")[0] for module in used[name]["modules"]}
     assert packages & (HEAVY | CLI) == NEEDED.get(name, set())
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_parts_of_the_package_that_a_scene_does_not_use_are_not_imported(used, name):
     ours = {m.removeprefix("pdcorrect.") for m in used[name]["modules"] if "pdcorrect" in m}
     assert ("fem.mesh_files" in ours) == (name == "full")
     parts = {module.split(".")[0] for module in ours}
@@ -100,19 +92,11 @@ def test_a_scene_without_loads_clamps_or_terms_holds_nothing_for_them(used):
     assert used["bare"]["clamps"] <= held
     assert 0 < size["loaded"] - size["volume"] <= sum(used["loaded"]["loads"]) + held
     assert size["best"] < size["full"]
-
-
-def test_a_dead_load_holds_a_pattern_and_no_operators(used):
-    """The others, which follow the body, share its space."""
-    for name in ("loaded", "best"):
+    for name in ("loaded", "best"):  # a dead load is a pattern, without operators
         nodes, (gravity,) = used[name]["sizes"][0], used[name]["loads"]
         assert gravity <= nodes * 3 * NUMBER + 100, name
     assert used["full"]["loads"][0] == used["best"]["loads"][0]
-
-
-def test_a_stepper_holds_no_more_than_its_unknowns_need(used):
-    """The factor of what may move; condensed blocks only for elements with internal modes."""
     stepper = {name: one["bytes"] - one["problem_bytes"] for name, one in used.items()}
     assert stepper["bare"] == stepper["volume"]
     assert stepper["loaded"] < stepper["volume"]  # clamped components are no unknowns
-    assert stepper["loaded"] < stepper["best"]
+    assert stepper["loaded"] < stepper["best"]  # whose internal modes are condensed

@@ -16,7 +16,6 @@ import pytest
 
 from motion import assert_same, remembering, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
-from pdcorrect.io.growing_file import Reserve
 from pdcorrect.io.growing_file import GrowingFile
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
@@ -64,18 +63,27 @@ def writer_of(path, run, **options):
 # --- round trips -----------------------------------------------------------------------
 
 
-def test_what_is_saved_is_loaded_bit_by_bit(run, saved):
-    assert_same(load_trajectory(saved), run)
-
-
 @pytest.mark.parametrize("compress", [False, True])
-def test_the_writer_stores_what_the_steps_returned(run, tmp_path, compress):
+def test_what_is_saved_or_written_step_by_step_is_loaded_bit_by_bit(run, saved, tmp_path, compress):
+    assert_same(load_trajectory(saved), run)
     path = tmp_path / "run.h5"
     with writer_of(path, run, compress=compress) as writer:
         for result, seconds in step_results(run):
             writer.append(result, seconds)
     assert_same(load_trajectory(path), run)
     assert_same(load_trajectory(path, salvage=True), run)
+
+
+def test_a_file_rewritten_by_other_tools_is_read(run, saved, tmp_path):
+    """Contiguous datasets, an old superblock, no checksums."""
+    path = tmp_path / "copy.h5"
+    with h5py.File(saved) as old, h5py.File(path, "w", libver="earliest") as new:
+        for name in ("positions", "velocities", "times", "mesh/points", "mesh/cells"):
+            new[name] = old[name][...]
+        for name in old["stats"]:
+            new[f"stats/{name}"] = old[f"stats/{name}"][...]
+        new.attrs.update(old.attrs)
+    assert_same(load_trajectory(path), run)
 
 
 def test_the_layout_is_the_documented_one(run, saved):
@@ -86,6 +94,7 @@ def test_the_layout_is_the_documented_one(run, saved):
         assert file["positions"].shape == file["velocities"].shape == run.positions.shape
         assert file["positions"].dtype == file["times"].dtype == np.float64
         assert file["mesh/cells"].shape == run.cells.shape
+        assert set(file) == {"positions", "velocities", "times", "mesh", "stats"}  # no memory
         assert set(file["stats"]) == set(run.stats)
         assert file["stats/status"][0].decode() in Status.__members__
 
@@ -102,13 +111,7 @@ def test_compression_makes_smooth_motion_smaller(run, tmp_path):
     assert sizes[1] < 0.8 * sizes[0]
 
 
-def test_a_scene_larger_than_hdf5_attributes_usually_are(run, tmp_path):
-    large = dataclasses.replace(run, scene_toml="# ä\n" * 50000)
-    save_trajectory(tmp_path / "run.h5", large)
-    assert load_trajectory(tmp_path / "run.h5").scene_toml == large.scene_toml
-
-
-def test_a_run_of_no_steps_and_one_without_statistics(run, tmp_path):
+def test_runs_of_no_steps_without_statistics_or_with_a_very_long_scene(run, tmp_path):
     start = dataclasses.replace(
         run, positions=run.positions[:1], velocities=run.velocities[:1], times=run.times[:1],
         stats={},
@@ -118,6 +121,9 @@ def test_a_run_of_no_steps_and_one_without_statistics(run, tmp_path):
     bare = dataclasses.replace(run, stats={})
     save_trajectory(tmp_path / "bare.h5", bare)
     assert_same(load_trajectory(tmp_path / "bare.h5"), bare)
+    large = dataclasses.replace(run, scene_toml="# ä\n" * 50000)
+    save_trajectory(tmp_path / "large.h5", large)
+    assert load_trajectory(tmp_path / "large.h5").scene_toml == large.scene_toml
 
 
 def test_statistics_may_come_and_go(run, tmp_path):
@@ -150,64 +156,26 @@ def test_what_states_remember_is_stored_with_them(run, tmp_path, first):
         assert np.isnan(file["memory/acceleration"][:first]).all()
 
 
-def test_a_run_that_remembers_nothing_has_no_memory_in_its_file(saved):
-    with h5py.File(saved) as file:
-        assert set(file) == {"positions", "velocities", "times", "mesh", "stats"}
-    assert load_trajectory(saved).memory == {}
-
-
-def test_room_is_made_for_memory_that_comes_late(tmp_path, monkeypatch):
-    promised, filled = [], []
-    ensure, fill = Reserve.ensure, GrowingFile._add
-
-    def ensuring(self, used, need):
-        promised.append(used + need)
-        ensure(self, used, need)
-
-    def filling(self, columns):
-        fill(self, columns)
-        self._file.flush()
-        if "memory/acceleration" in columns:
-            filled.append((promised[-1], self._file.id.get_filesize()))
-
-    monkeypatch.setattr(Reserve, "ensure", ensuring)
-    monkeypatch.setattr(GrowingFile, "_add", filling)
-    save_trajectory(tmp_path / "run.h5", remembering(trajectory(frames=300), 298))
-    ((room, used),) = filled
-    assert used <= room < 1.5 * used
-
-
 # --- what a writer refuses -------------------------------------------------------------
 
 
-def test_an_existing_file_is_kept_unless_told(run, tmp_path):
-    path = tmp_path / "run.h5"
-    path.write_text("precious")
-    with pytest.raises(OutputError, match="exists already"):
-        save_trajectory(path, run)
-    assert path.read_text() == "precious"
-    save_trajectory(path, run, overwrite=True)
-    assert_same(load_trajectory(path), run)
-
-
-def test_places_that_cannot_be_written(run, saved, tmp_path):
-    for path, words in (
-        (tmp_path, "is a folder"),
-        (tmp_path / "missing" / "run.h5", "there is no folder"),
-        (saved / "run.h5", "there is no folder"),
-        (Path("/proc/nothing.h5"), "cannot be written"),
-    ):
-        with pytest.raises(OutputError, match=words) as caught:
+def test_places_that_cannot_be_written_and_files_that_exist(run, saved, tmp_path):
+    kept = tmp_path / "kept.h5"
+    kept.write_text("precious")
+    places = [
+        tmp_path, tmp_path / "missing" / "run.h5", saved / "run.h5", Path("/proc/nothing.h5"), kept
+    ]  # fmt: skip
+    if hasattr(os, "geteuid") and os.geteuid():  # root may write it
+        (tmp_path / "closed").mkdir(mode=0o500)
+        places.append(tmp_path / "closed" / "run.h5")
+    for path in places:
+        with pytest.raises(OutputError) as caught:
             save_trajectory(path, run)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write it")
-def test_a_read_only_folder(run, tmp_path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(OutputError, match="Permission denied"):
-        save_trajectory(tmp_path / "run.h5", run)
+    assert kept.read_text() == "precious"
+    save_trajectory(kept, run, overwrite=True)
+    assert_same(load_trajectory(kept), run)
 
 
 def test_states_that_do_not_fit_are_refused_and_leave_the_file_whole(run, tmp_path):
@@ -218,11 +186,11 @@ def test_states_that_do_not_fit_are_refused_and_leave_the_file_whole(run, tmp_pa
         bad = good.positions.copy()
         bad[3, 1] = np.nan
         for state, words in (
-            (State(good.positions[:-1], good.velocities[:-1], 1.0), "positions, expected"),
-            (State(bad, good.velocities, 1.0), "only finite states"),
-            (State(good.positions, good.velocities, good.time), "expected more than"),
-            (State(good.positions, good.velocities, 1.0, {"a": bad}), "only finite states"),
-            (State(good.positions, good.velocities, 1.0, {"a/b": bad}), "without '/'"),
+            (State(good.positions[:-1], good.velocities[:-1], 1.0), "positions"),
+            (State(bad, good.velocities, 1.0), "finite"),
+            (State(good.positions, good.velocities, good.time), "time"),
+            (State(good.positions, good.velocities, 1.0, {"a": bad}), "finite"),
+            (State(good.positions, good.velocities, 1.0, {"a/b": bad}), "a/b"),
         ):
             with pytest.raises(InputError, match=words):
                 writer.append_values(state, {})
@@ -230,40 +198,34 @@ def test_states_that_do_not_fit_are_refused_and_leave_the_file_whole(run, tmp_pa
     assert load_trajectory(path).positions.tobytes() == run.positions[:3].tobytes()
 
 
+SHAPE = trajectory().points.shape
+PARTLY = np.full((7, *SHAPE), np.nan)
+PARTLY[2, 3:] = 1.0
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"cells": np.array([[0, 1, 2, 3, 4, 5, 6, 999]])}, "cells refer to nodes 0 to 999"),
-        ({"velocities": np.zeros((7, 2, 3))}, "velocities has float64 of shape"),
-        ({"times": np.zeros(7)}, "times do not increase"),
-        ({"stats": {"residual": np.zeros(3)}}, "'residual' has shape"),
-        ({"stats": {"status": np.array(["FINE"] * 6)}}, "'FINE' is unknown"),
+        ({"cells": np.array([[0, 1, 2, 3, 4, 5, 6, 999]])}, "cells .*999"),
+        ({"velocities": np.zeros((7, 2, 3))}, "velocities"),
+        ({"times": np.zeros(7)}, "times"),
+        ({"stats": {"residual": np.zeros(3)}}, "'residual'"),
+        ({"stats": {"status": np.array(["FINE"] * 6)}}, "'FINE'"),
         ({"stats": {"a/b": np.zeros(6)}}, "a/b"),
-        ({"memory": {"a": np.zeros((7, 2, 3))}}, "memory 'a' has float64 of shape"),
-        ({"attributes": {"format": "mine"}}, "file's own"),
+        ({"memory": {"a": np.zeros((7, 2, 3))}}, "memory 'a'"),
+        ({"memory": {"a/b": np.ones((7, *SHAPE))}}, "memory 'a/b'"),
+        ({"memory": {"a": PARTLY}}, "memory 'a'"),
+        ({"memory": {"a": np.full((7, *SHAPE), np.nan)}}, "memory 'a'"),
+        ({"attributes": {"format": "mine"}}, "format"),
     ],
 )
 def test_contradictory_trajectories_are_not_saved(run, tmp_path, change, words):
     with pytest.raises(InputError, match=words):
         save_trajectory(tmp_path / "run.h5", dataclasses.replace(run, **change))
     assert not (tmp_path / "run.h5").exists()
-
-
-def test_contradictory_memory_is_not_saved(run, tmp_path):
-    whole, partly, none = (np.full(run.positions.shape, x) for x in (1.0, np.nan, np.nan))
-    partly[2, 3:] = 1.0
-    for memory, words in (
-        ({"a/b": whole}, "memory 'a/b': expected a name"),
-        ({"a": partly}, "memory 'a' has infinite or NaN entries"),
-        ({"a": none}, "memory 'a' has no finite frame"),
-    ):
-        with pytest.raises(InputError, match=words):
-            save_trajectory(tmp_path / "run.h5", dataclasses.replace(run, memory=memory))
-    assert not (tmp_path / "run.h5").exists()
-    with pytest.raises(InputError, match=r"memory 'a': expected shape \(N, 3\), got \(4,\)"):
-        State(run.positions[0], run.velocities[0], 0.0, {"a": np.zeros(4)})
-    with pytest.raises(InputError, match="memory 'a': expected the shape of positions"):
-        State(run.positions[0], run.velocities[0], 0.0, {"a": np.zeros((4, 3))})
+    for memory in (np.zeros(4), np.zeros((4, 3))):
+        with pytest.raises(InputError, match="memory 'a'"):
+            State(run.positions[0], run.velocities[0], 0.0, {"a": memory})
 
 
 # --- writers that do not finish --------------------------------------------------------
@@ -319,16 +281,6 @@ def test_a_killed_writer_leaves_every_complete_frame(run, tmp_path, ready):
         assert loaded.stats["status"][k - 1] == "CONVERGED"
 
 
-def test_an_exception_in_the_run_keeps_its_frames(run, tmp_path):
-    path = tmp_path / "run.h5"
-    with pytest.raises(ZeroDivisionError), writer_of(path, run) as writer:  # noqa: PT012
-        for k in range(3):
-            writer.append_values(run.state(k + 1), {})
-        raise ZeroDivisionError
-    assert load_trajectory(path).positions.tobytes() == run.positions[:4].tobytes()
-    assert not read_superblock(path).in_writing
-
-
 @pytest.mark.parametrize("reached", [1, 2, 3, 4])
 def test_an_interruption_inside_a_frame_drops_only_that_frame(run, tmp_path, reached):
     path = tmp_path / "run.h5"
@@ -342,6 +294,11 @@ def test_an_interruption_inside_a_frame_drops_only_that_frame(run, tmp_path, rea
         assert len(file["positions"]) == 3
         assert len(file["times"]) == (3 if reached == 4 else 2)
     assert load_trajectory(path).positions.tobytes() == run.positions[:2].tobytes()
+    with pytest.raises(ZeroDivisionError), writer_of(tmp_path / "b.h5", run) as writer:  # noqa: PT012
+        writer.append_values(run.state(1), {})
+        raise ZeroDivisionError
+    assert load_trajectory(tmp_path / "b.h5").positions.tobytes() == run.positions[:2].tobytes()
+    assert not read_superblock(tmp_path / "b.h5").in_writing
 
 
 @pytest.mark.parametrize("write", range(9))
@@ -389,12 +346,12 @@ def test_a_full_disk_is_reported_and_keeps_the_frames_before(tmp_path, limit):
     process = child(FULL, path, limit)
     message, _ = process.communicate(timeout=60)
     assert process.returncode == 0
-    assert re.search(r"run\.h5: cannot be written \(File too large\)", message), message
+    assert re.search(r"run\.h5: .*File too large", message), message
     if limit < 20_000:
         assert not path.exists()
     else:
         loaded = load_trajectory(path)
-        assert f"its first {len(loaded.times)} frames are intact" in message
+        assert f" {len(loaded.times)} frames" in message
         expected = trajectory(frames=60)
         assert len(loaded) > 5
         assert_same(loaded, expected, len(loaded.times))
@@ -415,15 +372,15 @@ def test_truncation_at_any_length_is_refused_and_a_prefix_salvaged(run, saved, t
         message = str(refused.value)
         assert "cut.h5" in message
         if length >= 48:
-            assert f"expected {len(data)} bytes, got {length}" in message
+            assert f"{len(data)} bytes" in message
+            assert str(length) in message
         try:
             loaded = load_trajectory(path, salvage=True)
         except FileFormatError:
             survivors.add(0)
-            assert "is intact" in message or "no frame" in message or "empty" in message
         else:
             survivors.add(len(loaded.times))
-            assert f"{len(loaded.times)} of its {len(run.times)} frames are intact" in message
+            assert f"{len(loaded.times)} of its {len(run.times)} frames" in message
             assert_same(loaded, run, len(loaded.times))
     assert survivors >= {0, 3, 4, 5, 6}
 
@@ -466,16 +423,13 @@ def test_a_damaged_frame_can_be_left_out(run, saved, tmp_path):
 
 @pytest.mark.parametrize("size", [3, 48, 5000])
 @pytest.mark.parametrize("head", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n\x00\x00\x00\x00"])
-def test_noise_is_refused(tmp_path, size, head):
+def test_noise_and_folders_are_refused(tmp_path, size, head):
     path = tmp_path / "noise.h5"
     path.write_bytes(head + random.Random(size).randbytes(size))
     with pytest.raises(FileFormatError, match=r"noise\.h5"):
         load_trajectory(path)
-
-
-def test_paths_that_are_not_files(tmp_path):
     for path in (tmp_path, tmp_path / "none.h5"):
-        with pytest.raises(FileFormatError, match="cannot be read"):
+        with pytest.raises(FileFormatError, match=path.name):
             load_trajectory(path)
 
 
@@ -487,28 +441,28 @@ def replace(file, name, data):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda f: f.attrs.__delitem__("format"), "not a trajectory"),
-        (lambda f: f.attrs.__setitem__("format", "other"), "not a trajectory"),
-        (lambda f: f.attrs.__setitem__("format_version", 2), "version 2, expected 1"),
-        (lambda f: f.__delitem__("velocities"), "'velocities' is missing"),
-        (lambda f: f.__delitem__("mesh"), "'mesh/points' is missing"),
-        (lambda f: f.__delitem__("stats"), "'stats' is missing"),
-        (lambda f: replace(f, "times", f["times"][:][:, None]), "'times' has"),
-        (lambda f: replace(f, "times", f["times"][:].astype(int)), "'times' has"),
-        (lambda f: replace(f, "times", f["times"][:][::-1]), "do not increase"),
-        (lambda f: replace(f, "positions", f["positions"][:-1]), "has 6 entries, expected 7"),
-        (lambda f: replace(f, "positions", f["positions"][:, 1:]), "positions has float64"),
+        (lambda f: f.attrs.__delitem__("format"), ""),
+        (lambda f: f.attrs.__setitem__("format", "other"), ""),
+        (lambda f: f.attrs.__setitem__("format_version", 2), "version 2"),
+        (lambda f: f.__delitem__("velocities"), "'velocities'"),
+        (lambda f: f.__delitem__("mesh"), "'mesh/points'"),
+        (lambda f: f.__delitem__("stats"), "'stats'"),
+        (lambda f: replace(f, "times", f["times"][:][:, None]), "'times'"),
+        (lambda f: replace(f, "times", f["times"][:].astype(int)), "'times'"),
+        (lambda f: replace(f, "times", f["times"][:][::-1]), "times"),
+        (lambda f: replace(f, "positions", f["positions"][:-1]), "6 entries"),
+        (lambda f: replace(f, "positions", f["positions"][:, 1:]), "positions"),
         (
             lambda f: replace(f, "positions", f["positions"][:].astype("f4")),
-            "positions has float32",
+            "float32",
         ),
-        (lambda f: f["positions"].__setitem__((2, 3, 1), np.nan), "positions has infinite"),
-        (lambda f: f["mesh/points"].__setitem__((0, 0), np.inf), "points has infinite"),
-        (lambda f: f["mesh/cells"].__setitem__((1, 2), -1), "cells refer to nodes -1"),
-        (lambda f: f["mesh/cells"].__setitem__((1, 2), 10**6), "cells refer to nodes 0 to 1000000"),
-        (lambda f: replace(f, "mesh/cells", f["mesh/cells"][:, :4]), "cells has int64"),
-        (lambda f: f["stats/status"].__setitem__(0, b"GREAT"), "'GREAT' is unknown"),
-        (lambda f: replace(f, "stats/seconds", np.zeros(2)), "expected 6"),
+        (lambda f: f["positions"].__setitem__((2, 3, 1), np.nan), "positions"),
+        (lambda f: f["mesh/points"].__setitem__((0, 0), np.inf), "points"),
+        (lambda f: f["mesh/cells"].__setitem__((1, 2), -1), "-1"),
+        (lambda f: f["mesh/cells"].__setitem__((1, 2), 10**6), "1000000"),
+        (lambda f: replace(f, "mesh/cells", f["mesh/cells"][:, :4]), "cells"),
+        (lambda f: f["stats/status"].__setitem__(0, b"GREAT"), "'GREAT'"),
+        (lambda f: replace(f, "stats/seconds", np.zeros(2)), "seconds"),
     ],
 )
 def test_files_that_break_the_layout_are_refused(saved, tmp_path, change, words):
@@ -520,15 +474,3 @@ def test_files_that_break_the_layout_are_refused(saved, tmp_path, change, words)
         load_trajectory(path)
     assert words in str(refused.value)
     assert "broken.h5" in str(refused.value)
-
-
-def test_a_file_rewritten_by_other_tools_is_read(run, saved, tmp_path):
-    """Contiguous datasets, an old superblock, no checksums."""
-    path = tmp_path / "copy.h5"
-    with h5py.File(saved) as old, h5py.File(path, "w", libver="earliest") as new:
-        for name in ("positions", "velocities", "times", "mesh/points", "mesh/cells"):
-            new[name] = old[name][...]
-        for name in old["stats"]:
-            new[f"stats/{name}"] = old[f"stats/{name}"][...]
-        new.attrs.update(old.attrs)
-    assert_same(load_trajectory(path), run)

@@ -45,13 +45,17 @@ def test_the_collection_names_existing_files_and_times(run, tmp_path):
     np.testing.assert_allclose(times, run.times[::2], rtol=1e-11)
     assert [e.get("file") for e in entries] == [f"cross_{k:04d}.vtu" for k in (0, 2, 4)]
     assert {p.name for p in tmp_path.iterdir()} == {"cross.pvd", *(e.get("file") for e in entries)}
-
-
-def test_times_are_written_as_a_reader_would(run, tmp_path):
     times = 0.1 * np.arange(len(run.times))  # 0.30000000000000004
-    path = write_vtu_series(dataclasses.replace(run, times=times), tmp_path)
+    path = write_vtu_series(
+        dataclasses.replace(run, times=times), tmp_path,
+        point_data=lambda frame: {"error": np.full(len(run.points), 1.0 * frame)},
+        cell_data=lambda frame: {"number": np.arange(len(run.cells)) + frame},
+    )  # fmt: skip
     entries = ET.parse(path).getroot().findall("Collection/DataSet")
     assert [e.get("timestep") for e in entries] == ["0", "0.1", "0.2", "0.3", "0.4", "0.5"]
+    mesh = meshio.read(tmp_path / "run_0005.vtu")
+    assert (mesh.point_data["error"] == 5.0).all()
+    np.testing.assert_array_equal(mesh.cell_data["number"][0], np.arange(len(run.cells)) + 5)
 
 
 def test_a_series_replaces_no_other_of_a_longer_name(run, tmp_path):
@@ -78,35 +82,25 @@ def test_what_is_refused_leaves_the_old_series(run, tmp_path, damage):
         positions[3, 0, 0] = np.nan
         bad, problem, words = dataclasses.replace(run, positions=positions), None, "frame 3"
     else:
-        bad, problem, words = run, pc.discretise(beam((2, 1, 1))), "stress_of has 12 nodes"
+        bad, problem, words = run, pc.discretise(beam((2, 1, 1))), ".* 12 nodes"
     with pytest.raises(InputError, match=f"run: {words}"):
         write_vtu_series(bad, path.parent, every=2, stress_of=problem)
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
-
-
-def test_a_series_that_is_interrupted_has_no_collection(run, tmp_path):
-    write_vtu_series(run, tmp_path)
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    for folder in (blocked, blocked / "sub"):
+        with pytest.raises(OutputError, match="file"):
+            write_vtu_series(run, folder)
 
     def stops(frame):
         if frame == 2:
             raise KeyboardInterrupt
         return {}
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt):  # which leaves no collection
         write_vtu_series(run, tmp_path, point_data=stops)
     assert not list(tmp_path.glob("*.pvd"))
     assert len(list(tmp_path.glob("*.vtu"))) == len(run.times)
-
-
-def test_extra_fields_are_written(run, tmp_path):
-    write_vtu_series(
-        run, tmp_path, every=5,
-        point_data=lambda frame: {"error": np.full(len(run.points), 1.0 * frame)},
-        cell_data=lambda frame: {"number": np.arange(len(run.cells)) + frame},
-    )  # fmt: skip
-    mesh = meshio.read(tmp_path / "run_0005.vtu")
-    assert (mesh.point_data["error"] == 5.0).all()
-    np.testing.assert_array_equal(mesh.cell_data["number"][0], np.arange(len(run.cells)) + 5)
 
 
 @pytest.mark.parametrize("element", ["hex8", "hex27"])
@@ -127,18 +121,6 @@ def test_the_stress_of_a_stretched_body_is_written_by_component(element, tmp_pat
     np.testing.assert_allclose(data["von_mises"], invariant, rtol=3e-3)
     write_vtu_series(run, tmp_path)
     assert set(meshio.read(tmp_path / "run_0000.vtu").point_data) == {"displacement", "velocity"}
-
-
-def test_what_cannot_be_written_is_named(run, tmp_path):
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    for folder in (blocked, blocked / "sub"):
-        with pytest.raises(OutputError, match="file"):
-            write_vtu_series(run, folder)
-    with pytest.raises(InputError, match="every = 0"):
-        write_vtu_series(run, tmp_path, every=0)
-    with pytest.raises(OutputError, match=r"a\.vtu"):
-        write_vtu(tmp_path / "missing" / "a.vtu", run.points, run.cells)
 
 
 def test_a_failed_write_leaves_the_old_file(run, tmp_path, monkeypatch):
