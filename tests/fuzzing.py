@@ -24,7 +24,7 @@ TRIED: list[int] = []
 
 @pytest.fixture(autouse=True)
 def inputs_recorded(record_property):
-    """Tell the test report how many inputs a test took (`benchmarks/robustness.py` reads it)."""
+    """Tell the test report how many inputs a test took."""
     TRIED.clear()
     yield
     record_property("inputs", len(TRIED))

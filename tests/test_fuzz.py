@@ -24,13 +24,12 @@ from fuzzing import (
     counts,
     damaged,
     for_all,
-    inputs_recorded,  # noqa: F401
     places,
     renumbered,
     within_memory,
     within_seconds,
 )
-from pdcorrect.cli import main as cli
+from pdcorrect.cli import common as cli
 from pdcorrect.errors import MeshError, PdcorrectError, SceneError
 from pdcorrect.fem.mesh import corner_jacobians
 from pdcorrect.fem.mesh_files import read_hex_mesh
