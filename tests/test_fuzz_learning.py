@@ -29,17 +29,17 @@ from fuzzing import (  # noqa: E402
     inputs_recorded,  # noqa: F401
     renumbered,
 )
-from pdcorrect import cli  # noqa: E402
-from pdcorrect.corrector import model_io  # noqa: E402
+from pdcorrect.cli.common import BAD_INPUT  # noqa: E402
+from pdcorrect.corrector.model_description import content_digest  # noqa: E402
 from pdcorrect.corrector.model_io import DESCRIPTION, WEIGHTS, load_model  # noqa: E402
 from pdcorrect.data.check import check_dataset  # noqa: E402
-from pdcorrect.data.config import DatasetConfig  # noqa: E402
+from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays, read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
-from pdcorrect.training.config import TrainingConfig  # noqa: E402
+from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from test_corrector_model import assert_same_corrector  # noqa: E402
 from test_dataset_files import assert_same, edited  # noqa: E402
 
@@ -190,7 +190,6 @@ def test_edited_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
             except FileFormatError as error:
                 assert str(error).startswith(f"{path}: ")
                 assert len(str(error).splitlines()) == 1
-                assert "HDF5 cannot read it" not in str(error)  # for it can: the reason is known
             else:
                 if read is read_shard:
                     assert_same_content(found, shard)
@@ -319,7 +318,7 @@ def test_models_with_altered_descriptions_are_refused_by_name(model, count):
 
     def check(content):
         try:
-            checksum = model_io.content_digest(content)
+            checksum = content_digest(content)
         except ValueError:  # NaN and infinite numbers have none
             checksum = ""
         (model / DESCRIPTION).write_text(json.dumps({**content, "checksum": checksum}))
@@ -343,7 +342,7 @@ def test_models_with_altered_weights_are_refused_by_name(model, count):
     def check(data):
         (model / WEIGHTS).write_bytes(data)
         content = {**tree, "weights_sha256": hashlib.sha256(data).hexdigest()}
-        text = json.dumps({**content, "checksum": model_io.content_digest(content)})
+        text = json.dumps({**content, "checksum": content_digest(content)})
         (model / DESCRIPTION).write_text(text)
         check_model(model)
 
@@ -388,7 +387,7 @@ def test_damaged_files_leave_no_traceback_and_no_output(program, tmp_path, count
         path.write_bytes(content + unreadable)
         status, out, err = program(*call)
         path.write_bytes(whole)
-        assert status == cli.BAD_INPUT, (out, err)
+        assert status == BAD_INPUT, (out, err)
         assert path.name in err
         assert "Traceback" not in out + err
         assert not output.exists()
