@@ -137,6 +137,6 @@ def _check_version(path: Path, version: object, whole: bool) -> None:
         raise FileFormatError(
             f"{path}: damaged: its checksum is not that of its content; copy or save it again."
         )
-    if version != VERSION:
+    if type(version) is not int or version != VERSION:
         remedy = "update pdcorrect" if newer else "train the model anew"
         raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {remedy}.")

@@ -127,8 +127,7 @@ def _of_the_rows(comparison: Comparison) -> str:
     told = [f"{', '.join(labels)}: {what}" for what, labels in unlike.items()]
     if comparison.without_best:
         told.append(f"there is no best coarse model: {comparison.without_best}")
-    text = "; ".join(told)
-    return f"{text[:1].upper()}{text[1:]}." if text else ""
+    return f"{'; '.join(told)}." if told else ""
 
 
 def _discretisation(run: Trajectory) -> str:
