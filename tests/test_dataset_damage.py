@@ -11,9 +11,9 @@ pytest.importorskip("torch_geometric")
 
 import reader_samples as samples  # noqa: E402
 from pdcorrect.data.folder import shard_paths, whole_files  # noqa: E402
-from pdcorrect.data.summary import dataset_info  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.data.statistics import compute_statistics  # noqa: E402
+from pdcorrect.data.summary import dataset_info  # noqa: E402
 from pdcorrect.errors import FileFormatError, FileVersionError  # noqa: E402
 
 

@@ -184,7 +184,9 @@ def names(folder):
     return {path.name for path in folder.iterdir()}
 
 
-def test_an_export_does_not_mix_with_another(folder, exported, tmp_path):
+def test_exports_do_not_mix_and_files_of_another_origin_are_not_replaced(
+    folder, exported, tmp_path
+):
     target = tmp_path / "target"
     export_meshgraphnet(folder, target)
     (target / "notes.json").write_text('{"mine": 1}')
@@ -209,8 +211,8 @@ def test_an_export_does_not_mix_with_another(folder, exported, tmp_path):
         }
         assert mine < names(target)
 
-
-def test_a_file_of_another_origin_is_not_replaced(folder, tmp_path):
+    tmp_path = tmp_path / "mine"
+    tmp_path.mkdir()
     (tmp_path / "train.h5").write_text("mine")
     with pytest.raises(OutputError, match=r"train\.h5"):
         export_meshgraphnet(folder, tmp_path, overwrite=True)

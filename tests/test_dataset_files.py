@@ -82,15 +82,13 @@ def test_what_is_written_is_read(shard, tmp_path, dtype, verify):
 
 
 @pytest.mark.parametrize("verify", [True, False])
-def test_simulations_and_runs_are_read_alone(shard, saved, verify):
+def test_parts_are_read_alone_and_those_that_are_not_there_are_refused(shard, saved, verify):
     found = read_shard(saved, simulations=[1], runs=["reference", "plain"], verify=verify)
     expected = dataclasses.replace(shard, simulations=shard.simulations[1:])
     assert_same(found, expected, "float32", ["plain", "reference"])
     assert [len(s.runs) for s in read_shard(saved, runs=(), verify=verify).simulations] == [0, 0]
     assert not read_shard(saved, simulations=(), verify=verify).simulations
 
-
-def test_a_simulation_or_run_that_is_not_there_is_refused(saved):
     for arguments, words in (
         ({"simulations": [2]}, "simulation 2"),
         ({"simulations": [-1]}, "simulation -1"),
@@ -181,20 +179,7 @@ def refusal(path, **options):
     return message
 
 
-def test_every_truncation_is_found(saved, tmp_path):
-    data, path = saved.read_bytes(), tmp_path / "shard.h5"
-    rng = random.Random(2)
-    for length in [1, 10, 30, 511, 512, 513, len(data) - 1, *rng.sample(range(len(data)), 50)]:
-        path.write_bytes(data[:length])
-        for verify in (True, False):
-            assert "truncated" in refusal(path, verify=verify)
-    path.write_bytes(data + b"\0")
-    message = refusal(path)
-    assert str(len(data)) in message
-    assert str(len(data) + 1) in message
-
-
-def test_every_flipped_bit_and_every_overwritten_block_is_found(saved, tmp_path):
+def test_every_flipped_bit_truncation_and_overwritten_block_is_found(saved, tmp_path):
     data, path = saved.read_bytes(), tmp_path / "shard.h5"
     rng = random.Random(1)
     places = [*range(0, 200, 7), 300, 511, 512, 520, 600, len(data) - 1]
@@ -214,6 +199,17 @@ def test_every_flipped_bit_and_every_overwritten_block_is_found(saved, tmp_path)
         if changed != data:
             path.write_bytes(changed)
             refusal(path)
+
+    data, path = saved.read_bytes(), tmp_path / "shard.h5"
+    rng = random.Random(2)
+    for length in [1, 10, 30, 511, 512, 513, len(data) - 1, *rng.sample(range(len(data)), 50)]:
+        path.write_bytes(data[:length])
+        for verify in (True, False):
+            assert "truncated" in refusal(path, verify=verify)
+    path.write_bytes(data + b"\0")
+    message = refusal(path)
+    assert str(len(data)) in message
+    assert str(len(data) + 1) in message
 
 
 def test_other_formats_folders_and_pipes_are_refused(tmp_path):

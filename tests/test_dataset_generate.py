@@ -92,7 +92,7 @@ def test_predictions_are_single_steps_from_the_reference(generated, name):
         np.testing.assert_allclose(prediction, found.state.positions, atol=2e-6)
 
 
-def test_evaluation_has_what_training_leaves_out(generated):
+def test_evaluation_has_the_models_and_runs_that_training_leaves_out(generated):
     _, folder = generated
     shard = read_shard(folder / "evaluation/mesh-0000.h5")
     assert set(shard.simulations[0].runs) == {"reference", "plain", "best"}  # refine is 2
@@ -108,8 +108,6 @@ def test_evaluation_has_what_training_leaves_out(generated):
     assert masses["plain"] > 1.3 * masses["reference"]
     assert masses["total-mass"] == pytest.approx(masses["reference"])
 
-
-def test_the_time_converged_and_the_finest_run_are_made_where_asked_for():
     config = small(converged_steps=4, finest_meshes=1)
     (shard,) = simulate(config, make_plan(config)[-1:], make_engines(config, "cpu"))
     runs = shard.simulations[0].runs
@@ -268,13 +266,39 @@ def test_an_interruption_says_what_is_there_and_how_to_go_on(program, tmp_path, 
     assert "1 of 4 simulations" in err
 
 
-def test_another_configuration_may_not_use_the_folder(generated):
+def test_folders_of_other_configurations_and_files_of_others_are_never_overwritten(
+    generated, tmp_path, monkeypatch
+):
     _, folder = generated
     with pytest.raises(InputError, match="seed: 7 there, 99 here"):
         generate(small(seed=99), folder)
     extra = [{"name": "stiffer", "meshes": 1, "simulations": 1}]
     with pytest.raises(InputError, match=r"extra.*meshes: nothing there, 1 here"):
         generate(small(extra=extra), folder)
+
+    config, folder = generated
+    foreign = tmp_path / "foreign"
+    shutil.copytree(folder, foreign)
+    (foreign / "config.toml").unlink()
+    with pytest.raises(InputError, match=r"config\.toml"):
+        generate(config, foreign)
+    other = small(seed=8)
+    (foreign / "config.toml").write_text(other.to_toml())
+    with pytest.raises(InputError, match=r"mesh-0000\.h5"):
+        generate(other, foreign)
+    monkeypatch.setattr("pdcorrect.data.checksum.VERSION", 0)
+    with pytest.raises(FileFormatError, match="version 1"):
+        generate(config, folder)
+
+    config, other, tmp_path = small(), small(seed=8), tmp_path / "new"
+    assert not generate(config, tmp_path, seconds=0.0)  # so that it may be replaced
+    assert not generate(other, tmp_path, seconds=0.0)
+    written = (tmp_path / "config.toml").read_text()
+    assert written == other.to_toml()
+    (tmp_path / "config.toml").write_text("# by hand\n" + written)
+    with pytest.raises(InputError, match="config"):
+        generate(config, tmp_path, seconds=0.0)
+    assert (tmp_path / "config.toml").read_text() == "# by hand\n" + written
 
 
 def test_what_is_refused_leaves_no_folder(program, tmp_path):
@@ -303,18 +327,6 @@ def test_what_is_refused_leaves_no_folder(program, tmp_path):
     assert not folder.exists()
 
 
-def test_a_configuration_of_which_nothing_is_there_yet_is_replaced(tmp_path):
-    config, other = small(), small(seed=8)
-    assert not generate(config, tmp_path, seconds=0.0)
-    assert not generate(other, tmp_path, seconds=0.0)
-    written = (tmp_path / "config.toml").read_text()
-    assert written == other.to_toml()
-    (tmp_path / "config.toml").write_text("# by hand\n" + written)
-    with pytest.raises(InputError, match="config"):
-        generate(config, tmp_path, seconds=0.0)
-    assert (tmp_path / "config.toml").read_text() == "# by hand\n" + written
-
-
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_named(
     tmp_path, monkeypatch, address
@@ -329,22 +341,6 @@ def test_a_scheduler_that_does_not_answer_or_has_no_workers_is_named(
         pytest.raises(InputError, match=r"0\.2 s"),
     ):
         generate(small(), tmp_path, Workers(scheduler=cluster.scheduler_address))
-
-
-def test_files_of_others_are_never_overwritten(generated, tmp_path, monkeypatch):
-    config, folder = generated
-    foreign = tmp_path / "foreign"
-    shutil.copytree(folder, foreign)
-    (foreign / "config.toml").unlink()
-    with pytest.raises(InputError, match=r"config\.toml"):
-        generate(config, foreign)
-    other = small(seed=8)
-    (foreign / "config.toml").write_text(other.to_toml())
-    with pytest.raises(InputError, match=r"mesh-0000\.h5"):
-        generate(other, foreign)
-    monkeypatch.setattr("pdcorrect.data.checksum.VERSION", 0)
-    with pytest.raises(FileFormatError, match="version 1"):
-        generate(config, folder)
 
 
 def test_processes_write_to_places_of_their_own_and_clear_up_after_dead_ones(tmp_path):

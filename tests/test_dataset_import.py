@@ -156,13 +156,11 @@ def test_wrong_arrays_are_refused_with_the_place(changes, words):
 
 
 @pytest.mark.parametrize("name", ["coarse", "predictions"])
-def test_simulations_of_a_mesh_have_the_same_runs(name):
+def test_wrong_meshes_and_simulations_of_unlike_runs_are_refused(name):
     first, second = arguments()["motions"]
     with pytest.raises(InputError, match=f"simulation 1 .* {name}"):
         shard_from_arrays(**arguments(motions=[first, replace(second, **{name: None})]))
 
-
-def test_an_inverted_mesh_is_refused():
     cells = arguments()["cells"].copy()
     cells[2] = cells[2][[4, 5, 6, 7, 0, 1, 2, 3]]
     with pytest.raises(MeshError, match="cell 2 "):
@@ -185,8 +183,23 @@ def test_what_is_imported_is_what_the_check_accepts(tmp_path):
         write_shard(root / "training/mesh-0000.h5", shard, dtype)
         assert check_dataset(root) == []
 
+    moved = np.asarray(arguments()["motions"][0].reference).copy()
+    moved[1:] += 0.01 * (moved[1:] - moved[0])
+    still = np.zeros((len(moved) - 1, *moved.shape[1:]))
+    first = arguments()["motions"][0].reference
+    free = np.ones_like(arguments()["free"])
+    motions = [ImportedMotion(first, forces=still), ImportedMotion(moved, forces=still)]
+    path = tmp_path / "set" / "training" / "mesh-0000.h5"
+    write_shard(path, shard_from_arrays(**arguments(motions=motions, free=free)))
+    assert check_dataset(tmp_path / "set") == []
+    twice = [ImportedMotion(first, forces=still)] * 2
+    write_shard(path, shard_from_arrays(**arguments(motions=twice, free=free)), overwrite=True)
+    (finding,) = check_dataset(tmp_path / "set")
+    assert "simulation 0001" in finding.message
+    assert "simulation 0000" in finding.message
 
-def test_numbers_of_other_types_mean_the_same():
+
+def test_numbers_of_other_types_or_nearly_the_scenes_mean_the_same():
     given = arguments()
     shard = shard_from_arrays(
         **{**given, "cells": given["cells"].astype(float), "free": given["free"].astype(np.int8)}
@@ -194,6 +207,12 @@ def test_numbers_of_other_types_mean_the_same():
     assert (shard.cells == given["cells"]).all()
     assert (shard.free == given["free"]).all()
     assert shard.free.dtype == bool
+
+    given = scene_arguments()
+    for step, expected in ((0.009999999999999998, 0.01), (0.0125, 0.0125)):
+        shard = shard_from_arrays(**{**given, "time_step": step})
+        assert shard.attributes["time_step"] == expected
+        assert pc.Scene.from_toml(shard.simulations[0].scene_toml).time.step == expected
 
 
 def scene_arguments(**changes):
@@ -207,14 +226,6 @@ def scene_arguments(**changes):
         "free": problem.free, "young": materials.young, "poisson": materials.poisson,
         "density": materials.density, "time_step": 0.01, "scene": scene,
     }  # fmt: skip
-
-
-def test_a_time_step_that_is_nearly_the_scenes_is_the_scenes():
-    given = scene_arguments()
-    for step, expected in ((0.009999999999999998, 0.01), (0.0125, 0.0125)):
-        shard = shard_from_arrays(**{**given, "time_step": step})
-        assert shard.attributes["time_step"] == expected
-        assert pc.Scene.from_toml(shard.simulations[0].scene_toml).time.step == expected
 
 
 MOVING = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]}
@@ -269,23 +280,6 @@ def test_an_npz_file_is_imported(tmp_path):
     assert not other.forces.any()
     with pytest.raises(InputError, match=r"mesh-0003\.h5"):
         import_trajectories([source], tmp_path / "set", split="validation", number=3)
-
-
-def test_an_imported_set_without_forces_passes_the_check(tmp_path):
-    moved = np.asarray(arguments()["motions"][0].reference).copy()
-    moved[1:] += 0.01 * (moved[1:] - moved[0])
-    still = np.zeros((len(moved) - 1, *moved.shape[1:]))
-    first = arguments()["motions"][0].reference
-    free = np.ones_like(arguments()["free"])
-    motions = [ImportedMotion(first, forces=still), ImportedMotion(moved, forces=still)]
-    path = tmp_path / "set" / "training" / "mesh-0000.h5"
-    write_shard(path, shard_from_arrays(**arguments(motions=motions, free=free)))
-    assert check_dataset(tmp_path / "set") == []
-    twice = [ImportedMotion(first, forces=still)] * 2
-    write_shard(path, shard_from_arrays(**arguments(motions=twice, free=free)), overwrite=True)
-    (finding,) = check_dataset(tmp_path / "set")
-    assert "simulation 0001" in finding.message
-    assert "simulation 0000" in finding.message
 
 
 def test_wrong_npz_files_are_refused_by_name(tmp_path):
@@ -498,7 +492,7 @@ def test_a_reference_may_have_nodes_between_the_corners(runs, refine):
     np.testing.assert_array_equal(positions[0], problem.positions)
 
 
-def test_the_coarse_runs_scene_is_the_coarse_models(runs):
+def test_the_coarse_and_the_best_coarse_model_are_those_of_the_scene(runs):
     fine, coarse = runs
     other = rerun(coarse, solver={"element": "hex8-mean", "mass": "averaged"})
     shard = shard_from_trajectories(fine, other)
@@ -509,8 +503,6 @@ def test_the_coarse_runs_scene_is_the_coarse_models(runs):
     np.testing.assert_allclose(found.runs["plain"].predictions[0], expected, atol=1e-12)
     assert np.abs(expected - coarse.positions[1]).max() > 1e-6
 
-
-def test_the_best_coarse_models_run_is_computed_if_wanted(runs):
     fine, coarse = runs
     shard = shard_from_trajectories(fine, coarse, best=True)
     (found,) = shard.simulations

@@ -152,7 +152,7 @@ def pair(cases):
     return chosen, pc.BatchStepper([case.problems["plain"] for case in chosen])
 
 
-def test_rollouts_reach_the_frames_asked_for(pair):
+def test_a_scene_that_fails_is_held_and_the_others_reach_the_frames_asked_for(pair):
     chosen, stepper = pair
     runs = roll_out(Fake(stepper, chosen, perfect), stepper, [3, 7])
     for run, case, count in zip(runs, chosen, (3, 7), strict=True):
@@ -160,8 +160,6 @@ def test_rollouts_reach_the_frames_asked_for(pair):
         assert run.refused.shape == (count,)
         assert run.failed is None
 
-
-def test_a_scene_that_fails_is_held_and_the_others_go_on(pair):
     chosen, stepper = pair
 
     def breaking(case, t, x):
@@ -404,8 +402,6 @@ def test_solvers_are_compared_at_equal_accuracy():
     with pytest.raises(InputError, match="2 .* 1 |1 .* 2 |as many"):
         measure_speed(coarse, fine[:1], hybrid)
 
-
-def test_the_loosest_tolerance_that_is_accurate_enough_is_taken():
     assert _loosest(lambda tolerance: 2 * tolerance, 1e-3) == (3e-4, 6e-4)
     assert _loosest(lambda tolerance: 0.5 * tolerance, 1e-3) == (1e-3, 5e-4)
     with pytest.raises(ConvergenceError, match="tolerance"):

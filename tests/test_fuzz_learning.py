@@ -26,7 +26,6 @@ from fuzzing import (  # noqa: E402
     counts,
     damaged,
     for_all,
-    inputs_recorded,  # noqa: F401
     renumbered,
 )
 from pdcorrect.cli.common import BAD_INPUT  # noqa: E402

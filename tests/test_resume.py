@@ -204,7 +204,9 @@ def test_a_failure_while_reopening_loses_nothing(run, whole, tmp_path, monkeypat
     assert_same_file(path, whole)
 
 
-def test_what_a_killed_reopening_leaves_behind_is_removed(run, whole, tmp_path):
+def test_what_a_killed_reopening_leaves_behind_is_removed_and_no_beginning_is_half(
+    run, whole, tmp_path, monkeypatch
+):
     path = tmp_path / "run.h5"
     for end in (len(whole.read_bytes()), -10):
         path.write_bytes(whole.read_bytes()[:end])
@@ -213,8 +215,6 @@ def test_what_a_killed_reopening_leaves_behind_is_removed(run, whole, tmp_path):
         finish(path, run)
         assert_same_file(path, whole)
 
-
-def test_a_file_without_its_beginning_never_exists(run, tmp_path, monkeypatch):
     path = tmp_path / "run.h5"
 
     def half(self, data):
@@ -223,12 +223,20 @@ def test_a_file_without_its_beginning_never_exists(run, tmp_path, monkeypatch):
         raise Terminated
 
     monkeypatch.setattr(Path, "write_bytes", half)
+    path.unlink()
     with pytest.raises(Terminated):
         write(path, run)
     assert not list(tmp_path.iterdir())
 
 
-def test_files_that_cannot_be_continued_are_refused_and_kept(run, whole, tmp_path, monkeypatch):
+def test_other_files_are_continued_or_refused_and_kept(run, whole, tmp_path, monkeypatch):
+    path = tmp_path / "run.h5"
+    with h5py.File(whole) as old, h5py.File(path, "w", libver="earliest") as new:
+        old.visititems(lambda n, d: new.__setitem__(n, d[:]) if hasattr(d, "shape") else None)
+        new.attrs.update(old.attrs)
+    finish(path, run)
+    assert_same_file(path, whole)
+
     path = tmp_path / "run.h5"
     for data in (b"", b"noise", whole.read_bytes()[:300]):
         path.write_bytes(data)
@@ -240,15 +248,6 @@ def test_files_that_cannot_be_continued_are_refused_and_kept(run, whole, tmp_pat
     with pytest.raises(InputError, match=r"0\.1\.0.*9\.9"):
         TrajectoryWriter.resume(path)
     assert path.read_bytes() == whole.read_bytes()
-
-
-def test_a_file_of_another_tool_is_continued(run, whole, tmp_path):
-    path = tmp_path / "run.h5"
-    with h5py.File(whole) as old, h5py.File(path, "w", libver="earliest") as new:
-        old.visititems(lambda n, d: new.__setitem__(n, d[:]) if hasattr(d, "shape") else None)
-        new.attrs.update(old.attrs)
-    finish(path, run)
-    assert_same_file(path, whole)
 
 
 # --- the stepper -----------------------------------------------------------------------

@@ -258,15 +258,13 @@ def test_errors_below_the_rounding_of_storage_are_not_learned():
 # --- checkpoints -------------------------------------------------------------------------
 
 
-def test_a_checkpoint_comes_back(tmp_path):
+def test_checkpoints_come_back_and_every_damaged_one_is_refused_by_name(tmp_path):
     tensors = {"a": torch.tensor([1.0, np.pi]), "b": torch.tensor(3), "c": torch.zeros(0, 2)}
     write_checkpoint(tmp_path / "c", {"x": 0.1 + 0.2, "list": [1, None]}, tensors)
     content, found = read_checkpoint(tmp_path / "c")
     assert content == {"x": 0.1 + 0.2, "list": [1, None]}
     assert all(torch.equal(found[n], x) and found[n].dtype == x.dtype for n, x in tensors.items())
 
-
-def test_every_damaged_checkpoint_is_refused_by_name(tmp_path):
     path = tmp_path / "checkpoint.safetensors"
     write_checkpoint(path, {"iteration": 12}, {"a": torch.arange(6.0), "b": torch.ones(2, 2)})
     whole = path.read_bytes()

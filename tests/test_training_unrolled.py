@@ -46,7 +46,7 @@ def started(group, frames):
     return Rollouts(positions, velocities, none, frames, np.zeros_like(frames))
 
 
-def test_groups_hold_all_simulations_once_and_meshes_stay_together():
+def test_groups_hold_all_simulations_once_and_states_have_backward_differences(group):
     recordings = load_recordings(samples.TINY, "training", "plain")
     every = [
         group
@@ -59,8 +59,6 @@ def test_groups_hold_all_simulations_once_and_meshes_stay_together():
     assert len([1 for a, b in itertools.pairwise(meshes) if a != b]) == 5
     assert meshes != [r.mesh for g in grouped(recordings, 3, seed=6) for r in g]
 
-
-def test_states_of_the_reference_have_backward_differences(group):
     frames = np.array([0, 4, 20])
     positions, velocities = group.states(frames)
     truth = group.recordings[1].reference.astype(float)

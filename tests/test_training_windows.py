@@ -154,7 +154,7 @@ def test_windows_kept_in_memory_are_those_that_are_read(folder, features, placem
             assert torch.equal(vars(one.bodies)[name], vars(other.bodies)[name])
 
 
-def test_windows_that_memory_does_not_hold_are_read(folder, monkeypatch):
+def test_windows_that_memory_does_not_hold_are_read_and_know_the_rest(folder, monkeypatch):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
     assert windows.resident
@@ -165,8 +165,6 @@ def test_windows_that_memory_does_not_hold_are_read(folder, monkeypatch):
     monkeypatch.setattr("pdcorrect.training.windows.CACHE_BYTES", 10**5)
     assert not samples.windows(folder, settings)[0].resident
 
-
-def test_what_is_known_of_the_rest_is_that_of_the_bodies(folder):
     windows, _ = samples.windows(folder, samples.config(samples.one_step()))
     bodies = windows.batch([3, 45, 4]).bodies
     anew = bodies.to()
@@ -197,7 +195,7 @@ def test_the_normaliser_has_zero_mean_and_unit_deviation_on_the_training_split(f
     assert float(normaliser.output_scale) == pytest.approx(float(target.square().mean().sqrt()))
 
 
-def test_bodies_of_the_training_split_are_like_it(folder):
+def test_bodies_of_the_training_split_are_like_it_whatever_part_is_fitted_to(folder):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
     corrector = samples.fitted(folder, settings)
@@ -217,8 +215,6 @@ def test_bodies_of_the_training_split_are_like_it(folder):
     )
     assert 1.0 < float(corrector.unlike(view).max()) <= 3.5 + 1e-9
 
-
-def test_bodies_of_the_training_split_are_known_whatever_part_is_fitted_to(folder):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
     corrector = samples.fitted(folder, settings)

@@ -64,7 +64,7 @@ def test_it_is_what_backward_euler_makes_of_a_mode(mode, x, y):
         assert ahead(of_one(problem, steps), e, v) == pytest.approx(expected, rel=2e-3)
 
 
-def test_it_is_nearly_that_of_a_mix_of_modes():
+def test_it_is_nearly_that_of_a_mix_of_modes_and_others_do_not_count():
     problem = held_beam(time={"step": STEP, "integrator": "backward-euler", "frames": 1})
     found, generator = modes(problem, 4), np.random.default_rng(4)
     e, v = (
@@ -74,8 +74,6 @@ def test_it_is_nearly_that_of_a_mix_of_modes():
     expected = simulated(problem, e, v, 40)
     assert ahead(of_one(problem, 40), e, v) == pytest.approx(expected, rel=0.1)
 
-
-def test_modes_that_are_left_out_do_not_count():
     problem = held_beam()
     shapes, two = modes(problem, 4).shapes, of_one(problem, count=2)
     none = np.zeros_like(shapes[0])

@@ -153,7 +153,7 @@ def test_hexahedra_survive_the_formats(tmp_path, suffix):
     np.testing.assert_array_equal(found.cells, mesh.cells)
 
 
-def test_other_dimensions_are_ignored_and_unused_nodes_dropped(tmp_path):
+def test_hexahedra_are_read_and_other_cells_and_unused_nodes_dropped(tmp_path, capfd):
     mesh = cross_mesh()
     points = np.concatenate([[[9.0, 9.0, 9.0]], mesh.positions, [[8.0, 8.0, 8.0]]])
     cells = [
@@ -169,8 +169,6 @@ def test_other_dimensions_are_ignored_and_unused_nodes_dropped(tmp_path):
     np.testing.assert_array_equal(found.positions, mesh.positions)
     np.testing.assert_array_equal(found.cells, mesh.cells)
 
-
-def test_files_without_usable_cells_are_refused(tmp_path, capfd):
     cube = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
     hexahedron = ("hexahedron", [[0, 1, 3, 2, 4, 5, 7, 6]])
     for name, cells, words in (
