@@ -37,10 +37,24 @@ def exported(folder, tmp_path_factory):
 # --- MeshGraphNet ----------------------------------------------------------------------
 
 
-def test_each_split_becomes_a_file_under_the_usual_name(exported):
+def test_each_split_becomes_a_file_under_its_usual_name_read_without_this_package(exported):
     written, target = exported
     names = {"train.h5", "valid.h5", "test.h5", "longer.h5", "meta.json", "meta-longer.json"}
     assert {path.name for path in written} == {path.name for path in target.iterdir()} == names
+
+    script = f"""
+        import sys
+        sys.modules["pdcorrect"] = None
+        import h5py, json, numpy
+        meta = json.load(open({str(exported[1] / "meta.json")!r}))
+        file = h5py.File({str(exported[1] / "train.h5")!r})
+        frame = {{k: file["0"][k][2] for k in meta["field_names"]}}
+        print(frame["world_pos"].shape, frame["cells"].max())
+    """
+    out = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
+    )
+    assert out.stdout == "(24, 3) 23\n"
 
 
 @pytest.mark.parametrize(("name", "meta"), [("train", "meta"), ("longer", "meta-longer")])
@@ -102,22 +116,6 @@ def test_tetrahedra_fill_the_cells_and_meet_face_to_face(seed):
     _, counts = np.unique(triangles, axis=0, return_counts=True)
     assert set(counts) == {1, 2}
     assert (counts == 1).sum() == 2 * 2 * (3 * 2 + 3 * 2 + 2 * 2)  # two on each outer face
-
-
-def test_exports_are_read_without_this_package(exported):
-    script = f"""
-        import sys
-        sys.modules["pdcorrect"] = None
-        import h5py, json, numpy
-        meta = json.load(open({str(exported[1] / "meta.json")!r}))
-        file = h5py.File({str(exported[1] / "train.h5")!r})
-        frame = {{k: file["0"][k][2] for k in meta["field_names"]}}
-        print(frame["world_pos"].shape, frame["cells"].max())
-    """
-    out = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)], capture_output=True, text=True, check=True
-    )
-    assert out.stdout == "(24, 3) 23\n"
 
 
 def test_what_cannot_be_exported_is_refused_and_leaves_no_file(folder, tmp_path):

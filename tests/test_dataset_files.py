@@ -301,7 +301,7 @@ OPTIONAL = {
 """What a simulation may lack."""
 
 
-def test_every_missing_part_is_named(saved, tmp_path):
+def test_every_missing_or_wrong_part_is_named(saved, tmp_path):
     path = tmp_path / "shard.h5"
     arrays, groups = everything(saved)
     for place in [*arrays, *groups]:
@@ -315,8 +315,6 @@ def test_every_missing_part_is_named(saved, tmp_path):
     with pytest.raises(FileFormatError, match="runs/reference/positions of simulation 0000"):
         read_arrays(path)
 
-
-def test_every_wrong_shape_type_and_value_is_named(saved, tmp_path):
     path = tmp_path / "shard.h5"
     arrays, _ = everything(saved)
     for place, values in arrays.items():
@@ -344,7 +342,7 @@ def test_every_wrong_shape_type_and_value_is_named(saved, tmp_path):
     assert "(6, 63, 3)" in message
 
 
-def test_wrong_attributes_are_named(saved, tmp_path):
+def test_wrong_attributes_and_contradictions_within_a_file_are_named(saved, tmp_path, shard):
     path = tmp_path / "shard.h5"
     with h5py.File(saved) as file:
         names = list(file.attrs)
@@ -364,8 +362,6 @@ def test_wrong_attributes_are_named(saved, tmp_path):
         edited(saved, path, lambda f, p=place, n=name, v=value: f[p].attrs.__setitem__(n, v))
         assert name in refusal(path)
 
-
-def test_contradictions_within_a_file_are_named(shard, saved, tmp_path):
     path = tmp_path / "shard.h5"
     cells = shard.cells.astype(np.int32)
     first = "simulations/0000"

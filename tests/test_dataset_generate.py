@@ -51,12 +51,10 @@ def generated(tmp_path_factory):
     return config, folder
 
 
-def test_a_generated_data_set_passes_its_check(generated):
+def test_a_generated_data_set_passes_its_check_and_its_runs_are_what_a_user_gets(generated):
     _, folder = generated
     assert check_dataset(folder) == []
 
-
-def test_its_runs_are_what_a_user_gets_from_the_scene(generated):
     config, folder = generated
     plan = make_plan(config)[1]
     simulation = read_shard(folder / f"{plan.name}.h5").simulations[1]

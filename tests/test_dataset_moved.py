@@ -94,7 +94,9 @@ def test_problems_are_rebuilt_on_the_mesh_of_the_file(mesh_file, moved, run):
         np.testing.assert_allclose(first, stored, atol=1e-7)
 
 
-def test_files_with_an_absolute_path_are_read_as_ever(moved, tmp_path):
+def test_scenes_with_an_absolute_path_are_read_and_those_taken_out_ask_for_their_mesh(
+    moved, tmp_path
+):
     path = moved / "training" / "mesh-0000.h5"
     shard = read_shard(path)
     (simulation,) = shard.simulations
@@ -104,8 +106,6 @@ def test_files_with_an_absolute_path_are_read_as_ever(moved, tmp_path):
     (problem,) = rebuilt_problems(before, path)
     np.testing.assert_array_equal(problem.positions, shard.points)
 
-
-def test_a_scene_taken_out_of_a_data_set_asks_for_its_mesh(moved):
     shard = read_shard(moved / "training" / "mesh-0000.h5")
     scene = pc.Scene.from_toml(shard.simulations[0].scene_toml)
     with pytest.raises(MeshError, match=r"bracket\.vtu"):

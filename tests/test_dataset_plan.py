@@ -113,7 +113,7 @@ def test_plans_and_loads_depend_on_nothing_but_the_configuration():
     assert any('"stiffer" here' in row for row in one.differences(other))
 
 
-def test_splits_are_by_mesh_and_have_the_sizes_asked_for():
+def test_splits_are_by_mesh_and_extra_ones_leave_the_training_distribution_as_told():
     config = small(
         coarse_nodes=[72, 200],
         training={"meshes": 20, "simulations": 50},
@@ -130,8 +130,6 @@ def test_splits_are_by_mesh_and_have_the_sizes_asked_for():
     keys = [p.design.key() for p in plans]
     assert len(set(keys)) == len(keys)
 
-
-def test_extra_splits_leave_the_training_distribution_as_told():
     config = small(
         extra=[
             {"name": "stiff", "meshes": 1, "simulations": 1, "young": [1e6, 1e6]},

@@ -132,22 +132,6 @@ def test_edges_are_those_of_the_cells_and_values_of_nodes_are_means_over_cells(f
     assert means[[0, 1, 8]].tolist() == [1.0, 2.0, 3.0]
 
 
-def test_samples_are_copies_and_no_file_stays_open(folder, tmp_path):
-    dataset = opened(folder)
-    before = dataset[3].positions.clone()
-    dataset[3].positions.zero_()
-    dataset.batch([3]).positions.zero_()
-    assert torch.equal(dataset[3].positions, before)
-
-    shutil.copytree(folder, tmp_path / "set")
-    dataset = opened(tmp_path / "set")
-    expected = dataset.batch([0, 40])
-    shutil.rmtree(tmp_path / "set")
-    same(dataset.batch([0, 40]), expected)
-    with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
-        dataset[20]
-
-
 def test_numbers_come_in_the_type_asked_for_and_are_stored_in_the_files_own(folder, tmp_path):
     found = TrajectoryDataset(folder, "training")[0]
     assert {found[n].dtype for n in ("positions", "velocities", "rest", "young", "time")} == {
@@ -264,7 +248,7 @@ def test_workers_hand_out_what_one_process_does(folder, method, count):
     assert sorted(places(shared)) == sorted(places(TrajectoryLoader(dataset, 48)))
 
 
-def test_a_pickled_data_set_starts_with_an_empty_memory(folder):
+def test_samples_are_copies_and_neither_files_nor_memory_are_passed_on(folder, tmp_path):
     dataset = opened(folder)
     expected = dataset.batch([0, 40])
     blob = pickle.dumps(dataset)
@@ -272,6 +256,20 @@ def test_a_pickled_data_set_starts_with_an_empty_memory(folder):
     copy = pickle.loads(blob)
     assert copy._shards.bytes == len(copy._shards) == 0
     same(copy.batch([0, 40]), expected)
+
+    dataset = opened(folder)
+    before = dataset[3].positions.clone()
+    dataset[3].positions.zero_()
+    dataset.batch([3]).positions.zero_()
+    assert torch.equal(dataset[3].positions, before)
+
+    shutil.copytree(folder, tmp_path / "set")
+    dataset = opened(tmp_path / "set")
+    expected = dataset.batch([0, 40])
+    shutil.rmtree(tmp_path / "set")
+    same(dataset.batch([0, 40]), expected)
+    with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
+        dataset[20]
 
 
 def test_memory_keeps_to_its_bound_and_the_least_recently_used_file_goes_first(folder):

@@ -33,7 +33,7 @@ def work(unit):
     return sum(generate._work(SHARED, plan) for plan in unit)
 
 
-def test_every_mesh_is_in_one_unit_with_others_of_its_split_and_the_longest_come_first():
+def test_every_mesh_is_in_one_unit_of_its_split_and_many_steps_make_small_units():
     plans, found = units()
     names = [plan.name for unit in found for plan in unit]
     assert sorted(names) == sorted(plan.name for plan in plans)
@@ -44,8 +44,6 @@ def test_every_mesh_is_in_one_unit_with_others_of_its_split_and_the_longest_come
         sizes = [sum(plan.simulations for plan in unit) for unit in units(batch)[1]]
         assert 0.8 * batch < max(sizes) <= batch
 
-
-def test_a_unit_with_many_steps_holds_few_simulations():
     found = units()[1]
     longest = {
         name: max(sum(p.simulations for p in unit) for unit in found if unit[0].split == name)
@@ -57,17 +55,15 @@ def test_a_unit_with_many_steps_holds_few_simulations():
     assert max(map(work, found)) < 4.5 * usual
 
 
-def test_on_a_cpu_meshes_are_computed_one_by_one_and_in_order():
-    plans = make_plan(SHARED)
-    assert generate._units(SHARED, plans, Workers(2)) == [[plan] for plan in plans]
-
-
-def test_work_counts_the_refined_nodes_of_all_steps():
+def test_work_counts_the_refined_nodes_of_all_steps_and_a_cpu_takes_meshes_in_order():
     by_split = {plan.split: plan for plan in make_plan(SHARED)}
     models = 2 * 2  # plain and best, each a rollout and single steps
     assert work_per_node(SHARED, by_split["training"]) == 10 * (64 + models)
     assert work_per_node(SHARED, by_split["evaluation"]) == 10 * (64 + models + 8 + 16 * 64)
     assert work_per_node(SHARED, by_split["long"]) == 50 * (64 + models + 8)
+
+    plans = make_plan(SHARED)
+    assert generate._units(SHARED, plans, Workers(2)) == [[plan] for plan in plans]
 
 
 @pytest.fixture

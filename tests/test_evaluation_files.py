@@ -292,8 +292,6 @@ def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged, p
     assert status == 0
     assert "refused (" not in out
 
-
-def test_bad_input_is_told_in_a_sentence(tmp_path, program):
     for arguments, words in (
         ((tmp_path / "none", TINY), "none"),
         ((tmp_path,), tmp_path.name),

@@ -181,7 +181,7 @@ def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlie
 # --- weights and ranges of the start ----------------------------------------------------------
 
 
-def test_a_training_starts_from_a_models_weights_and_normalisation(earlier, tmp_path):
+def test_a_training_starts_from_a_models_weights_and_its_ranges_grow(earlier, tmp_path, data):
     new = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
     config = samples.config(samples.one_step(), start_from=str(earlier))
     before = load_model(earlier).corrector
@@ -203,6 +203,19 @@ def test_a_training_starts_from_a_models_weights_and_normalisation(earlier, tmp_
     assert found.record.training["config"]["start_from"] == str(earlier)
     assert found.data_sets == load_model(earlier).data_sets  # of one configuration
 
+    config = samples.config(samples.one_step(), start_from=str(earlier))
+    training = Training(config, data, tmp_path / "same")
+    known = training.corrector.normaliser
+    fitted = known.get_buffer("deformation__high").clone()
+    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
+    further = {name: RunningMoments() for name in known.names}
+    for name, moments in further.items():
+        width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
+        moments.add(torch.full((1, width), 1e3))
+    known.widen(further)
+    assert known.get_buffer("deformation__high") == 1e3
+    assert known.get_buffer("deformation__low") < fitted
+
 
 def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, tmp_path):
     new = samples.dataset(tmp_path / "data", training=(3,), validation=(1,), frames=4)
@@ -217,21 +230,6 @@ def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, t
     found = load_model(tmp_path / "out" / "model")
     assert found.data_sets == [before, ("other", "0" * 64)]
     assert found.record.dataset == "tiny+other"
-
-
-def test_the_ranges_of_a_start_grow_by_the_new_data(data, earlier, tmp_path):
-    config = samples.config(samples.one_step(), start_from=str(earlier))
-    training = Training(config, data, tmp_path / "same")
-    known = training.corrector.normaliser
-    fitted = known.get_buffer("deformation__high").clone()
-    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
-    further = {name: RunningMoments() for name in known.names}
-    for name, moments in further.items():
-        width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
-        moments.add(torch.full((1, width), 1e3))
-    known.widen(further)
-    assert known.get_buffer("deformation__high") == 1e3
-    assert known.get_buffer("deformation__low") < fitted
 
 
 def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(data, earlier, tmp_path):

@@ -94,7 +94,7 @@ def test_steps_of_several_data_sets_are_those_of_each(folders, resident, remembe
         begin += len(alone.dataset)
 
 
-def test_recordings_of_several_data_sets_have_their_own_bodies(folders):
+def test_recordings_of_several_data_sets_have_their_own_bodies_and_ranks_share_them(folders):
     recordings = load_recordings(folders, "training", "plain")
     assert [r.dataset for r in recordings] == ["tiny"] + ["other"] * 4
     assert recordings[0].name == "tiny, training/mesh-0000/0"
@@ -113,6 +113,12 @@ def test_recordings_of_several_data_sets_have_their_own_bodies(folders):
     assert names == [r.name for r in recordings]
     with pytest.raises(InputError, match="meshes = 0"):
         load_recordings(folders, "training", "plain", meshes=0)
+
+    recordings = load_recordings(folders, "training", "plain")
+    of_ranks = [grouped(recordings, 2, seed=0, rank=rank, world_size=2) for rank in (0, 1)]
+    names = sorted(r.name for groups in of_ranks for group in groups for r in group)
+    assert names == sorted(r.name for r in recordings)
+    assert len(set(names)) == 5
 
 
 def test_rollouts_of_unlike_lengths_have_the_omegas_that_they_have_alone(folders):
@@ -277,31 +283,6 @@ def test_the_command_takes_several_data_sets_and_judges_each(folders, program, t
         assert json.loads(path.read_text())["data"]["name"] == name
 
 
-def test_sets_that_one_batch_cannot_hold_are_refused_by_what_differs(folders, tmp_path):
-    other = tmp_path / "other"
-    (other / "training").mkdir(parents=True)
-    shard = read_shard(folders[1] / "training" / "mesh-0000.h5")
-    step = 2.0 * shard.attributes["time_step"]
-    simulations = tuple(
-        replace(s, scene_toml=doubled(s.scene_toml, step)) for s in shard.simulations
-    )
-    write_shard(
-        other / "training" / "mesh-0000.h5",
-        replace(shard, simulations=simulations, attributes={**shard.attributes, "time_step": step}),
-        "float32",
-    )
-    without = tmp_path / "without" / "training"
-    without.mkdir(parents=True)
-    shutil.copy(folders[0] / "training" / "mesh-0000.h5", without)
-    config = settings(samples.one_step(iterations=2))
-    told = r"mesh-0000\.h5: time_step 0\.02, .*0\.01 of .*mesh-0000\.h5"
-    with pytest.raises(InputError, match=told):
-        Training(config, (without.parent, other), tmp_path / "out")
-    recordings = load_recordings((without.parent, other), "training", "plain")
-    with pytest.raises(InputError, match=r"time\.step"):
-        SceneGroup(recordings, "plain", "cpu")
-
-
 def test_sets_that_do_not_go_together_are_refused(folders, program, tmp_path):
     recipe = tmp_path / "recipe.toml"
     config = settings(samples.one_step(iterations=2))
@@ -322,17 +303,32 @@ def test_sets_that_do_not_go_together_are_refused(folders, program, tmp_path):
         with pytest.raises(InputError, match="4 simulations"):
             StepWindows(folders[1], wrong, config.architecture(), "plain")
 
+    other = tmp_path / "other"
+    (other / "training").mkdir(parents=True)
+    shard = read_shard(folders[1] / "training" / "mesh-0000.h5")
+    step = 2.0 * shard.attributes["time_step"]
+    simulations = tuple(
+        replace(s, scene_toml=doubled(s.scene_toml, step)) for s in shard.simulations
+    )
+    write_shard(
+        other / "training" / "mesh-0000.h5",
+        replace(shard, simulations=simulations, attributes={**shard.attributes, "time_step": step}),
+        "float32",
+    )
+    without = tmp_path / "another step" / "training"
+    without.mkdir(parents=True)
+    shutil.copy(folders[0] / "training" / "mesh-0000.h5", without)
+    config = settings(samples.one_step(iterations=2))
+    told = r"mesh-0000\.h5: time_step 0\.02, .*0\.01 of .*mesh-0000\.h5"
+    with pytest.raises(InputError, match=told):
+        Training(config, (without.parent, other), tmp_path / "out")
+    recordings = load_recordings((without.parent, other), "training", "plain")
+    with pytest.raises(InputError, match=r"time\.step"):
+        SceneGroup(recordings, "plain", "cpu")
+
 
 def doubled(text, step):
     return pc.Scene.from_toml(text).with_changes(time={"step": step}).to_toml()
-
-
-def test_ranks_share_the_groups_of_all_data_sets(folders):
-    recordings = load_recordings(folders, "training", "plain")
-    of_ranks = [grouped(recordings, 2, seed=0, rank=rank, world_size=2) for rank in (0, 1)]
-    names = sorted(r.name for groups in of_ranks for group in groups for r in group)
-    assert names == sorted(r.name for r in recordings)
-    assert len(set(names)) == 5
 
 
 RECIPES = MODELS / "recipes"
