@@ -19,7 +19,7 @@ from pdcorrect.batch import gpu as recording
 from pdcorrect.batch.cells import Sizes
 from pdcorrect.batch.gpu import tall_product
 from pdcorrect.batch.points import Points
-from pdcorrect.batch.sharing import DistinctBodies
+from pdcorrect.batch.shared_matrices import DistinctBodies
 from pdcorrect.batch.states import expected_bytes
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies

@@ -18,7 +18,7 @@ from pdcorrect.corrector.compiled_network import Groups
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.products import normalise, product, strips
+from pdcorrect.corrector.matrix_products import normalise, product, strips
 
 CROSS = {
     "shape": "cross", "cells": [6, 2, 2], "cell_size": 0.05, "arms": 4, "arm_start": 2,

@@ -24,7 +24,7 @@ from hybrid_samples import (
 )
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
-from pdcorrect.corrector.decision import Decision
+from pdcorrect.corrector.corrected_step import Decision
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.corrector.pause import PAUSE

@@ -19,7 +19,7 @@ from pdcorrect.corrector import recorded  # noqa: E402
 from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.features import FeatureView, Snapshot  # noqa: E402
 from pdcorrect.corrector.gate import Reason  # noqa: E402
-from pdcorrect.corrector.recorded import RecordedCorrector, recordable  # noqa: E402
+from pdcorrect.corrector.graph_replay import RecordedCorrector, recordable  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 
 DEVICES = [

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdcorrect.data.config import DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.produce import make_engines
@@ -49,7 +49,7 @@ def kill_after(count, folder, workers):
     """
     psutil = pytest.importorskip("psutil")
     command = [
-        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", TINY / "config.toml",
+        sys.executable, "-m", "pdcorrect", "dataset", "generate", TINY / "config.toml",
         "-o", folder, "--workers", str(workers),
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -79,7 +79,7 @@ def test_one_worker_and_two_that_were_killed_compute_the_same_whole_set(tmp_path
     finished = kill_after(4, tmp_path / "two", workers=2)
     assert 4 <= len(finished) < len(make_plan(config))
     command = [
-        sys.executable, "-m", "pdcorrect.cli.main", "dataset", "generate", TINY / "config.toml",
+        sys.executable, "-m", "pdcorrect", "dataset", "generate", TINY / "config.toml",
         "-o", tmp_path / "two", "--workers", "2",
     ]  # fmt: skip
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

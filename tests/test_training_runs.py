@@ -18,13 +18,13 @@ import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.gate import Gate  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
 from pdcorrect.errors import ConvergenceError  # noqa: E402
+from pdcorrect.training.batch_losses import OneStepBatches  # noqa: E402
 from pdcorrect.training.checkpoints import read_checkpoint  # noqa: E402
-from pdcorrect.training.distributed import World  # noqa: E402
+from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from pdcorrect.training.recordings import load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroups  # noqa: E402
-from pdcorrect.training.sources import OneStepBatches  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Scores, Validation  # noqa: E402
 from training_samples import weights  # noqa: E402
@@ -241,11 +241,11 @@ def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
     corrector = Training(settings, folder, tmp_path / "one").corrector
     windows, _ = samples.windows(folder, settings)
     stage = settings.stages[0]
-    optimiser = Optimiser(corrector, stage, None, World())
-    from pdcorrect.training.sources import make_source
+    optimiser = Optimiser(corrector, stage, None, ProcessGroup())
+    from pdcorrect.training.batch_losses import make_source
 
     parts = [
-        make_source(stage, 0, settings, windows, SceneGroups([], "plain"), World(rank, 2))
+        make_source(stage, 0, settings, windows, SceneGroups([], "plain"), ProcessGroup(rank, 2))
         for rank in (0, 1)
     ]
     for k in range(3):

@@ -12,10 +12,10 @@ import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
 from pdcorrect.corrector.features import FeatureView  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
-from pdcorrect.training.distributed import World  # noqa: E402
+from pdcorrect.training.batch_losses import one_step_loss  # noqa: E402
+from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
-from pdcorrect.training.sources import one_step_loss  # noqa: E402
 from training_samples import weights  # noqa: E402
 
 
@@ -293,7 +293,7 @@ def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers)
 def test_batches_without_a_finite_gradient_change_nothing_and_are_counted(folder):
     settings = samples.config(samples.one_step())
     corrector = samples.fitted(folder, settings)
-    optimiser = Optimiser(corrector, settings.stages[0], None, World())
+    optimiser = Optimiser(corrector, settings.stages[0], None, ProcessGroup())
     some = next(iter(corrector.network.parameters()))
 
     def loss(factor):
@@ -322,7 +322,7 @@ def test_gradients_are_clipped_and_averaged_weights_follow_by_their_decay(folder
     settings = samples.config(samples.one_step(clip=0.25, ema=0.75))
     corrector, averaged = samples.fitted(folder, settings), samples.fitted(folder, settings)
     before = weights(averaged)
-    optimiser = Optimiser(corrector, settings.stages[0], averaged, World())
+    optimiser = Optimiser(corrector, settings.stages[0], averaged, ProcessGroup())
     optimiser.step(1e3 * sum(p.square().sum() for p in corrector.network.parameters()), 0.5)
     grads = [p.grad for p in corrector.network.parameters()]
     assert float(torch.nn.utils.get_total_norm(grads)) == pytest.approx(0.25, rel=1e-4)

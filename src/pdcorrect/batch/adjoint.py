@@ -15,7 +15,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.implicit import positive
-from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.schemes import Linear
 
 
 class BatchGradients:

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
-from pdcorrect.batch.levels import places
+from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.sharing import DistinctBodies, with_rows
+from pdcorrect.batch.shared_matrices import DistinctBodies, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 

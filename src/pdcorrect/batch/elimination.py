@@ -11,7 +11,7 @@ from torch import Tensor, cat
 
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.gpu import small_products, tall_product
-from pdcorrect.batch.sharing import Sharing, with_rows
+from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
 

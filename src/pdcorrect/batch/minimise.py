@@ -20,11 +20,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.first_hessian import FirstHessian
 from pdcorrect.batch.gpu import Recorder, as_kernel
-from pdcorrect.batch.inverses import FirstHessian
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement, node_dot
-from pdcorrect.batch.sharing import with_rows
+from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.solvers.minimise import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
 
 _CURVATURE = 1e-12
@@ -164,7 +164,7 @@ class Phase(IntEnum):
 
 
 @dataclass
-class Improved:
+class LbfgsInverse:
     """The first Hessian's inverse, improved by the pairs of the steps since the start."""
 
     inverse: FirstHessian
@@ -221,7 +221,7 @@ class BatchMinimiser:
         self._narrows = rest.device.type == "cpu" and scenes >= _FEW
         self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        improved = Improved(inverse, self._history)
+        improved = LbfgsInverse(inverse, self._history)
         self.linear_solver = BatchConjugateGradients(objective, improved, recorder)
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._next)

@@ -20,8 +20,8 @@ from torch import Tensor
 from pdcorrect.batch.cells import padded
 from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
 from pdcorrect.batch.gpu import as_kernel, rows_of, sums
-from pdcorrect.batch.levels import Level, Numbers, hierarchy, places, table
-from pdcorrect.batch.sharing import Sharing, with_rows
+from pdcorrect.batch.mesh_levels import Level, Numbers, hierarchy, places, table
+from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]

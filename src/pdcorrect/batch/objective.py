@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.gpu import as_kernel, small_products
-from pdcorrect.batch.sharing import with_rows
+from pdcorrect.batch.shared_matrices import with_rows
 
 
 class BatchMass:

@@ -26,16 +26,16 @@ from pdcorrect.batch.checks import (
     usable_device,
 )
 from pdcorrect.batch.elimination import alike_cells
-from pdcorrect.batch.inverses import BatchHessian, FirstHessian, chosen
+from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
-from pdcorrect.batch.sharing import Sharing
-from pdcorrect.batch.stage import BatchStage, BatchStaging
+from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
+from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
 from pdcorrect.batch.threads import one_thread
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import positive, whole
@@ -339,7 +339,7 @@ class BatchStepper:
             ratios,
         )
 
-    def prepare(self, state: BatchState, forces: Tensor | None = None) -> BatchStage:
+    def prepare(self, state: BatchState, forces: Tensor | None = None) -> BatchStepEquation:
         """Set up the step's objective and first Hessian."""
         check_state(self.cells, state)
         if forces is not None:

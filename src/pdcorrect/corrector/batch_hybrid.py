@@ -19,19 +19,19 @@ from pdcorrect.batch.states import BatchResult, BatchState, chosen, state_of
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_bodies import BatchBodies, check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.corrected_step import corrected_step
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.decision import corrected_step
 from pdcorrect.corrector.features import FeatureView
 from pdcorrect.corrector.gate import Gate, GateMeasures, check_gate
-from pdcorrect.corrector.pause import PAUSE, steps_left
-from pdcorrect.corrector.placements import Values, Velocity, check_velocity, moved
-from pdcorrect.corrector.recorded import (
+from pdcorrect.corrector.graph_replay import (
     UNRECORDABLE,
     RecordedCorrector,
     RecordedMeasures,
     recordable,
     stored_and_ratios,
 )
+from pdcorrect.corrector.pause import PAUSE, steps_left
+from pdcorrect.corrector.placements import Values, Velocity, check_velocity, moved
 from pdcorrect.errors import InputError
 
 

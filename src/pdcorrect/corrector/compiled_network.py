@@ -13,8 +13,8 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from pdcorrect.corrector.matrix_products import EPSILON, ROWS, filled_up, normalise, product, strips
 from pdcorrect.corrector.network import MeshGraphNetwork
-from pdcorrect.corrector.products import EPSILON, ROWS, filled_up, normalise, product, strips
 from pdcorrect.fem.kernels import PARALLEL, REDUCE
 
 Array = NDArray[Any]

@@ -21,8 +21,8 @@ from pdcorrect.batch.threads import one_thread
 from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
+from pdcorrect.corrector.corrected_step import Decision, corrected_step
 from pdcorrect.corrector.corrector import Answers, Corrector
-from pdcorrect.corrector.decision import Decision, corrected_step
 from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.corrector.pause import PAUSE, steps_left

@@ -26,7 +26,7 @@ from pdcorrect.solvers.adjoint_terms import (
 )
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.integrators import Integrator
-from pdcorrect.solvers.linear import Linear
+from pdcorrect.solvers.schemes import Linear
 from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
 from pdcorrect.state import State
 

@@ -18,8 +18,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
-from pdcorrect.solvers.linear import Linear, by_component
-from pdcorrect.solvers.schemes import Scheme, SchemeOf
+from pdcorrect.solvers.schemes import Linear, Scheme, SchemeOf, by_component
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]

@@ -240,7 +240,7 @@ def minimise(
 
 
 @dataclass(eq=False)
-class Found:
+class LineSearchResult:
     """Outcome of a line search; ``step`` 0 means none was found."""
 
     step: float
@@ -257,7 +257,7 @@ def line_search(
     gradient: Array,
     direction: Array,
     search: bool = True,
-) -> Found:
+) -> LineSearchResult:
     """Backtracking until gamma falls (Armijo).
 
     Where the fall is lost in round-off, the slope decides (approximate Wolfe
@@ -273,13 +273,13 @@ def line_search(
             new_value, new_gradient = objective.value_and_gradient(trial)
             fall = new_value - value
             if fall <= ARMIJO * step * slope or not search:
-                return Found(step, trial, new_value, new_gradient, tried)
+                return LineSearchResult(step, trial, new_value, new_gradient, tried)
             if abs(fall) <= noise and float(np.vdot(new_gradient, direction)) <= -0.8 * slope:
-                return Found(step, trial, new_value, new_gradient, tried)
+                return LineSearchResult(step, trial, new_value, new_gradient, tried)
             curvature = 2.0 * (fall - step * slope) / step**2
             best = -slope / curvature if math.isfinite(curvature) and curvature > 0 else 0.0
             step = min(max(best, 0.1 * step), 0.5 * step)
-    return Found(0.0, p, value, gradient, tried)
+    return LineSearchResult(0.0, p, value, gradient, tried)
 
 
 def largest_displacement(x: Array) -> float:

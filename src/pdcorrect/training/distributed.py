@@ -1,4 +1,4 @@
-"""`World`: the processes that train together, each on its own part of the data."""
+"""`ProcessGroup`: the processes that train together, each on its own part of the data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pdcorrect.errors import InputError
 
 
 @dataclass(frozen=True)
-class World:
+class ProcessGroup:
     """A process among others, as ``torchrun`` started them; alone by default.
 
     Attributes
@@ -64,7 +64,7 @@ class World:
 
 
 @contextlib.contextmanager
-def joined(device: str) -> Iterator[tuple[World, str]]:
+def joined(device: str) -> Iterator[tuple[ProcessGroup, str]]:
     """The world that ``torchrun`` describes in the environment, and this process's device.
 
     Raises
@@ -74,7 +74,7 @@ def joined(device: str) -> Iterator[tuple[World, str]]:
     """
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
-        yield World(), device
+        yield ProcessGroup(), device
         return
     if device.startswith("cuda:"):
         raise InputError(
@@ -92,6 +92,6 @@ def joined(device: str) -> Iterator[tuple[World, str]]:
         torch.cuda.set_device(local)
     dist.init_process_group("cpu:gloo,cuda:nccl" if device.startswith("cuda") else "gloo")
     try:
-        yield World(dist.get_rank(), size), device
+        yield ProcessGroup(dist.get_rank(), size), device
     finally:
         dist.destroy_process_group()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.training.distributed import World
+from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.recipe import Rate, Stage
 
 _TOLD = ("loss_sum", "count", "skipped", "row", "longest")
@@ -39,7 +39,7 @@ class Optimiser:
     stage : Stage
     averaged : Corrector or None
         Takes the averaged weights, if the stage wants them.
-    world : World
+    world : ProcessGroup
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Optimiser:
     """
 
     def __init__(
-        self, corrector: Corrector, stage: Stage, averaged: Corrector | None, world: World
+        self, corrector: Corrector, stage: Stage, averaged: Corrector | None, world: ProcessGroup
     ) -> None:
         self._names = [name for name, _ in corrector.network.named_parameters()]
         self._weights: list[Tensor] = [p for _, p in corrector.network.named_parameters()]

@@ -24,9 +24,10 @@ from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.training.batch_losses import Source, make_source, share_done
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.distillation import load_start, load_teachers
-from pdcorrect.training.distributed import World
+from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
 from pdcorrect.training.history import HistoryFile
 from pdcorrect.training.lineage import lineage_of
@@ -35,7 +36,6 @@ from pdcorrect.training.progress import Progress, check_same
 from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
-from pdcorrect.training.sources import Source, make_source, share_done
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 
@@ -61,7 +61,7 @@ class Training:
         Go on from the checkpoint, if there is one.
     incomplete : bool
         Take the files that are there, if the data set's configuration asks for more.
-    world : World
+    world : ProcessGroup
     on_report : callable, optional
         Called with each row of the history.
 
@@ -93,10 +93,10 @@ class Training:
         device: str = "cpu",
         resume: bool = False,
         incomplete: bool = False,
-        world: World | None = None,
+        world: ProcessGroup | None = None,
         on_report: Report | None = None,
     ) -> None:
-        self.config, self.world = config, World() if world is None else world
+        self.config, self.world = config, ProcessGroup() if world is None else world
         self.device = usable_device(device)
         self.output, self._on_report = Path(output), on_report
         data = folders_of(data)

@@ -20,7 +20,7 @@ from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
 from pdcorrect.fem.problem import Base
-from pdcorrect.training.distributed import World
+from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.recordings import Recording, rounding
 from pdcorrect.training.scenes import SceneGroup
 
@@ -85,10 +85,10 @@ class Validation:
         *,
         velocity: Velocity = "recomputed",
         device: str | torch.device = "cpu",
-        world: World | None = None,
+        world: ProcessGroup | None = None,
     ) -> None:
         self.recordings, self._velocity = tuple(recordings), velocity
-        self._world = World() if world is None else world
+        self._world = ProcessGroup() if world is None else world
         self._numbers = range(self._world.rank, len(recordings), self._world.size)
         own = [recordings[i] for i in self._numbers]
         self._group = SceneGroup(own, base, device) if own else None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.training.distributed import World
+from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses
 from pdcorrect.training.precision import network_precision
 from pdcorrect.training.recipe import Stage, TrainingConfig
@@ -46,10 +46,10 @@ class OneStepBatches:
     windows : StepWindows
     stage : Stage
     seed : int
-    world : World
+    world : ProcessGroup
     """
 
-    def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: World) -> None:
+    def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
         self._batches = windows.batches(
             stage.batch, seed=seed, rank=world.rank, world_size=world.size
         )
@@ -94,7 +94,7 @@ def make_source(
     config: TrainingConfig,
     windows: StepWindows,
     groups: SceneGroups,
-    world: World,
+    world: ProcessGroup,
     teacher: Corrector | None = None,
 ) -> Source:
     """The source of stage ``number`` of a training."""

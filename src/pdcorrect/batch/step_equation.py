@@ -17,12 +17,11 @@ from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import Integrator, equal_steps, nodal_solution
-from pdcorrect.solvers.linear import Linear, by_component
-from pdcorrect.solvers.schemes import Scheme
+from pdcorrect.solvers.schemes import Linear, Scheme, by_component
 
 
 @dataclass(frozen=True, eq=False)
-class BatchStage:
+class BatchStepEquation:
     """One step's equation and what it was made of.
 
     Attributes
@@ -72,13 +71,13 @@ class BatchStaging:
             return nodal
         return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
 
-    def __call__(self, state: BatchState) -> BatchStage:
+    def __call__(self, state: BatchState) -> BatchStepEquation:
         """The step from a state."""
         scheme = self._scheme(state)
         known = self._known(scheme, state)
         first, last = scheme.loads_over
         h = self._h
-        return BatchStage(
+        return BatchStepEquation(
             scheme,
             known,
             [(t + first * h, t + last * h) for t in state.times],
@@ -86,7 +85,7 @@ class BatchStaging:
             self.extended(self._split(known, scheme.origin, scheme.clamped_origin)),
         )
 
-    def start(self, stage: BatchStage, guess: Tensor | None = None) -> Tensor:
+    def start(self, stage: BatchStepEquation, guess: Tensor | None = None) -> Tensor:
         """First iterate (B, U, 3), prescribed where clamped.
 
         Where positions after the step are ``guess`` (B, N, 3), in scenes where it is finite.
@@ -99,7 +98,7 @@ class BatchStaging:
             nodal = torch.where(usable & self.free, y, nodal)
         return self.extended(nodal)
 
-    def finish(self, stage: BatchStage, y: Tensor, state: BatchState) -> BatchState:
+    def finish(self, stage: BatchStepEquation, y: Tensor, state: BatchState) -> BatchState:
         """The state after the step from ``state`` with solution y (B, U, 3).
 
         Its tensors share no memory with others.

@@ -32,7 +32,7 @@ from pdcorrect.batch.elimination import (
 )
 from pdcorrect.batch.gpu import as_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
-from pdcorrect.batch.sharing import Sharing, with_rows
+from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
