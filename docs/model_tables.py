@@ -74,7 +74,11 @@ def minutes(model: str) -> float:
 
 
 def recipe_of(name: str) -> dict[str, Any]:
-    return tomllib.loads((ROOT / f"models/recipes/{name}.toml").read_text(encoding="utf-8"))
+    return _toml(f"models/recipes/{name}.toml")
+
+
+def _toml(path: str) -> dict[str, Any]:
+    return tomllib.loads((ROOT / path).read_text(encoding="utf-8"))
 
 
 def start_of(name: str) -> str | None:
@@ -117,6 +121,17 @@ def card(model: str) -> Rows:
     return ("run", "Ω mean", "95 %", "worst", "RMS, mm", "stress error, %"), rows
 
 
+def knows(model: str) -> list[str]:
+    """Bodies, load and time step over cell size of the data sets that a model learned from."""
+    names = read(f"models/{model}/model.json")["record"]["dataset"].split("+")
+    sets = [_toml(f"datasets/{name}/config.toml") for name in names]
+    cells = [
+        (each["family"], each["motion"]["kind"], f"{each['step'] / each['cell_size']:.2g}")
+        for each in sets
+    ]
+    return [", ".join(dict.fromkeys(column)) for column in zip(*cells, strict=True)]
+
+
 def results() -> Rows:
     """The six models beside the thesis, their base and the intermediate mesh."""
     rows = []
@@ -127,14 +142,15 @@ def results() -> Rows:
         thesis = THESIS[model.partition("-")[0]]
         exact = model in EXACT
         rows.append([
-            f"`{model}`", base_of(record), f"({thesis})" if exact else f"{thesis}",
+            f"`{model}`", *knows(model), base_of(record),
+            f"({thesis})" if exact else f"{thesis}",
             f"**{percent(omega['mean'])}**", interval(omega["interval"]),
             percent(omega["smallest"]), percent(runs[record["base"]]["omega"]["mean"]),
             percent(runs["intermediate"]["omega"]["mean"]),
             number(1e3 * runs["corrected"]["rms_error"]),
         ])  # fmt: skip
-    head = ("model", "corrects", "thesis", "Ω mean", "95 %", "worst", "base alone",
-            "intermediate mesh", "RMS, mm")  # fmt: skip
+    head = ("model", "bodies", "load", "step over cell", "corrects", "thesis", "Ω mean", "95 %",
+            "worst", "base alone", "intermediate mesh", "RMS, mm")  # fmt: skip
     return head, rows
 
 

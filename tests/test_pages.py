@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from pdcorrect import Scene
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```(python|sh|toml)\n(.*?)^```", re.S | re.M)
@@ -39,7 +41,7 @@ def test_snippets_and_commands_run(page, checkout, program):
         elif language == "toml":
             from pdcorrect.data.configuration import DatasetConfig
 
-            DatasetConfig.from_toml(text)
+            (Scene if "[body]" in text else DatasetConfig).from_toml(text)
         else:
             for line in text.splitlines():
                 _run(shlex.split(line, comments=True), program)
