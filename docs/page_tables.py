@@ -14,8 +14,8 @@ _METHODS = {
     "hybrid, {}-exact": "corrected best coarse",
     "plain 2×2×2": "intermediate PD (2×2×2)",
     "hex27": "27-node elements, coarse cells",
-    "best 2×2×2": "better element, 2×2×2",
-    "best 4×4×4": "better element, 4×4×4",
+    "best 2×2×2": "`hex8-bubble-mean`, 2×2×2",
+    "best 4×4×4": "`hex8-bubble-mean`, 4×4×4",
 }
 _INTEGRATORS = ("backward-euler", "bdf2", "generalised-alpha", "midpoint")
 _MESHES = {
@@ -86,7 +86,7 @@ def own_body_runs() -> Rows:
         "best coarse": "best coarse model",
         "hybrid": "fine-tuned corrector",
         "intermediate": "intermediate mesh (plain, 2×2×2)",
-        "fine": "fine (better element, 3×3×3)",
+        "fine": "fine (`hex8-bubble-mean`, 3×3×3)",
     }
     runs = {row["run"]: row for row in read(_OWN)["rows"]}
     header = ("first evaluation simulation", "nodes", "RMS, mm", "ms a frame")
