@@ -29,10 +29,10 @@ import numba
 import numpy as np
 import torch
 from machine_file import add
+from network_cost import flops
 
 import pdcorrect as pc
 from pdcorrect.corrector import features
-from pdcorrect.corrector import model_io as cost
 from pdcorrect.corrector.architecture import PRESETS
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
@@ -118,12 +118,12 @@ def measure(name: str, body: str, threads: int, calls: int, warm: int) -> dict[s
             }
         times = {key: timed(function, calls, warm) for key, function in taken.items()}
     times |= steps(corrector, body, step, calls, warm)
-    flops = cost.flops(corrector.config, n, e)
+    operations = flops(corrector.config, n, e)
     row = {
         "preset": name, "body": body, "nodes": n, "edges": e, "threads": threads,
-        "parameters": cost.parameters(corrector.config), "flops": flops,
+        "parameters": sum(p.numel() for p in corrector.parameters()), "flops": operations,
         **{key: middle for key, (middle, _) in times.items()},
-        "network_gflops_a_second": 1e-6 * flops / times["network_ms"][0],
+        "network_gflops_a_second": 1e-6 * operations / times["network_ms"][0],
         **{
             f"{kind}correction_to_coarse": times[f"{kind}correction_ms"][0]
             / times[f"{kind}coarse_ms"][0]

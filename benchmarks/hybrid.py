@@ -21,6 +21,7 @@ from typing import Any
 
 import torch
 from machine_file import add
+from speed import measure_speed
 
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
@@ -33,7 +34,6 @@ from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import models, rebuilt_problems
 from pdcorrect.evaluation.candidates import saved_candidates
-from pdcorrect.evaluation.speed import measure_speed
 from pdcorrect.fem.problem import Problem, coarse_model, discretise
 from pdcorrect.scene import best_coarse
 

@@ -1,13 +1,10 @@
 """Small synthetic data sets: smooth motions of box meshes, without a solver."""
 
-import os
-import signal
 from dataclasses import replace
 
 import numpy as np
 
 from conftest import box_mesh
-from pdcorrect.data import statistics
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
 
 STEP = 0.02
@@ -88,10 +85,3 @@ def dataset(folder, splits=("training", "validation", "evaluation"), dtype="floa
 def changed(one, **changes):
     """The same shard with other arrays."""
     return replace(one, **changes)
-
-
-def parts_of_no_other_process(path, process):
-    """Statistics of parts of a file; any other process than the one given is killed."""
-    if os.getpid() != process:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return statistics._parts(path, ["plain"])

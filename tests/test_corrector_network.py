@@ -1,6 +1,8 @@
 """Symmetries, derivatives, network and cost of the corrector."""
 
+import importlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +16,6 @@ import network_samples as samples  # noqa: E402
 from block_meshes import o_grid  # noqa: E402
 from conftest import rotation  # noqa: E402
 from network_samples import SIZE, STEP, tensor  # noqa: E402
-from pdcorrect.corrector import model_io as cost  # noqa: E402
 from pdcorrect.corrector.architecture import PRESETS, preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector, without_momentum  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
@@ -347,6 +348,13 @@ def test_a_node_is_reached_from_as_many_edges_as_there_are_rounds(rounds):
 # --- cost --------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def cost(monkeypatch):
+    """The benchmark's module that counts operations."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    return importlib.import_module("network_cost")
+
+
 def test_the_thesis_has_the_parameters_of_its_description():
     w, L = 128, 4
 
@@ -359,7 +367,6 @@ def test_the_thesis_has_the_parameters_of_its_description():
     by_hand += 15 * (mlp(3 * w, w, True) + mlp(2 * w, w, True))
     model = Corrector(PRESETS["thesis"])
     assert sum(p.numel() for p in model.parameters()) == by_hand == 2_878_467
-    assert cost.parameters(PRESETS["thesis"]) == by_hand
 
 
 CONFIGS = {
@@ -371,10 +378,9 @@ CONFIGS = {
 
 
 @pytest.mark.parametrize("name", list(CONFIGS))
-def test_parameters_and_operations_are_those_counted(name):
+def test_operations_are_those_counted(cost, name):
     config = CONFIGS[name]
     model = Corrector(config)
-    assert cost.parameters(config) == sum(p.numel() for p in model.parameters())
     bodies, step = sample()
     samples.fit(model, FeatureView(bodies, step))
     nodes, edges = model.inputs(FeatureView(bodies, step))

@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
@@ -12,7 +11,6 @@ pytest.importorskip("torch_geometric")
 import reader_samples as samples  # noqa: E402
 from pdcorrect.data.folder import shard_paths, whole_files  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
-from pdcorrect.data.statistics import compute_statistics  # noqa: E402
 from pdcorrect.data.summary import dataset_info  # noqa: E402
 from pdcorrect.errors import FileFormatError, FileVersionError  # noqa: E402
 
@@ -42,7 +40,7 @@ def names(found):
     return [path.name for path in found]
 
 
-def test_windows_and_statistics_of_whole_files_are_read_without_the_damaged_one(damaged):
+def test_windows_of_whole_files_are_read_without_the_damaged_one(damaged):
     folder, without = damaged
     dataset = TrajectoryDataset(folder, "training", skip_damaged=True)
     expected = TrajectoryDataset(without, "training")
@@ -55,11 +53,6 @@ def test_windows_and_statistics_of_whole_files_are_read_without_the_damaged_one(
         assert int(one.mesh) == int(other.mesh)
     assert not TrajectoryDataset(without, "training", skip_damaged=True).damaged
     assert not expected.damaged
-    found, expected = compute_statistics(folder, skip_damaged=True), compute_statistics(without)
-    assert names(found.damaged) == ["mesh-0001.h5"]
-    assert not expected.damaged
-    assert found.shards == expected.shards
-    np.testing.assert_array_equal(found["velocity"].mean, expected["velocity"].mean)
 
 
 def test_the_summary_is_of_the_whole_files_and_names_the_other(damaged, tmp_path, program):
@@ -79,9 +72,8 @@ def test_the_summary_is_of_the_whole_files_and_names_the_other(damaged, tmp_path
 def test_truncated_files_are_refused_where_nothing_else_is_asked_for(tmp_path):
     folder = samples.dataset(tmp_path, splits=("training",))
     truncate(folder / "training" / "mesh-0001.h5")
-    for read in (lambda: TrajectoryDataset(folder, "training"), lambda: compute_statistics(folder)):
-        with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
-            read()
+    with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
+        TrajectoryDataset(folder, "training")
     for number in (0, 2, 3):
         truncate(folder / "training" / f"mesh-{number:04d}.h5")
     with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):

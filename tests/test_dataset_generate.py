@@ -16,7 +16,6 @@ import pytest
 import pdcorrect as pc
 from dataset_configs import small
 from pdcorrect._files import INTERRUPTED, clear_parts, part_of_process
-from pdcorrect.data import statistics
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import generate
@@ -389,22 +388,6 @@ def test_workers_that_join_later_are_used(tmp_path, monkeypatch):
         workers = Workers(scheduler=cluster.scheduler_address)
         assert not generate(config, tmp_path, workers)  # for nothing was written
     assert len(SEEN) == 2
-
-
-def test_a_schedulers_workers_compute_the_statistics_wherever_they_run(tmp_path, monkeypatch):
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(statistics, "_moments", None)  # by this process, or new ones
-    config = small(frames=1, training={"meshes": 9, "simulations": 9})
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
-    with (
-        distributed.LocalCluster(**options) as cluster,
-        distributed.Client(cluster, set_as_default=False) as client,
-    ):
-        client.run(os.chdir, tmp_path / "elsewhere")
-        assert generate(config, "set", Workers(scheduler=cluster.scheduler_address))
-    assert len(statistics.load_statistics("set").shards) == 9
-    assert not any((tmp_path / "elsewhere").iterdir())
 
 
 def interrupted(config, folder, delay, workers):

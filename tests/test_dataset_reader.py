@@ -1,13 +1,9 @@
-"""Windows of data sets: what samples hold, batches, loaders, samplers, statistics."""
+"""Windows of data sets: what samples hold, batches, loaders, samplers."""
 
 import itertools
 import json
-import os
 import pickle
 import shutil
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
-from functools import partial
 
 import h5py
 import numpy as np
@@ -19,7 +15,6 @@ pytest.importorskip("torch_geometric")
 from torch_geometric.data import Batch  # noqa: E402
 from torch_geometric.loader import DataLoader  # noqa: E402
 
-import pdcorrect.data.statistics as statistics_module  # noqa: E402
 import reader_samples as samples  # noqa: E402
 from pdcorrect.data.reader import (  # noqa: E402
     ShardShuffle,
@@ -27,8 +22,6 @@ from pdcorrect.data.reader import (  # noqa: E402
     TrajectoryLoader,
 )
 from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
-from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
-from pdcorrect.data.workers import Workers, mapped  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
 
@@ -405,156 +398,3 @@ def test_training_goes_on_exactly_where_it_stopped(folder, workers, stop):
     assert before + places(second) == expected
     second.set_epoch(3)
     assert places(second) == following
-
-
-# --- statistics ------------------------------------------------------------------------
-
-
-def direct(folder):
-    """All values of the training split, window by window, from the samples."""
-    found = {}
-    for base in ("plain", "best"):
-        for one in opened(folder, base=base):
-            first, second = one.edge_index
-            correction = (one.targets - one.predictions)[:, 0]
-            values = {f"correction/{base}": torch.where(one.free, correction, torch.nan)}
-            if base == "plain":
-                for name, positions in (("rest_edge", one.rest), ("edge", one.positions)):
-                    values[name] = positions[second] - positions[first]
-                    values[f"{name}_length"] = values[name].norm(dim=1, keepdim=True)
-                values |= {
-                    "velocity": one.velocities,
-                    "force": one.forces[:, 0],
-                    "displacement": (one.positions - one.rest).norm(dim=1, keepdim=True),
-                    "log_young": one.young.log()[:, None],
-                    "poisson": one.poisson[:, None],
-                    "density": one.density[:, None],
-                }
-            for name, array in values.items():
-                found.setdefault(name, []).append(array.numpy())
-    return {name: np.concatenate(arrays) for name, arrays in found.items()}
-
-
-def close(one, other, tolerance=1e-12):
-    for name in ("count", "mean", "deviation", "minimum", "maximum"):
-        a, b = getattr(one, name), getattr(other, name)
-        scale = np.abs([one.minimum, one.maximum]).max()
-        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance * scale)
-
-
-def test_statistics_are_those_of_all_values_of_the_training_split_in_any_order(folder, tmp_path):
-    statistics = compute_statistics(folder)
-    expected = direct(folder)
-    assert statistics.quantities.keys() == expected.keys()
-    for name, values in expected.items():
-        found = statistics[name]
-        assert found.count.tolist() == np.isfinite(values).sum(axis=0).tolist()
-        np.testing.assert_allclose(found.mean, np.nanmean(values, axis=0), rtol=1e-9, atol=1e-13)
-        np.testing.assert_allclose(
-            found.deviation, np.nanstd(values, axis=0), rtol=1e-9, atol=1e-13
-        )
-        np.testing.assert_allclose(found.minimum, np.nanmin(values, axis=0), rtol=1e-12)
-        np.testing.assert_allclose(found.maximum, np.nanmax(values, axis=0), rtol=1e-12)
-
-    for number, cells in enumerate(samples.SHAPES):
-        one = samples.shard(number, cells=cells)
-        moved = {**one.attributes, "number": 3 - number}
-        samples.write(tmp_path, [replace(one, attributes=moved)])
-    one, other = compute_statistics(folder), compute_statistics(tmp_path)
-    for name in one.quantities:
-        close(one[name], other[name])
-
-
-def test_statistics_by_several_processes_have_the_same_bits(tmp_path, monkeypatch):
-    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 4)
-    by_several, counts = statistics_module._moments_by_several, []
-
-    def noted(work, paths, count):
-        counts.append(count)
-        return by_several(work, paths, count)
-
-    monkeypatch.setattr(statistics_module, "_moments_by_several", noted)
-    samples.write(tmp_path, [samples.shard(number) for number in range(9)])
-    one, several = (compute_statistics(tmp_path, processes=count) for count in (1, 8))
-    assert counts == [2]
-    assert several.quantities.keys() == one.quantities.keys()
-    for name in one.quantities:
-        close(several[name], one[name], 0)
-    path = tmp_path / "training" / "mesh-0005.h5"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2 :] = bytes(len(content) - len(content) // 2)  # of the same size
-    path.write_bytes(content)
-    for count in (1, 2):
-        with pytest.raises(FileFormatError, match=r"mesh-0005\.h5"):
-            compute_statistics(tmp_path, processes=count)
-
-
-def test_statistics_by_a_schedulers_workers_have_the_same_bits(tmp_path):
-    distributed = pytest.importorskip("distributed")
-    samples.write(tmp_path, [samples.shard(number) for number in range(9)])
-    options = {"n_workers": 2, "threads_per_worker": 1, "processes": False}
-    with distributed.LocalCluster(**options, dashboard_address=":0") as cluster:
-        spread = partial(mapped, workers=Workers(scheduler=cluster.scheduler_address))
-        one, several = compute_statistics(tmp_path), compute_statistics(tmp_path, spread=spread)
-        assert several.quantities.keys() == one.quantities.keys()
-        for name in one.quantities:
-            close(several[name], one[name], 0)
-        path = tmp_path / "training" / "mesh-0007.h5"
-        path.write_bytes(path.read_bytes()[:-1])
-        with pytest.raises(FileFormatError, match=r"mesh-0007\.h5"):
-            compute_statistics(tmp_path, spread=spread)
-
-
-def test_statistics_are_computed_here_if_a_process_is_killed(tmp_path, monkeypatch):
-    monkeypatch.setattr(statistics_module, "_FILES_A_PROCESS", 4)
-    by_several, broken = statistics_module._moments_by_several, []
-
-    def noted(*arguments):
-        try:
-            return by_several(*arguments)
-        except BrokenProcessPool:
-            broken.append(arguments)
-            raise
-
-    monkeypatch.setattr(statistics_module, "_moments_by_several", noted)
-    samples.write(tmp_path, [samples.shard(number) for number in range(8)])
-    paths = sorted((tmp_path / "training").iterdir())
-    work = partial(samples.parts_of_no_other_process, process=os.getpid())
-    one, other = (statistics_module._moments(work, paths, count) for count in (1, 2))
-    assert len(broken) == 1
-    for name in one:
-        close(other[name], one[name], 0)
-
-
-def test_saved_statistics_are_loaded_as_they_were(folder):
-    statistics = compute_statistics(folder)
-    path = statistics.save(folder)
-    loaded = load_statistics(folder)
-    path.unlink()
-    assert (loaded.config_hash, loaded.shards) == (statistics.config_hash, statistics.shards)
-    for name in statistics.quantities:
-        close(loaded[name], statistics[name], 0)
-    with pytest.raises(InputError, match="'speed'"):
-        loaded["speed"]
-
-
-def test_stale_and_damaged_statistics_and_files_of_two_configurations_are_refused(tmp_path):
-    samples.dataset(tmp_path, splits=("training", "validation"))
-    with pytest.raises(FileFormatError, match=r"statistics\.json"):
-        load_statistics(tmp_path)
-    compute_statistics(tmp_path).save(tmp_path)
-    samples.write(tmp_path, [samples.shard(9, "validation")])
-    load_statistics(tmp_path)  # another split is no part of them
-    for stale in (samples.shard(4), samples.shard(0, steps=(3,))):
-        samples.write(tmp_path, [stale])
-        with pytest.raises(InputError, match=rf"mesh-000{stale.attributes['number']}\.h5"):
-            load_statistics(tmp_path)
-        compute_statistics(tmp_path).save(tmp_path)
-    (tmp_path / "statistics.json").write_text('{"version": 1}')
-    with pytest.raises(FileFormatError, match=r"statistics\.json"):
-        load_statistics(tmp_path)
-    one = samples.shard(1)
-    other = replace(one, attributes={**one.attributes, "config_hash": "another"})
-    samples.write(tmp_path, [other])
-    with pytest.raises(InputError, match="2 configurations"):
-        compute_statistics(tmp_path)

@@ -1,7 +1,9 @@
 """Rollouts and single steps of correctors, in batches and scene by scene."""
 
+import importlib
 import itertools
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,9 +28,7 @@ from pdcorrect.evaluation.measures import (  # noqa: E402
     measure,
     read_cases,
 )
-from pdcorrect.evaluation.rollouts import roll_out, single_steps  # noqa: E402
-from pdcorrect.evaluation.single_rollouts import roll_out_alone, single_steps_alone  # noqa: E402
-from pdcorrect.evaluation.speed import _loosest, measure_speed  # noqa: E402
+from pdcorrect.evaluation.rollouts import roll_out, roll_out_alone, single_steps, single_steps_alone  # noqa: E402  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.state import Status  # noqa: E402
 from training_samples import shortened  # noqa: E402
@@ -379,7 +379,14 @@ class Uncorrected:
         )  # fmt: skip
 
 
-def test_solvers_are_compared_at_equal_accuracy():
+@pytest.fixture
+def speed(monkeypatch):
+    """The benchmark's module that times steps."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "benchmarks")
+    return importlib.import_module("speed")
+
+
+def test_solvers_are_compared_at_equal_accuracy(speed):
     pulled = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
     loaded = beam((2, 1, 1), cell_size=0.1, loads=pulled)
     made = []
@@ -389,7 +396,7 @@ def test_solvers_are_compared_at_equal_accuracy():
         return made[0]
 
     coarse, fine = ([pc.discretise(loaded, refine=k)] * 2 for k in (1, 2))
-    found = measure_speed(coarse, fine, hybrid, accuracy=1e-3, steps=2)
+    found = speed.measure_speed(coarse, fine, hybrid, accuracy=1e-3, steps=2)
     solvers = (found.coarse, found.hybrid, found.fine, found.fine_one_by_one)
     assert all(0 < s.solver_error <= 1e-3 for s in solvers)
     assert all(s.seconds > 0 for s in solvers)
@@ -400,9 +407,9 @@ def test_solvers_are_compared_at_equal_accuracy():
     quickest = min(found.fine.seconds, found.fine_one_by_one.seconds)
     assert found.speed_up == quickest / found.hybrid.seconds
     with pytest.raises(InputError, match="2 .* 1 |1 .* 2 |as many"):
-        measure_speed(coarse, fine[:1], hybrid)
+        speed.measure_speed(coarse, fine[:1], hybrid)
 
-    assert _loosest(lambda tolerance: 2 * tolerance, 1e-3) == (3e-4, 6e-4)
-    assert _loosest(lambda tolerance: 0.5 * tolerance, 1e-3) == (1e-3, 5e-4)
+    assert speed._loosest(lambda tolerance: 2 * tolerance, 1e-3) == (3e-4, 6e-4)
+    assert speed._loosest(lambda tolerance: 0.5 * tolerance, 1e-3) == (1e-3, 5e-4)
     with pytest.raises(ConvergenceError, match="tolerance"):
-        _loosest(lambda tolerance: 1.0, 1e-3)
+        speed._loosest(lambda tolerance: 1.0, 1e-3)

@@ -134,8 +134,7 @@ def dataset_input(folder):
 def shards(output):
     folder = output / "set"
     manifest = json.loads((folder / "manifest.json").read_text())["files"]
-    statistics = json.loads((folder / "statistics.json").read_text())
-    return {p.name: stored_hashes(p)[1] for p in all_shards(folder)}, manifest, statistics
+    return {p.name: stored_hashes(p)[1] for p in all_shards(folder)}, manifest
 
 
 def whole_shards(output, killed):

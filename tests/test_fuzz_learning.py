@@ -36,7 +36,6 @@ from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
 from pdcorrect.data.shard_arrays import read_arrays, read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
-from pdcorrect.data.statistics import compute_statistics, load_statistics  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from test_corrector_model import assert_same_corrector  # noqa: E402
@@ -236,8 +235,7 @@ def test_other_files_of_data_sets_are_read_or_refused_by_name(tmp_path, count):
     shutil.copytree(DATASET, folder)
     for path in all_shards(folder)[1:]:
         path.unlink()
-    compute_statistics(folder).save(folder)
-    names = ("manifest.json", "statistics.json", "config.toml")
+    names = ("manifest.json", "config.toml")
     whole = {name: (folder / name).read_bytes() for name in names}
 
     def changed(name):
@@ -251,10 +249,7 @@ def test_other_files_of_data_sets_are_read_or_refused_by_name(tmp_path, count):
         name, data = one
         (folder / name).write_bytes(data)
         try:
-            if name == "statistics.json":
-                load_statistics(folder)
-            else:
-                assert all(finding.message for finding in check_dataset(folder))
+            assert all(finding.message for finding in check_dataset(folder))
         except InputError as error:
             assert str(folder) in str(error)
         (folder / name).write_bytes(whole[name])

@@ -127,7 +127,6 @@ def _awaited(process: int) -> bool:
 
 
 _PAUSE = 0.01  # s
-
 INTERRUPTED, TERMINATED = 130, 143
 """Exit status after Ctrl-C and after SIGTERM."""
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -253,3 +255,44 @@ def check_step(cells: CellBatch, before: BatchState, result: Solved, time_step: 
                     f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
                     f"a step of {time_step:g} s from before."
                 )
+
+
+class _Restored:
+    """The number to go back to, shared by all Python threads that are on one torch thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside, self._number = 0, 1
+
+    def enter(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._number = torch.get_num_threads()
+            self._inside += 1
+            torch.set_num_threads(1)
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            torch.set_num_threads(self._number)
+
+
+_restored = _Restored()
+
+
+@contextmanager
+def one_thread(device: torch.device) -> Iterator[None]:
+    """Torch on one CPU thread, if that is the device.
+
+    Batches on the CPU are small; their products gain nothing from threads that wait for
+    each other, and lose much where other processes want the cores.  Numba's kernels, which
+    share torch's OpenMP library, change the number for both.
+    """
+    if device.type != "cpu":
+        yield
+        return
+    _restored.enter()
+    try:
+        yield
+    finally:
+        _restored.leave()

@@ -98,9 +98,7 @@ def _products(R: list[Tensor], x: Tensor) -> Tensor:
 
 
 Array = NDArray[np.float64]
-
 Factors = tuple[float, float]
-
 BatchHessian = Literal["auto", "G", "G-scaled", "multigrid", "rest"]
 
 

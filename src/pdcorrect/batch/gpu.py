@@ -177,7 +177,6 @@ def _no_collection() -> Iterator[None]:
 
 
 _MOST_COLUMNS = 4
-
 _ROWS, _COLUMNS, _WARPS = 8, 256, 4
 
 

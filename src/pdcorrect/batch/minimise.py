@@ -139,16 +139,12 @@ def _pair_products(s: Tensor, z: Tensor, old: Tensor, new: Tensor) -> Tensor:
 
 
 _ROUND_OFF = {torch.float64: 1e-13, torch.float32: 1e-5}
-
 HISTORY = 12
-
 _CG_STEPS = 60
-
 _FEW = 4
 """One in so many scenes or less are few."""
 
 _OUTCOME = ("y", "gradient", "phase", "iterations", "evaluations", "estimate")
-
 _PROGRESS = ("_x", "_d", "_value", "_scale", "_step", "_slope", "_threshold", "_tried")
 
 

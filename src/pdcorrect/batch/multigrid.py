@@ -25,7 +25,6 @@ from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
-
 DEGREE = 3
 """Of the Chebyshev polynomial in D^-1 A times D^-1: products with D^-1 in one smoothing."""
 

@@ -20,7 +20,6 @@ from torch import Tensor
 from pdcorrect.errors import MissingExtraError
 
 Number = int | float
-
 PointFunction = Callable[..., Sequence[Sequence[Any]]]
 """Lists of components, one for each argument, to lists of components."""
 
@@ -213,7 +212,6 @@ _FORMS = {
 }
 
 _TYPES = {torch.float64: "tl.float64", torch.float32: "tl.float32"}
-
 _ROOTS = {torch.float64: "tl.sqrt({})", torch.float32: "tl.sqrt_rn({})"}
 """The former is rounded correctly of float64 alone; quotients of float32 are to two units."""
 

@@ -22,6 +22,7 @@ from pdcorrect.batch.checks import (
     check_problems,
     check_state,
     check_states,
+    one_thread,
     start_times,
     usable_device,
 )
@@ -36,7 +37,6 @@ from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
-from pdcorrect.batch.threads import one_thread
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import positive, whole
 from pdcorrect.solvers.integrators import integrator as make_integrator

@@ -269,11 +269,8 @@ class BodyGraph:
 
 
 REST_OF_NODES = ("rest_frames", "cell_counts")
-
 REST_OF_EDGES = ("rest_edges", "rest_turns")
-
 REST_OF_CELLS = ("rest_inverses",)
-
 KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
 """What a graph computes of its bodies at rest once for a network, when first asked for."""
 

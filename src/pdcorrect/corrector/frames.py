@@ -108,7 +108,6 @@ def _product(A: Tensor, B: Tensor) -> Tensor:
 
 
 _NEWTON_STEPS = 8
-
 _FLATTEST = 1e-3 * 3.0**-1.5
 """Least determinant that a rotation is made of, where the matrix has norm 1."""
 

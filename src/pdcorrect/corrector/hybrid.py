@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.batch.threads import one_thread
+from pdcorrect.batch.checks import one_thread
 from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
@@ -37,7 +37,6 @@ from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
 MEMORY = "previous_correction"
 """In `State.memory`, m, where the network asks for the correction of the step before."""
 

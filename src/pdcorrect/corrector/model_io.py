@@ -14,7 +14,6 @@ import hashlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from torch import Tensor
 
 from pdcorrect._environment import home_folder
 from pdcorrect._files import make_folder, part_of_process, replacing
-from pdcorrect.corrector import features
 from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_description import (
@@ -128,58 +126,6 @@ def _models_in(folder: Path) -> list[str]:
     return sorted(path.parent.name for path in folder.glob(f"*/{DESCRIPTION}"))
 
 
-OUTPUTS = 3
-"""Components of the network's output."""
-
-
-def parameters(config: CorrectorConfig) -> int:
-    """Trainable numbers of the network."""
-    width, layers = config.width, config.mlp_layers
-    hidden = config.norm != "none"
-    nodes, edges = _inputs(config)
-    encoders = _mlp(nodes, width, width, layers, hidden) + _mlp(edges, width, width, layers, hidden)
-    one = _mlp(3 * width, width, width, layers, hidden) + _mlp(
-        2 * width, width, width, layers, hidden
-    )
-    decoder = _mlp(width, width, OUTPUTS, layers, config.norm == "all")
-    return encoders + (1 if config.shared else config.layers) * one + decoder
-
-
-def flops(config: CorrectorConfig, nodes: int, edges: int) -> int:
-    """Operations of one call for n nodes and E directed edges: twice the multiply-adds.
-
-    Those of the linear maps; their biases, ReLU, LayerNorm, sums over edges, and the
-    features are left out.
-    """
-    width, layers = config.width, config.mlp_layers
-    of_node, of_edge = _inputs(config)
-    square = width * width
-    encoders = nodes * _maps(of_node, width, width, layers)
-    encoders += edges * _maps(of_edge, width, width, layers)
-    # the first map of the edges' network is applied to nodes and edges apart
-    one = edges * layers * square + 2 * nodes * square
-    one += nodes * _maps(2 * width, width, width, layers)
-    decoder = nodes * _maps(width, width, OUTPUTS, layers)
-    return 2 * (encoders + config.layers * one + decoder)
-
-
-def _inputs(config: CorrectorConfig) -> tuple[int, int]:
-    return (
-        features.width(features.NODE_FEATURES, config.node_features),
-        features.width(features.EDGE_FEATURES, config.edge_features),
-    )
-
-
-def _maps(inputs: int, width: int, outputs: int, layers: int) -> int:
-    """Multiply-adds of an MLP for one row."""
-    return sum(a * b for a, b in pairwise([inputs, *[width] * (layers - 1), outputs]))
-
-
-def _mlp(inputs: int, width: int, outputs: int, layers: int, norm: bool) -> int:
-    biases = (layers - 1) * width + outputs
-    return _maps(inputs, width, outputs, layers) + biases + (2 * outputs if norm else 0)
-
-
 BACKWARD_EULER = "backward-euler"
 """What all data sets have, also those of models that do not record it."""
 
@@ -266,7 +212,8 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
     _check_values(f"model for {folder}", state, InputError)
     weights = safetensors.save(state)
     description = Description(
-        architecture=corrector.config, parameters=parameters(corrector.config),
+        architecture=corrector.config,
+        parameters=sum(tensor.numel() for tensor in corrector.parameters()),
         normalisation=_normalisation(state), record=record,
         weights_sha256=hashlib.sha256(weights).hexdigest(),
     )  # fmt: skip

@@ -19,7 +19,6 @@ from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import (
     CONFIG,
     MANIFEST,
-    NORMALISATION,
     REFERENCE,
     SUFFIX,
     Array,
@@ -27,7 +26,6 @@ from pdcorrect.data.schema import (
     Simulation,
 )
 from pdcorrect.data.shard_reader import read_shard, stored_hashes
-from pdcorrect.data.statistics import load_statistics
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
@@ -69,8 +67,7 @@ def _digest(values: Array) -> str:
 
 
 Severity = Literal["error", "warning"]
-
-_OTHERS = (CONFIG, MANIFEST, NORMALISATION, "README.md")
+_OTHERS = (CONFIG, MANIFEST, "README.md")
 
 
 @dataclass(frozen=True)
@@ -131,7 +128,6 @@ def check_dataset(
     check = _Check(folder, repeat)
     check.load_config()
     check.load_manifest()
-    check.load_statistics()
     paths = all_shards(folder)
     check.files(paths)
     for path in paths:
@@ -217,16 +213,6 @@ class _Check:
             for key, value in manifest_content(self.config, self.hashes).items():
                 if content.get(key) != value:
                     self.error(path, f"its {key} is not that of {CONFIG} and of the files it lists")
-
-    def load_statistics(self) -> None:
-        """Compare the statistics, if there are some, with the files of the training split."""
-        path = self.folder / NORMALISATION
-        if not path.exists():
-            return
-        try:
-            load_statistics(self.folder)
-        except InputError as error:
-            self.error(path, _reason(path, error))
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""

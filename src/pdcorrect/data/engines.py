@@ -32,7 +32,6 @@ far more, for which all others in its batch would wait.
 """
 
 Array = NDArray[np.float64]
-
 SolverName = Literal["pd", "newton"]
 
 

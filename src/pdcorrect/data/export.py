@@ -101,9 +101,7 @@ NORMAL, HANDLE = 0, 3
 """Types of nodes, ``NodeType`` in google-deepmind/deepmind-research, meshgraphnets/common.py."""
 
 _SPLITS = {TRAINING: "train", VALIDATION: "valid", EVALUATION: "test"}
-
 _DYNAMIC = ("world_pos", "base_pos", "forces")
-
 Array = NDArray[Any]
 
 

@@ -17,7 +17,6 @@ from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
-
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
 
 

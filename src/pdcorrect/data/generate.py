@@ -6,17 +6,15 @@ is whole, so an interrupted generation is continued by starting it again.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from statistics import median
 
 from pdcorrect._files import clear_parts, make_folder, write_text
-from pdcorrect.data.configuration import TRAINING, DatasetConfig
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.produce import shard_path
@@ -24,8 +22,7 @@ from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.simulate import lacking, work_per_node
-from pdcorrect.data.statistics import compute_statistics, load_statistics
-from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, mapped
+from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _MOST_DIFFERENCES = 5
@@ -109,8 +106,7 @@ def generate(
     Returns
     -------
     Generated
-        True if all that was asked for is there.  Once that is the whole training split,
-        ``statistics.json`` has its normalisation; once it is the whole data set,
+        True if all that was asked for is there.  Once that is the whole data set,
         ``manifest.json`` lists the hashes of its files.
 
     Raises
@@ -146,8 +142,6 @@ def generate(
     for plan in plans:
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
-    if all(hashes[plan.name] for plan in plans if plan.split == TRAINING):
-        _write_statistics(folder, workers)
     if None not in hashes.values():
         _write_manifest(config, folder, hashes)
     return _generated(plans, chosen, hashes)
@@ -273,12 +267,3 @@ def _work(config: DatasetConfig, plan: MeshPlan) -> float:
 def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:
     """List the files' hashes."""
     write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")
-
-
-def _write_statistics(folder: Path, workers: Workers) -> None:
-    """Those of the training split, unless they are there."""
-    with contextlib.suppress(InputError):
-        load_statistics(folder)
-        return
-    spread = partial(mapped, workers=workers) if workers.scheduler else None
-    compute_statistics(folder.resolve(), processes=workers.count, spread=spread).save(folder)

@@ -67,7 +67,6 @@ def discretise_stored(scene: Scene, points: Array, cells: Array, refine: int = 1
 
 
 SETTING = "imported"
-
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
 

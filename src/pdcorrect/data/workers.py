@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pdcorrect._files import ctrl_c_ignored
 from pdcorrect.data.configuration import DatasetConfig
@@ -25,10 +25,6 @@ _PATIENCE = 600
 """Seconds to wait for the first worker of a scheduler."""
 _ANSWER = 10
 """Seconds to wait for a scheduler's answer."""
-_ITEMS_A_TASK = 4
-"""Of a list, handed out together."""
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -121,31 +117,6 @@ def _distributed(
         for future in running:
             yield future.result()
             hand_out()
-
-
-def mapped(
-    function: Callable[[Item], Result], items: Sequence[Item], workers: Workers
-) -> Iterator[Result]:
-    """Results in order, by the workers of a scheduler, before all else that they have to do.
-
-    They have imported what is needed already, which new processes would take long to do.
-
-    Raises
-    ------
-    InputError
-        If no scheduler or worker answers.
-    """
-    distributed = require_extra("distributed", "cluster")
-    parts = [list(items[k : k + _ITEMS_A_TASK]) for k in range(0, len(items), _ITEMS_A_TASK)]
-    with _client(distributed, workers) as client:
-        _wait_for_worker(client)
-        futures = client.map(partial(_each, function), parts, pure=False, priority=1)
-        for future in futures:
-            yield from future.result()
-
-
-def _each(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    return [function(item) for item in items]
 
 
 def _client(distributed: Any, workers: Workers) -> Any:

@@ -140,38 +140,28 @@ def cases_for(
     Raises
     ------
     InputError
-        As `cases_with`; or if a corrector is for the best coarse model, the scene has no such
-        model and the corrector's reference cannot be made; or if the scene's own element has 27
-        nodes and others are asked for.
+        As `cases_with`; or if a corrector's base or reference cannot be made for the scene, or
+        the scene's own element has 27 nodes and others are asked for.
     """
     reference, *others = cases_with(models, gate=gate)
     best, why = Case(_COARSE["best"], "pd", 1, "best"), without_best(scene)
-    _check_best(scene, others, why)
     if why is None:
-        if not models:
-            reference = _FINE_BEST
-        if best not in others:
-            others.insert(len(CASES) - 1, best)
+        reference = reference if models else _FINE_BEST
+        others[len(CASES) - 1 : len(CASES) - 1] = [] if best in others else [best]
+    elif not _is_best(scene):
+        for case in others:
+            if case.model is not None and case.base == "best":
+                raise InputError(
+                    f"model {case.model}: corrects the best coarse model, and this scene has none: "
+                    f"{why}. Expected a scene that has one, or a model of another base."
+                )
     if hex27:
         if scene.solver.element == HEX27.element:
             raise InputError(
-                "hex27: the scene's own element is hex27, and coarse PD has it: expected a scene "
-                "of another element; leave the option out."
+                "hex27: the scene's own element is hex27: expected a scene of another element."
             )
         others.append(HEX27)
     return (reference, *others)
-
-
-def _check_best(scene: Scene, cases: Sequence[Case], why: str | None) -> None:
-    """Refuse correctors of a best coarse model that a scene has not, ``why``."""
-    if why is None or _is_best(scene):
-        return
-    for case in cases:
-        if case.model is not None and case.base == "best":
-            raise InputError(
-                f"model {case.model}: corrects the best coarse model, and this scene has none: "
-                f"{why}. Expected a scene that has one, or a model of another base."
-            )
 
 
 def _is_best(scene: Scene) -> bool:

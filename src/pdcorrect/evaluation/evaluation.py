@@ -27,8 +27,13 @@ from pdcorrect.evaluation.measures import (
     measure,
     read_cases,
 )
-from pdcorrect.evaluation.rollouts import Hybrid, roll_out, single_steps
-from pdcorrect.evaluation.single_rollouts import roll_out_alone, single_steps_alone
+from pdcorrect.evaluation.rollouts import (
+    Hybrid,
+    roll_out,
+    roll_out_alone,
+    single_steps,
+    single_steps_alone,
+)
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]

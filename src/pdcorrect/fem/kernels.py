@@ -16,9 +16,7 @@ from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lan
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
 PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
-
 REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
-
 CHUNK = 16
 """Cells that one thread takes at a time."""
 

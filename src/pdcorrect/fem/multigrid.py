@@ -17,7 +17,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
 Product = Callable[[Array], Array]
 
 
@@ -117,7 +116,6 @@ _SMOOTHED = 8.0
 """Ratio of the largest eigenvalue of D^-1 A to the smallest one that the smoother damps."""
 
 _LANCZOS_STEPS = 15
-
 _RADIUS_MARGIN = 1.1
 
 

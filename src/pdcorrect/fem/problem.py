@@ -26,7 +26,6 @@ from pdcorrect.scene import Load, MeshFile, Scene, best_coarse, check_scene
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
-
 _LEAST_BYTES = 4000
 """Of memory that a cell takes, less than half of what was measured; eight times it as "hex27"."""
 
@@ -308,7 +307,6 @@ def _freeze(*arrays: NDArray[np.generic]) -> None:
 
 
 Base = Literal["plain", "best", "total-mass"]
-
 BASES: tuple[str, ...] = get_args(Base)
 
 

@@ -14,9 +14,7 @@ from pdcorrect.figures.panels import replacing
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-
 _FONT = 9
 """Of legends, points."""
 
@@ -200,7 +198,6 @@ def plot_error_against_time(points: Mapping[str, tuple[float, float]], output: s
 
 
 _BINS = 24
-
 _HALF = 50.0  # per cent
 
 

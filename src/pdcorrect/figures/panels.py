@@ -23,15 +23,10 @@ from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-
 _TO_CAMERA = np.array([-0.55, -1.0, 0.5])
-
 _MARGIN = 0.04  # of the panel's width, kept free on each side
-
 _SHAPES = 0.42, 1.25  # smallest and largest height of a panel, in widths
-
 _OVERSAMPLING = 2
-
 _LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
 """Places (right, up, towards the camera) and strengths."""
 

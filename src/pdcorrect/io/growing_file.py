@@ -81,7 +81,6 @@ def abandon(file: Any, path: Path) -> None:
 
 
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
-
 _FILL: dict[str, Any] = {"f": np.nan, "i": -1, "S": b""}
 
 

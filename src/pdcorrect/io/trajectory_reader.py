@@ -19,9 +19,7 @@ from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
 FORMAT = "pdcorrect-trajectory"
-
 VERSION = 1
-
 RESERVED = frozenset({"format", "format_version", "scene_toml", "pdcorrect_version"})
 """Attributes of the file that are not the run's."""
 

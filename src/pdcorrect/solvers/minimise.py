@@ -26,18 +26,13 @@ from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.state import Status
 
 Array = NDArray[np.float64]
-
 Solve = Callable[[Array], Array]
-
 ARMIJO = 1e-4
-
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
 
 BACKTRACKS = 30
-
 _ESTIMATE_STEPS = 1000
-
 NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 

@@ -18,9 +18,7 @@ from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
 
 Array = NDArray[np.float64]
-
 OnStep = Callable[[StepResult, float], None]
-
 DENSITY_CHANGED = "the scene's but for its density"
 """Attribute "material" of runs of `Problem.with_total_mass`."""
 
@@ -244,7 +242,6 @@ def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
 
 
 _SHOWN = 4
-
 _NONE = "nothing"
 
 

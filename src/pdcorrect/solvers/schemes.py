@@ -94,9 +94,7 @@ def by_component(
 
 
 _P, _V, _A = Linear(positions=1.0), Linear(velocities=1.0), Linear(accelerations=1.0)
-
 _Y, _PRESCRIBED = Linear(y=1.0), Linear(prescribed=1.0)
-
 _CLAMP_VELOCITY = Linear(clamp_velocity=1.0)
 
 
@@ -154,7 +152,6 @@ class Scheme:
 
 
 SchemeOf = Callable[[float, bool], Scheme]
-
 """(h, started) -> the scheme; ``started`` says whether the state has the memory for it."""
 
 

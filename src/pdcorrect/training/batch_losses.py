@@ -11,8 +11,7 @@ from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.training.distributed import ProcessGroup
-from pdcorrect.training.losses import body_losses
-from pdcorrect.training.precision import network_precision
+from pdcorrect.training.losses import body_losses, network_precision
 from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.unrolled import UnrolledBatches

@@ -20,12 +20,15 @@ of positions in units of 1 / 1000 m.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
+from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.training.recipe import Loss
 
 LEAST_ERROR = 1e-30
@@ -99,3 +102,29 @@ def mean_of(values: Tensor, chosen: Tensor) -> Tensor:
     """Mean of the chosen values; NaN where none is chosen, so that the batch does not count."""
     kept = torch.where(chosen, values, 0.0)
     return kept.sum() / chosen.sum()
+
+
+Amp = Literal["none", "bf16"]
+
+
+@contextlib.contextmanager
+def network_precision(corrector: Corrector, amp: Amp) -> Iterator[None]:
+    """Let the network, and nothing else, take its matrix products in bfloat16.
+
+    The coarse solver, which may run between, keeps its own precision.
+    """
+    if amp == "none":
+        yield
+        return
+    network = corrector.network
+    plain, kind = network.forward, next(network.parameters()).device.type
+
+    def forward(*arguments: Any) -> Any:
+        with torch.autocast(kind, torch.bfloat16):
+            return plain(*arguments)
+
+    vars(network)["forward"] = forward
+    try:
+        yield
+    finally:
+        del vars(network)["forward"]

@@ -25,14 +25,12 @@ from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.training.batch_losses import Source, make_source, share_done
-from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
+from pdcorrect.training.checkpoints import lineage_of, read_checkpoint, write_checkpoint
 from pdcorrect.training.distillation import load_start, load_teachers
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
-from pdcorrect.training.history import HistoryFile
-from pdcorrect.training.lineage import lineage_of
 from pdcorrect.training.optimisation import Optimiser, rate_at
-from pdcorrect.training.progress import Progress, check_same
+from pdcorrect.training.progress import HistoryFile, Progress, check_same
 from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups

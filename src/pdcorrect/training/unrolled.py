@@ -15,8 +15,7 @@ from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import FeatureView
 from pdcorrect.corrector.placements import Velocity
-from pdcorrect.training.losses import body_losses, mean_of
-from pdcorrect.training.precision import network_precision
+from pdcorrect.training.losses import body_losses, mean_of, network_precision
 from pdcorrect.training.recipe import Stage
 from pdcorrect.training.scenes import Frames, SceneGroup, SceneGroups
 
