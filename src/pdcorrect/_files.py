@@ -1,4 +1,4 @@
-"""Files that appear under their names only when they are whole."""
+"""Files that appear under their names only when they are whole; SIGTERM as an exception."""
 
 from __future__ import annotations
 

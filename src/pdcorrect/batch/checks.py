@@ -1,4 +1,4 @@
-"""What a batch, its steps and its derivatives are given."""
+"""Checks of what a batch, its steps and its derivatives are given; threads of torch."""
 
 from __future__ import annotations
 

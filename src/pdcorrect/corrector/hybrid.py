@@ -1,4 +1,4 @@
-"""`HybridStepper`: a coarse solver's steps, corrected by a network.
+"""`HybridStepper`: a coarse solver's steps, corrected by a network; `hybrid_of` a released one.
 
 stepper = HybridStepper(pc.ProjectiveDynamics(pc.discretise(scene)), corrector)
 run = pc.rollout(stepper, frames=60)

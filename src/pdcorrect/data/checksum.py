@@ -1,4 +1,4 @@
-"""The seal of a data set's file: its first 512 bytes say what the rest must be.
+"""The checksum of a data set's file: its first 512 bytes say what the rest must be.
 
 HDF5 leaves that room, the user block, to others.  It holds three lines of text, padded
 with zeros::

@@ -1,4 +1,4 @@
-"""Compute what is missing of a shard."""
+"""What a worker does for one file of a data set: it computes the simulations and writes them."""
 
 from __future__ import annotations
 

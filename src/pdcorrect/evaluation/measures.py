@@ -1,4 +1,4 @@
-"""How far a run of a simulation is from the reference: everything measured of one trajectory."""
+"""Simulations of a split, and how far a run is from the reference: all that is measured of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Free rollouts and single steps of corrected scenes, many at once."""
+"""Free rollouts and single steps of corrected scenes, one by one or many at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clamps of a scene: which components move freely, and where the others are."""
+"""Clamps of a scene: which nodes its regions select, what moves freely, where the rest is."""
 
 from __future__ import annotations
 

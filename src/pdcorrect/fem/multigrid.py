@@ -1,4 +1,4 @@
-"""Smoothed aggregation (Vanek, Mandel and Brezina 1996): a cheap, fixed, symmetric A^-1.
+"""Smoothed aggregation (Vanek, Mandel and Brezina 1996) and conjugate gradients with it.
 
 pyamg forms the aggregates.  The rest is here because the cycle has to advance
 several right-hand sides together and to be the same in every run, whereas pyamg

@@ -1,4 +1,4 @@
-"""`Problem`: a scene on a mesh, with everything a stepper needs; `discretise` makes it."""
+"""`Problem`: a scene on a mesh, with all that a stepper needs; `discretise`, `coarse_model`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One body in one picture: camera, surface, colours (pyvista, off-screen).
+"""One body in one picture: camera, surface, colours; picture files (pyvista, off-screen).
 
 All panels share a camera with parallel projection, so that lengths compare.
 """

@@ -1,4 +1,4 @@
-"""`Scene`, its time and solver sections, and messages for wrong ones."""
+"""`Scene` with its time, damping and solver sections; `best_coarse`."""
 
 from __future__ import annotations
 

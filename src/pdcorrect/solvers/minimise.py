@@ -1,4 +1,4 @@
-"""The minimisation loop of projective dynamics.
+"""The loops that minimise a step: L-BFGS and local/global, Newton and Newton-CG.
 
 Quasi-Newton steps d = -H g with H the L-BFGS inverse Hessian built on G^-1
 (Liu, Bouaziz and Kavan 2017), in compact form (Byrd, Nocedal and Schnabel

@@ -1,4 +1,4 @@
-"""Repeat a stepper, and bring runs of different meshes onto the same nodes."""
+"""Repeat a stepper, go on with a run from its file, restrict runs to the nodes of another mesh."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Implicit time integrators as tables: one equation of the same form for each step.
+"""Implicit time integrators as tables of linear combinations of nodal arrays.
 
 A step of h seconds solves
 

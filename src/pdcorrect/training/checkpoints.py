@@ -1,4 +1,4 @@
-"""Checkpoints: one file that is replaced whole, of tensors and, in its head, JSON.
+"""Checkpoints: one file that is replaced whole, of tensors and JSON; what models came from.
 
 The format is safetensors; the JSON lies in its metadata, with a SHA-256 over everything
 else, so that a damaged file is refused.  Nothing is ever unpickled.
