@@ -359,7 +359,6 @@ def test_damaged_files_leave_no_traceback_and_no_output(program, tmp_path, count
     settings = shutil.copy(ROOT / "examples" / "training" / "tiny.toml", tmp_path)
     calls = {
         ("dataset", "info", data, "--json", output): [shard],
-        ("dataset", "card", data, "-o", output): [shard, data / "manifest.json"],
         ("dataset", "export", data, output): [shard],
         ("dataset", "generate", data / "config.toml", "-o", output): [data / "config.toml"],
         ("train", settings, "--data", data, "-o", output): [Path(settings)],

@@ -55,7 +55,8 @@ def make(folder, *options, status=0):
 @pytest.fixture
 def sets(tmp_path):
     (tmp_path / "datasets").mkdir()
-    shutil.copy(ROOT / "datasets" / "make_all.py", tmp_path / "datasets")
+    for name in ("make_all.py", "card.py"):
+        shutil.copy(ROOT / "datasets" / name, tmp_path / "datasets")
     for seed, name in enumerate(("one", "two")):
         folder = tmp_path / "datasets" / name
         folder.mkdir()
