@@ -133,7 +133,7 @@ def test_newton_as_reference_agrees_with_pd():
 
 def test_batches_agree_with_one_by_one():
     pytest.importorskip("torch")
-    from pdcorrect.data.engines import Batched
+    from pdcorrect.data.batch_engine import Batched
 
     config = small(frames=2, tolerance=1e-7)
     plans = make_plan(config)[:2]

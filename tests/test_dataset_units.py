@@ -118,7 +118,7 @@ def test_a_step_of_too_many_iterations_fails_alike_one_by_one_and_in_batches(mon
 
 def test_a_rollout_of_one_problem_is_that_among_others():
     pytest.importorskip("torch")
-    from pdcorrect.data.engines import Batched
+    from pdcorrect.data.batch_engine import Batched
 
     config, job = one_job(2)
     engine = Batched("cpu", config.tolerance)

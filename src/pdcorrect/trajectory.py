@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State, StepResult
+
+if TYPE_CHECKING:
+    from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
 

@@ -47,7 +47,7 @@ def train(
 ) -> None:
     """Train a corrector; the best model is in OUTPUT/model (extra 'learn').
 
-    Several processes: torchrun --nproc-per-node N -m pdcorrect.cli.program train ...
+    Several processes: torchrun --nproc-per-node N -m pdcorrect train ...
     Exit status 1 if time was up before the end.
     """
     import time

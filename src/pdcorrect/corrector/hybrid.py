@@ -247,8 +247,8 @@ def hybrid_of(
     Parameters
     ----------
     scene : Scene
-        Another time integrator than that of the model's training is let pass, see
-        `pdcorrect.evaluation.run_text.foreign_integrator`, unless it is quasi-static.
+        Another time integrator than that of the model's training is let pass, unless it is
+        quasi-static.
     model : str, path or LoadedModel
         Name or folder, see `load_model`, or one that is loaded.
     gate : bool, Gate or None

@@ -57,7 +57,7 @@ def make_engines(config: DatasetConfig, device: str) -> Engines:
     if device == "cpu":
         return Engines(alone, truth or alone, truth or alone)
     require_extra("torch", "learn")
-    from pdcorrect.data.engines import Batched
+    from pdcorrect.data.batch_engine import Batched
 
     batched = Batched(device, config.tolerance)
     return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.io.superblock import RepairedFile, Superblock, read_superblock
-from pdcorrect.scene import Scene
-from pdcorrect.solvers.rollout import DENSITY_CHANGED
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from pdcorrect.fem.problem import Problem
 
 FORMAT = "pdcorrect-trajectory"
 VERSION = 1
@@ -321,6 +321,10 @@ def problem_of(run: Trajectory) -> Problem:
     """
     if run.problem is not None:
         return run.problem
+    from pdcorrect.fem.problem import discretise  # reading alone needs none of these
+    from pdcorrect.scene import Scene
+    from pdcorrect.solvers.rollout import DENSITY_CHANGED
+
     if not run.scene_toml:
         raise InputError("it holds no scene: expected a run that pdcorrect has computed.")
     changed = run.attributes.get("material", "the scene's")
