@@ -114,7 +114,7 @@ def step(
 def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[str, Any]:
     """Milliseconds of one iteration of L-BFGS with a full history, without the error estimate."""
     from pdcorrect.solvers.first_hessian import TrueHessian
-    from pdcorrect.solvers.implicit import _quiet_blas
+    from pdcorrect.solvers.implicit import quiet_blas
     from pdcorrect.solvers.integrators import backward_euler
     from pdcorrect.solvers.minimise import MinimiserOptions, minimise
     from pdcorrect.solvers.step import GlobalSolver, StepObjective
@@ -124,7 +124,7 @@ def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[
     state = problem.rest_state()
     loads = problem.external_forces(0.0, 0.01)
     objective = StepObjective(problem, state, backward_euler(problem, state, 0.01), loads)
-    with _quiet_blas():
+    with quiet_blas():
         if first_hessian == "rest":
             solve: Any = TrueHessian(TangentFactory(problem), lagged=False).solver(objective)
         else:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import InputError, OutputError
 
 VALIDATION = Path(__file__).parents[1] / "validation"
 sys.path.insert(0, str(VALIDATION))
@@ -19,7 +19,9 @@ from expectations import Expectation, outside, read_expectations  # noqa: E402
 CODE = """
 from pathlib import Path
 from harness import Outcome, Table
+from pdcorrect.errors import ConvergenceError, OutputError
 
+ERRORS = {"a": ConvergenceError, "c": OutputError}
 HERE = Path(__file__).parent
 
 
@@ -27,7 +29,7 @@ def part(name, value):
     with open(HERE / "calls", "a") as calls:
         calls.write(name)
     if (HERE / f"broken-{name}").exists():
-        raise RuntimeError(name)
+        raise ERRORS.get(name, RuntimeError)(name)
     return Outcome({name: value}, (Table("values", ("part", "value"), ((name, value),)),))
 
 
@@ -169,6 +171,43 @@ def test_a_case_that_ends_with_an_error_goes_on_with_the_part_that_failed(progra
     assert quick(home).figures == {"a": 1.0, "b": "CONVERGED"}
     assert calls(home) == "b"
     assert not (tmp_path / "out" / "parts").exists()
+
+
+def other_case(folder):
+    """A second case beside it, after it by name."""
+    return shutil.copytree(folder, folder.with_name("totals"))
+
+
+def test_a_step_that_fails_ends_its_own_case_only(program, home, tmp_path):
+    other_case(home)
+    (home / "broken-a").touch()
+    status, out, _ = program("validate", "--quick", "-o", "out")
+    assert status == 1
+    assert "ConvergenceError: a" in out
+    assert not (tmp_path / "out" / "sums.json").exists()
+    assert (tmp_path / "out" / "totals.json").exists()
+
+
+def test_a_result_that_cannot_be_written_ends_the_run(home):
+    (home / "broken-c").touch()
+    with pytest.raises(OutputError):
+        harness.run_case(harness.Case(home), "out")
+
+
+@pytest.mark.parametrize("function", ["finding(record)", "draw(record, path)"])
+def test_a_finding_or_figure_of_no_number_is_the_case_s_error(program, home, tmp_path, function):
+    other_case(home)
+    with (home / "run.py").open("a") as code:
+        code.write(f"\n\ndef {function}:\n    return f'{{record.figures[\"c\"]:.1f}}'\n")
+    for _ in range(2):  # the kept record fails as well
+        status, out, _ = program("validate", "-o", "out")
+        assert status == 1
+        assert "TypeError" in out
+        for name in ("report.md", "index.html"):
+            text = (tmp_path / "out" / name).read_text()
+            assert "TypeError" in text
+            assert "figures/totals.png" in text
+            assert "figures/sums.png" not in text
 
 
 def test_a_part_s_record_that_is_damaged_is_made_again(home, tmp_path):

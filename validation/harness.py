@@ -31,10 +31,14 @@ from expectations import Table as Table
 
 from pdcorrect._environment import code_digest, environment, home_folder
 from pdcorrect._files import clear_parts, make_folder, write_text
-from pdcorrect.errors import InputError, PdcorrectError
+from pdcorrect.errors import InputError, OutputError
 
 DIGITS = 6
 """Of numbers in records."""
+
+
+class CaseFilesError(InputError):
+    """The files of a case are wrong; other input errors are of what its code computes."""
 
 
 @dataclass
@@ -171,17 +175,18 @@ class Case:
 
         Raises
         ------
-        InputError
+        CaseFilesError
             If the module has neither function, or two parts' records would be one file.
         """
         place = self.folder / "run.py"
         if not hasattr(self.module, "parts") and not hasattr(self.module, "case"):
-            raise InputError(f"{place}: expected a function case or parts of (quick).")
+            raise CaseFilesError(f"{place}: expected a function case or parts of (quick).")
         if not hasattr(self.module, "parts"):
             return {"": partial(self.module.case, quick)}
         found: dict[str, Callable[[], Outcome]] = self.module.parts(quick)
         if len({slug(name) for name in found}) < len(found):
-            raise InputError(f"{place}: parts whose names differ in signs only: {list(found)}.")
+            told = f"parts whose names differ in signs only: {list(found)}."
+            raise CaseFilesError(f"{place}: {told}")
         return found
 
     def inputs(self) -> dict[str, str]:
@@ -263,7 +268,7 @@ def run_case(
             save(place, part)
             record.seconds = round(record.seconds + part.seconds, 3)
             record.add(part.figures, part.tables)
-    except PdcorrectError:
+    except (CaseFilesError, OutputError):
         raise
     except Exception:  # of a case's own code
         record.error = traceback.format_exc()
@@ -344,18 +349,18 @@ def run(
     """Run cases, a line when each begins and ends, and write the report; whether all passed."""
     import report
 
-    found = []
+    sections = []
     for number, case in enumerate(cases, start=1):
         tell(f"{case.name}: begins ({number} of {len(cases)})")
         started = time.perf_counter()
         record = run_case(case, output, quick, again, command)
+        sections.append(report.section(case, record, output))
         tell(f"{case.name}: {verdict(case, record)}, {time.perf_counter() - started:.0f} s")
         for name, value, aim, *_ in judged(case, record)[: len(record.outside)]:
             tell(f"  {name}: {value}, expected {aim}")
         if record.error:
             tell(record.error)
-        found.append((case, record))
     if importlib.util.find_spec("matplotlib") is None:
         tell("no figures: they need the extra 'view'")
-    tell(f"report: {report.write(found, output)}")
-    return all(record.passed for _, record in found)
+    tell(f"report: {report.write(sections, output)}")
+    return all(section.record.passed for section in sections)

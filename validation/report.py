@@ -10,40 +10,66 @@ from __future__ import annotations
 
 import html
 import importlib.util
+import sys
 import tempfile
+import traceback
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import harness
 
 from pdcorrect._files import make_folder, write_bytes, write_text
+from pdcorrect.errors import OutputError
 
-Sections = Sequence[tuple[harness.Case, harness.Record]]
 HERE = Path(__file__).parent
 
 
-def write(sections: Sections, folder: Path, page: bool = True) -> Path:
-    """Draw the figures, write ``report.md`` and, if asked for, ``index.html``; gives the last.
+@dataclass(frozen=True)
+class Section:
+    """A case in the report.
+
+    ``finding`` is its sentence about the record, and ``figure`` its path in the report's folder;
+    "" if there is none.
+    """
+
+    case: harness.Case
+    record: harness.Record
+    finding: str = ""
+    figure: str = ""
+
+
+def section(case: harness.Case, record: harness.Record, folder: Path) -> Section:
+    """Find the sentence and draw the figure of a full record.
+
+    An exception of the case's code there, as of a figure that is no number, becomes the record's
+    error.
 
     Raises
     ------
     OutputError
-        If a file cannot be written.
+        If the figure cannot be written.
     """
-    folder = make_folder(folder)
-    told = [(case, record, figure(case, record, folder)) for case, record in sections]
-    write_text(folder / "report.md", "\n".join(markdown(told)))
-    if not page:
-        return folder / "report.md"
-    write_text(folder / "index.html", "\n".join(as_html(told)))
-    return folder / "index.html"
+    if record.quick or record.error:
+        return Section(case, record)
+    try:
+        return Section(case, record, finding(case, record), figure(case, record, folder))
+    except OutputError:
+        raise
+    except Exception:  # of the case's own code
+        record.error = traceback.format_exc()
+        return Section(case, record)
+
+
+def finding(case: harness.Case, record: harness.Record) -> str:
+    """The case's sentence about its record."""
+    return str(case.module.finding(record)) if hasattr(case.module, "finding") else ""
 
 
 def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
     """Draw a case's figure from its record; its path in the folder, "" if it has none."""
-    drawable = hasattr(case.module, "draw") and not (record.quick or record.error)
-    if not drawable or importlib.util.find_spec("matplotlib") is None:
+    if not hasattr(case.module, "draw") or importlib.util.find_spec("matplotlib") is None:
         return ""
     place = make_folder(folder / "figures") / f"{case.name}.png"
     with tempfile.TemporaryDirectory() as scratch:  # a figure is there whole or not at all
@@ -52,35 +78,44 @@ def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
     return f"figures/{place.name}"
 
 
-def finding(case: harness.Case, record: harness.Record) -> str:
-    """The case's sentence about a full record, from its figures."""
-    if record.quick or record.error or not hasattr(case.module, "finding"):
-        return ""
-    return str(case.module.finding(record))
+def write(sections: Sequence[Section], folder: Path, page: bool = True) -> Path:
+    """Write ``report.md`` and, if asked for, ``index.html``; gives the last.
+
+    Raises
+    ------
+    OutputError
+        If a file cannot be written.
+    """
+    folder = make_folder(folder)
+    write_text(folder / "report.md", "\n".join(markdown(sections)))
+    if not page:
+        return folder / "report.md"
+    write_text(folder / "index.html", "\n".join(as_html(sections)))
+    return folder / "index.html"
 
 
-Told = Sequence[tuple[harness.Case, harness.Record, str]]
-
-
-def conditions(told: Told) -> str:
+def conditions(sections: Sequence[Section]) -> str:
     """When and on what all this was made."""
-    dates = sorted({record.date for _, record, _ in told})
+    records = [section.record for section in sections]
+    dates = sorted({record.date for record in records})
     period = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never"
     keys = ("processor", "threads", "dtype")
-    machines = {", ".join(r.environment.get(k, "") for k in keys) for _, r, _ in told}
+    machines = {", ".join(r.environment.get(k, "") for k in keys) for r in records}
     return (
         f"Measured {period} on {'; '.join(sorted(machines))} (processor, threads, precision). "
         "Judged are figures whose expectation was written down before."
     )
 
 
-def markdown(told: Told) -> Iterator[str]:
+def markdown(sections: Sequence[Section]) -> Iterator[str]:
     """A paragraph a case: question, verdict, finding, figure."""
-    yield from ("# Validation report", "", conditions(told), "")
-    for case, record, path in told:
+    yield from ("# Validation report", "", conditions(sections), "")
+    for each in sections:
+        case, record = each.case, each.record
         yield from (f"## {case.title}", "", case.question, "")
-        yield f"**{harness.verdict(case, record).capitalize()}.** {finding(case, record)}".rstrip()
-        yield from ("", f"![{case.title}]({path})", "") if path else ("",)
+        yield f"**{harness.verdict(case, record).capitalize()}.** {each.finding}".rstrip()
+        yield from ("", "```text", record.error.rstrip(), "```") if record.error else ()
+        yield from ("", f"![{case.title}]({each.figure})", "") if each.figure else ("",)
 
 
 _STYLE = """body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto }
@@ -89,16 +124,17 @@ th, td { padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #ddd; vertica
 .fail, .outside { background: #f6d3cd } .known { background: #fbeec9 } img { max-width: 100% }"""
 
 
-def as_html(told: Told) -> Iterator[str]:
+def as_html(sections: Sequence[Section]) -> Iterator[str]:
     """The same with all tables and all figures that were judged."""
     yield f'<!doctype html><html lang="en"><head><meta charset="utf-8"><style>{_STYLE}</style>'
     yield "<title>pdcorrect: validation report</title></head><body><h1>Validation report</h1>"
-    yield f"<p>{html.escape(conditions(told))}</p>"
-    for case, record, path in told:
+    yield f"<p>{html.escape(conditions(sections))}</p>"
+    for each in sections:
+        case, record, path = each.case, each.record, each.figure
         verdict = harness.verdict(case, record)
         yield f"<h2>{html.escape(case.title)}</h2><p>{html.escape(case.question)}</p>"
         yield f'<p class="{verdict.split(":")[0]}">{html.escape(verdict)}</p>'
-        yield f"<p>{html.escape(finding(case, record))}</p>"
+        yield f"<p>{html.escape(each.finding)}</p>"
         yield f"<pre>{html.escape(record.error)}</pre>" if record.error else ""
         yield f'<p><img src="{path}" alt="{html.escape(case.title)}"></p>' if path else ""
         for table in record.tables:
@@ -124,8 +160,10 @@ def main() -> None:
     """Write the report of the records that are kept in the repository."""
     cases = harness.find_cases(folder=HERE)
     records = [harness.load(HERE / "results" / f"{case.name}.json") for case in cases]
-    found = [(c, r) for c, r in zip(cases, records, strict=True) if r is not None]
-    print(write(found, HERE, page=False))
+    pairs = zip(cases, records, strict=True)
+    sections = [section(case, record, HERE) for case, record in pairs if record is not None]
+    print(write(sections, HERE, page=False))
+    sys.exit(0 if all(each.record.passed for each in sections) else 1)
 
 
 if __name__ == "__main__":
