@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from pdcorrect.cli import program as cli
+from pdcorrect.cli import main
 from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.materials import Materials
@@ -117,7 +117,7 @@ def program(capsys, monkeypatch):
         monkeypatch.setattr(sys, "argv", ["pdcorrect", *map(str, arguments)])
         status = 0
         try:
-            cli.main()
+            main()
         except SystemExit as end:
             status = end.code or 0
         out, err = capsys.readouterr()

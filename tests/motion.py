@@ -6,14 +6,14 @@ import numpy as np
 
 from pdcorrect.fem.mesh import refine as cut
 from pdcorrect.fem.mesh import voxel_mesh
-from pdcorrect.scene import voxels as shapes
+from pdcorrect.scene import voxels
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
 
 def cross_mesh(refine=1):
     """14 coarse cells, not symmetric in any direction."""
-    solid, origin = shapes.cross((6, 1, 2), 2, 3, 1, 2)
+    solid, origin = voxels.cross((6, 1, 2), 2, 3, 1, 2)
     return cut(voxel_mesh(solid, origin, 0.05), refine)
 
 

@@ -11,7 +11,7 @@ import pytest
 import pdcorrect as pc
 from conftest import beam
 from pdcorrect._files import INTERRUPTED
-from pdcorrect.cli import common as cli
+from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.evaluation.report import inverted_frames
 
 
@@ -97,7 +97,7 @@ def test_bad_scenes_end_with_status_2_and_one_paragraph(
     assert old in text
     scene_file.write_text(text.replace(old, new))
     status, out, err = program("simulate", scene_file, "-o", tmp_path / "run.h5")
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert told in err
     assert err.startswith("error: ")
     assert "Traceback" not in out + err
@@ -131,7 +131,7 @@ def test_other_bad_input_ends_with_status_2_and_names_it(
     if "run.h5" in command:
         assert program("simulate", "scene.toml", "-o", "run.h5", "--frames", 1)[0] == 0
     status, out, err = program(*command.split())
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert named in err
     assert "Traceback" not in out + err
     assert not list(tmp_path.glob("x*"))
@@ -151,7 +151,7 @@ def test_a_run_that_fails_keeps_its_frames_and_ends_with_status_1(
     monkeypatch.setattr(pc.ProjectiveDynamics, "__call__", fails_third)
     output = tmp_path / "run.h5"
     status, _, err = program("simulate", scene_file, "-o", output)
-    assert status == cli.FAILED
+    assert status == FAILED
     assert "frame 3" in err
     assert len(pc.load_trajectory(output)) == 2
 
@@ -174,7 +174,7 @@ def test_doctor_looks_at_everything(program):
     status, out, _ = program("doctor")
     for word in ("numpy", "scikit-fem", "BLAS", "threads", "cholespy", "GPU", "rendering"):
         assert word in out
-    assert ("PROBLEM" in out) == (status == cli.FAILED)
+    assert ("PROBLEM" in out) == (status == FAILED)
 
 
 def test_help_names_every_command_and_each_has_its_own(program):
@@ -204,7 +204,7 @@ def test_outputs_that_cannot_be_written_are_named_before_the_work(
         (("compare", scene_file, "-o", tmp_path / "r", "--vtu", "--no-figures"), "vtu"),
     ):
         status, out, err = program(*arguments)
-        assert status == cli.FAILED
+        assert status == FAILED
         assert named in err
         assert "Traceback" not in out + err
     assert not (tmp_path / "a.h5").exists()

@@ -13,11 +13,11 @@ import pytest
 import pdcorrect as pc
 from conftest import beam, cross
 from hybrid_samples import problems, saved
-from pdcorrect.cli import common as cli
-from pdcorrect.cli import compare as compare_cli
+from pdcorrect.cli.common import BAD_INPUT, FAILED
+from pdcorrect.cli.compare import _print_table
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation import compare as evaluate
+from pdcorrect.evaluation import compare as compare_module
 from pdcorrect.evaluation import report
 from pdcorrect.evaluation.compare import CASES, Case, case_stepper, cases_with
 from pdcorrect.evaluation.comparison_cases import HEX27, cases_for, without_best
@@ -123,7 +123,7 @@ def test_hex27_is_refused_where_it_is_the_scenes_own(program, thick, tmp_path):
     scene = thick.with_changes(solver={"element": "hex27"})
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     status, _, err = program("compare", tmp_path / "scene.toml", "-o", tmp_path / "r", "--hex27")
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert "hex27" in err
     assert not (tmp_path / "r").exists()
     with pytest.raises(InputError, match="element 'hex27' with base 'best'"):
@@ -165,7 +165,7 @@ def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once
     (tmp_path / "scene.toml").write_text(thick.with_changes(solver={"element": "hex27"}).to_toml())
     arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
     status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert f"model {MODEL}: " in err
     assert not (tmp_path / "r").exists()
     own = pc.best_coarse(thick)  # has none beside its own, which is as good
@@ -258,7 +258,7 @@ def test_names_are_folded_at_spaces_and_hyphens_on_a_terminal_only(thick, monkey
     monkeypatch.setenv("COLUMNS", "78")
 
     def names():
-        compare_cli._print_table(found)
+        _print_table(found)
         lines = capsys.readouterr().out.splitlines()[5:]
         assert " 1235 " in lines[0]
         return [line.strip().split("  ")[0] for line in lines if line.strip()]
@@ -405,7 +405,7 @@ def test_compare_goes_on_after_a_case_that_fails(
     status, out, err = program(
         "compare", scene_file, "-o", folder, "--figures" if drawn else "--no-figures"
     )
-    assert (status, err) == (cli.FAILED, "")
+    assert (status, err) == (FAILED, "")
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     others = ["coarse PD", "coarse Newton", "best coarse PD", "intermediate PD", "fine best PD"]
     assert list(rows) == [*(label for label in others if label != failing), failing]
@@ -422,7 +422,7 @@ def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, m
     nodes = nodes_of(pc.Scene.load(scene_file), 4)
     failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes}, "hex8-bubble")
     status, _, err = program("compare", scene_file, "-o", tmp_path / "report")
-    assert status == cli.FAILED
+    assert status == FAILED
     assert "frame 2 (t = 0.02 s) failed" in err
     assert not (tmp_path / "report" / "report.md").exists()
 
@@ -450,7 +450,7 @@ def test_a_case_that_cannot_be_set_up_has_failed(monkeypatch):
             raise pc.errors.ConvergenceError("no factor.")
         return make(scene, case)
 
-    monkeypatch.setattr(evaluate, "case_stepper", refuses)
+    monkeypatch.setattr(compare_module, "case_stepper", refuses)
     assert pc.compare(scene).failures == {"coarse Newton": "no factor."}
 
 
@@ -463,7 +463,7 @@ def test_compare_without_figures_needs_no_view_extra(program, scene_file, tmp_pa
     assert status == 0
     assert not list((tmp_path / "r").glob("*.png"))
     status, _, err = program("compare", scene_file, "-o", tmp_path / "r2", "--frames", 2)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert "pdcorrect[view]" in err
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from dataset_samples import sample_config, sample_shard, with_run, with_simulation
 from motion import trajectory
-from pdcorrect.data import checksum as seal
+from pdcorrect.data import checksum
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import (
@@ -112,13 +112,13 @@ def test_other_programs_read_the_file(shard, saved):
     with h5py.File(saved) as file:
         assert file.attrs["format"] == "pdcorrect-dataset"
         assert file.attrs["version"] == 1
-        assert file.userblock_size == seal.USER_BLOCK
+        assert file.userblock_size == checksum.USER_BLOCK
         np.testing.assert_array_equal(file["mesh/points"][()], shard.points)
         run = file["simulations/0001/runs/plain"]
         np.testing.assert_array_equal(
             run["predictions"][()], shard.simulations[1].runs["plain"].predictions.astype("f4")
         )
-    lines = saved.read_bytes()[: seal.USER_BLOCK].rstrip(b"\0").decode().splitlines()
+    lines = saved.read_bytes()[: checksum.USER_BLOCK].rstrip(b"\0").decode().splitlines()
     assert lines[:2] == ["pdcorrect-dataset 1", f"bytes {saved.stat().st_size}"]
     assert lines[2].startswith("sha256 ")
 
@@ -245,10 +245,10 @@ def test_other_formats_folders_and_pipes_are_refused(tmp_path):
 
 def test_another_version_is_named(saved, tmp_path, monkeypatch):
     path = tmp_path / "shard.h5"
-    monkeypatch.setattr(seal, "VERSION", 2)
+    monkeypatch.setattr(checksum, "VERSION", 2)
     resealed(path, saved.read_bytes())
     for expected in (1, 3):
-        monkeypatch.setattr(seal, "VERSION", expected)
+        monkeypatch.setattr(checksum, "VERSION", expected)
         for verify in (True, False):
             words = refusal(path, verify=verify)
             assert "version 2" in words
@@ -258,7 +258,7 @@ def test_another_version_is_named(saved, tmp_path, monkeypatch):
 def resealed(path, data):
     """Write bytes with a seal that fits them."""
     image = bytearray(data)
-    seal.seal(memoryview(image))
+    checksum.seal(memoryview(image))
     path.write_bytes(image)
 
 
@@ -567,7 +567,7 @@ def test_damaged_chunks_are_named_without_the_checksum(saved, tmp_path):
     with h5py.File(saved) as file:
         chunk = file[place].id.get_chunk_info(0)
     data = bytearray(saved.read_bytes())
-    data[seal.USER_BLOCK + chunk.byte_offset + chunk.size // 2] ^= 4
+    data[checksum.USER_BLOCK + chunk.byte_offset + chunk.size // 2] ^= 4
     path.write_bytes(data)
     assert "checksum" in refusal(path)
     assert "runs/plain/predictions of simulation 0001" in refusal(path, verify=False)

@@ -11,7 +11,6 @@ from motion import trajectory
 from pdcorrect import figures
 from pdcorrect.errors import InputError, MeshError, MissingExtraError, OutputError
 from pdcorrect.figures import curves
-from pdcorrect.figures import panels as offscreen
 
 pytest.importorskip("pyvista")
 pytest.importorskip("matplotlib")
@@ -390,9 +389,9 @@ def test_plotting_leaves_the_users_backend_alone(run, tmp_path):
 
 def test_drawing_is_probed_in_another_process(monkeypatch):
     assert figures.check_offscreen().startswith("ok (")
-    monkeypatch.setattr(offscreen, "_PROBE", "import os; os.abort()")
+    monkeypatch.setattr("pdcorrect.figures.panels._PROBE", "import os; os.abort()")
     assert "libegl1" in figures.check_offscreen()
-    monkeypatch.setattr(offscreen, "_PROBE", "import time; time.sleep(30)")
+    monkeypatch.setattr("pdcorrect.figures.panels._PROBE", "import time; time.sleep(30)")
     assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)
 
 

@@ -29,7 +29,7 @@ from fuzzing import (
     within_memory,
     within_seconds,
 )
-from pdcorrect.cli import common as cli
+from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.errors import MeshError, PdcorrectError, SceneError
 from pdcorrect.fem.mesh import corner_jacobians
 from pdcorrect.fem.mesh_files import read_hex_mesh
@@ -314,10 +314,10 @@ def test_damaged_scenes_leave_no_traceback_and_no_partial_output(program, tmp_pa
             return
         status, out, err = program("simulate", path, "-o", output, "--frames", 1)
         assert "Traceback" not in out + err
-        assert status in (0, cli.FAILED, cli.BAD_INPUT)
+        assert status in (0, FAILED, BAD_INPUT)
         if status:
             assert err.startswith("error: ")
-        if status == cli.BAD_INPUT:
+        if status == BAD_INPUT:
             assert not output.exists()
         elif output.exists():
             pc.load_trajectory(output)

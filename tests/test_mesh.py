@@ -18,11 +18,11 @@ from pdcorrect.fem.mesh import (
     refine,
     voxel_mesh,
 )
-from pdcorrect.scene import voxels as shapes
+from pdcorrect.scene import voxels
 
 
 def cross_mesh():
-    return voxel_mesh(*shapes.cross((6, 2, 2), 4, 3, 2, 1), 0.05)
+    return voxel_mesh(*voxels.cross((6, 2, 2), 4, 3, 2, 1), 0.05)
 
 
 def distorted_mesh():
@@ -145,12 +145,12 @@ def test_boundary_faces_point_outwards_and_close_the_body():
 
 
 def test_shapes_have_the_cells_they_promise():
-    solid, corner = shapes.cross((10, 2, 2), 4, 3, 2, 4)
+    solid, corner = voxels.cross((10, 2, 2), 4, 3, 2, 4)
     assert solid.sum() == 10 * 4 + 4 * 4 * 4
     assert corner == (0, 4, 4)
-    solid, corner = shapes.cross((10, 2, 2), 2, 3, 2, 4)
+    solid, corner = voxels.cross((10, 2, 2), 2, 3, 2, 4)
     assert solid.sum() == 10 * 4 + 2 * 4 * 4
-    solid, corner = shapes.weight((8, 2, 2), 6, 3, (2, 2, 7), 3, (4, 4, 2))
+    solid, corner = voxels.weight((8, 2, 2), 6, 3, (2, 2, 7), 3, (4, 4, 2))
     assert solid.sum() == 8 * 4 + (6 * 4 - 2 * 4) + 2 * 2 * 7 + (16 - 4) * 2
     np.testing.assert_array_equal(solid, solid[:, ::-1])  # symmetric across y
 
@@ -158,12 +158,12 @@ def test_shapes_have_the_cells_they_promise():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: shapes.cross((6, 2, 2), 4, 5, 2, 1), "at most the 6 cells"),
-        (lambda: shapes.weight((4, 2, 2), 0, 3, (2, 2, 4), 0, (2, 2, 2)), "at most the 4"),
-        (lambda: shapes.weight((8, 2, 2), 0, 3, (2, 2, 4), 3, (2, 2, 2)), "at most the 4"),
-        (lambda: shapes.weight((8, 2, 2), 0, 3, (2, 2, 4), 0, (3, 2, 2)), "even number"),
-        (lambda: shapes.weight((8, 2, 2), 5, 3, (2, 2, 4), 0, (2, 2, 2)), "second_support_length"),
-        (lambda: shapes.voxels(np.zeros((2, 2, 2))), "at least one 1"),
+        (lambda: voxels.cross((6, 2, 2), 4, 5, 2, 1), "at most the 6 cells"),
+        (lambda: voxels.weight((4, 2, 2), 0, 3, (2, 2, 4), 0, (2, 2, 2)), "at most the 4"),
+        (lambda: voxels.weight((8, 2, 2), 0, 3, (2, 2, 4), 3, (2, 2, 2)), "at most the 4"),
+        (lambda: voxels.weight((8, 2, 2), 0, 3, (2, 2, 4), 0, (3, 2, 2)), "even number"),
+        (lambda: voxels.weight((8, 2, 2), 5, 3, (2, 2, 4), 0, (2, 2, 2)), "second_support_length"),
+        (lambda: voxels.voxels(np.zeros((2, 2, 2))), "at least one 1"),
     ],
 )
 def test_impossible_shapes_are_refused(call, words):

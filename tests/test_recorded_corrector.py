@@ -15,7 +15,7 @@ from torch._subclasses.fake_tensor import (  # noqa: E402
 
 import pdcorrect as pc  # noqa: E402
 from hybrid_samples import fitted, problems  # noqa: E402
-from pdcorrect.corrector import recorded  # noqa: E402
+from pdcorrect.corrector import graph_replay  # noqa: E402
 from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts  # noqa: E402
 from pdcorrect.corrector.features import FeatureView, Snapshot  # noqa: E402
 from pdcorrect.corrector.gate import Reason  # noqa: E402
@@ -182,7 +182,7 @@ def test_a_recording_that_fails_leaves_nothing_behind(device, made, monkeypatch)
     def failing(device):
         raise MemoryError
 
-    monkeypatch.setattr(recorded, "Recorder", failing)
+    monkeypatch.setattr(graph_replay, "Recorder", failing)
     for _ in range(2):
         with pytest.raises(MemoryError):
             answers.of_view(motion.views[1])

@@ -10,7 +10,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect.cli import common as cli
+from pdcorrect.cli.common import BAD_INPUT
 
 weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
 
@@ -96,7 +96,7 @@ def test_a_hybrid_is_not_continued_as_something_else(program, learned, tmp_path,
     assert program("simulate", SCENE, "-o", path, "--frames", 1, "--model", MODEL)[0] == 0
     before = path.read_bytes()
     status, _, err = program("simulate", SCENE, "-o", path, "--frames", 2, "--resume", *other)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert str(path) in err
     assert path.read_bytes() == before
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_meant_is_refused_before_the_work(
 ):
     path = tmp_path / "run.h5"
     status, out, err = program("simulate", scene_file, "-o", path, *more)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert err.startswith("error: ")
     assert named in err
     assert "Traceback" not in out + err
@@ -125,13 +125,13 @@ def test_what_cannot_be_meant_is_refused_before_the_work(
 
 
 def test_a_model_of_an_unknown_base_is_named(learned, tmp_path, monkeypatch):
-    from pdcorrect.corrector import hybrid as released
+    from pdcorrect.corrector.hybrid import hybrid_of
 
     shutil.copytree(ROOT / "models" / "tiny", tmp_path / "odd")
     kind = type(pc.load_model(tmp_path / "odd"))
     monkeypatch.setattr(kind, "base", "coarsest")
     with pytest.raises(pc.errors.InputError, match="odd: corrects 'coarsest'"):
-        released.hybrid_of(pc.Scene.load(SCENE), tmp_path / "odd")
+        hybrid_of(pc.Scene.load(SCENE), tmp_path / "odd")
 
 
 def test_a_hybrid_in_one_call_has_the_gate_that_it_is_given():
@@ -152,7 +152,7 @@ def test_a_quasi_static_scene_is_refused_unless_the_model_was_trained_on_such(
     scene, path = tmp_path / "s.toml", tmp_path / "run.h5"
     scene.write_text(static.to_toml(), encoding="utf-8")
     status, _, err = program("simulate", scene, "-o", path, "--model", MODEL)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert f"{MODEL}: " in err
     assert "'quasi-static'" in err
     assert not path.exists()
@@ -179,7 +179,7 @@ def test_without_torch_the_extra_is_named(program, scene_file, tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "torch", None)
     path = tmp_path / "run.h5"
     status, _, err = program("simulate", scene_file, "-o", path, "--model", MODEL)
-    assert status == cli.BAD_INPUT
+    assert status == BAD_INPUT
     assert "pdcorrect[learn]" in err
     assert not path.exists()
     assert program("simulate", scene_file, "-o", path)[0] == 0  # which needs no torch

@@ -10,7 +10,7 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, problem_on
-from pdcorrect.batch import layer as torch_layer
+from pdcorrect.batch.layer import _Step
 from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import ConvergenceError, InputError
 from test_batch import VARIANTS, moving_states, on_every_device, unlike
@@ -474,7 +474,7 @@ def watched(monkeypatch, each_step=True):
     To count, all garbage is collected first, which takes longer than a step.
     """
     frames, counts = [], []
-    original = torch_layer._Step.forward
+    original = _Step.forward
 
     def kept():
         gc.collect()
@@ -487,7 +487,7 @@ def watched(monkeypatch, each_step=True):
             counts.append(kept())
         return out
 
-    monkeypatch.setattr(torch_layer._Step, "forward", staticmethod(watch))
+    monkeypatch.setattr(_Step, "forward", staticmethod(watch))
     return kept, counts
 
 

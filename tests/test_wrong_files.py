@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import pdcorrect as pc
-from pdcorrect.cli import common as cli
+from pdcorrect.cli.common import BAD_INPUT
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.errors import InputError, SceneError
 
@@ -57,7 +57,7 @@ def test_the_program_names_files_of_another_kind_and_folders(program, tmp_path):
         (("dataset", "generate", data.parent, "-o", output), data.parent),
     ):
         status, _, err = program(*arguments)
-        assert status == cli.BAD_INPUT
+        assert status == BAD_INPUT
         assert err.startswith(f"error: {named}: ")
     assert not any(tmp_path.iterdir())
 
