@@ -25,9 +25,8 @@ from hybrid_samples import (
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrected_step import Decision
-from pdcorrect.corrector.gate import Gate, Reason
+from pdcorrect.corrector.gate import PAUSE, Gate, Reason
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
-from pdcorrect.corrector.pause import PAUSE
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.io.trajectory import TrajectoryWriter
 from pdcorrect.solvers.rollout import continue_from

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -32,6 +31,23 @@ Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
 _DEEPEST_NESTING = 100
 _LONGEST_INTEGER = 1024  # bits; Python refuses to write out much longer ones
 _LONGEST_VALUE = 80  # characters of a value in a message
+_MOST_SENTENCES = 8  # of a message
+
+_WORDS = {
+    "dict_type": "expected a table of keys",
+    "float_type": "expected a number",
+    "int_type": "expected an integer",
+    "list_type": "expected a list",
+    "model_attributes_type": "expected a table of keys",
+    "model_type": "expected a table of keys",
+    "path_type": "expected a path",
+    "string_type": "expected a string",
+    "too_long": "expected a list of at most {max_length}, got {actual_length}",
+    "too_short": "expected a list of at least {min_length}, got {actual_length}",
+    "tuple_type": "expected a list",
+    "union_tag_invalid": "expected one of {expected_tags}",
+}
+"""By the type of pydantic's error, where its own words would tell of Python."""
 
 
 class Strict(BaseModel):
@@ -71,10 +87,10 @@ class TomlConfig(Checked):
         InputError
             If the file cannot be read, is not TOML, or a key is wrong.
         """
-        if not isinstance(path, (str, os.PathLike)) or "\n" in str(path):
+        if not isinstance(path, (str, Path)) or not str(path).strip() or "\n" in str(path):
             raise cls.error(f"path is {_shown(path)}: expected the path of a TOML file.")
         try:
-            text = Path(path).read_text(encoding="utf-8")
+            text = Path(path).read_text(encoding="utf-8-sig")
         except UnicodeDecodeError:
             raise cls.error(f"{path}: cannot be read (not a UTF-8 text file).") from None
         except (OSError, ValueError) as error:
@@ -87,11 +103,16 @@ class TomlConfig(Checked):
         """Read settings from TOML text; ``source`` names it in messages."""
         source = source or cls.source
         try:
-            return cls(**parse_toml(text))
-        except InputError as error:
-            raise cls.error(str(error).replace(f"{cls.source}:", f"{source}:", 1)) from None
+            data = parse_toml(text)
         except ValueError as error:
             raise cls.error(f"{source}: not valid TOML: {error}.") from None
+        if data and not set(data) & set(cls.model_fields):
+            found, expected = _listed(data), _listed(cls.model_fields)
+            raise cls.error(f"{source}: has {found}: expected a {cls.source}, with {expected}.")
+        try:
+            return cls(**data)
+        except InputError as error:
+            raise cls.error(str(error).replace(f"{cls.source}:", f"{source}:", 1)) from None
 
     def to_toml(self) -> str:
         """The settings as TOML, with every default written out."""
@@ -146,7 +167,10 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
     tables = _tables_of(model)
     items = error.errors()
     nested = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
-    sentences = dict.fromkeys(_sentence(x, tables) for x in items if x["loc"] not in nested)
+    every = dict.fromkeys(_sentence(x, tables) for x in items if x["loc"] not in nested)
+    sentences = list(every)[:_MOST_SENTENCES]
+    if len(every) > len(sentences):
+        sentences.append(f"And {len(every) - len(sentences)} more.")
     return " ".join(" ".join(sentences).split())
 
 
@@ -159,18 +183,16 @@ def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
     context = item.get("ctx", {})
     key = _key(location, tables, kind == "extra_forbidden")
     if kind == "extra_forbidden":
-        return f"{key}: unknown key; {_advice(str(location[-1]), key, tables)}"
+        return f"{key}: unknown key; {_advice(location, key, tables)}"
     if kind in ("union_tag_not_found", "union_tag_invalid"):  # wrong is the key that chooses
         chooses = str(context["discriminator"]).strip("'")
-        key, value = f"{key}.{chooses}", context.get("tag")
+        key, value = f"{key}.{chooses}", value.get(chooses) if isinstance(value, dict) else value
     if kind in ("missing", "union_tag_not_found"):
         return f"{key}: missing; a value is required."
-    told = {
-        "value_error": item["msg"].removeprefix("Value error, "),
-        "union_tag_invalid": f"expected one of {context.get('expected_tags')}",
-    }.get(kind, item["msg"].replace("Input should be", "expected"))
-    if value is not None or kind != "value_error":
-        key = f"{key} = {_shown(value)}" if key else ""
+    told = item["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
+    told = _WORDS[kind].format(**context) if kind in _WORDS else told
+    if key and (value is not None or kind != "value_error"):
+        key = f"{key} = {_shown(value)}"
     told = f"{key}: {told[:1].lower()}{told[1:]}" if key else told
     return told if told.endswith((".", "?")) else f"{told}."
 
@@ -189,35 +211,46 @@ def _key(location: tuple[int | str, ...], tables: Sequence[_Table], unknown: boo
             text += f".{part}"
             names = f"{names}.{part}".lstrip(".")
             tag_is_next = names in tagged
-    return text.lstrip(".")
+    return _cut(text.lstrip("."))
 
 
 def _shown(value: Any) -> str:
     if isinstance(value, BaseModel):
         value = value.model_dump(mode="json", exclude_none=True)
-    text = as_toml(value)
+    return _cut(as_toml(value))
+
+
+def _cut(text: str) -> str:
     return text if len(text) < _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."
 
 
-def _advice(name: str, key: str, tables: Sequence[_Table]) -> str:
+def _listed(names: Iterable[str]) -> str:
+    return _cut(", ".join(names))
+
+
+def _advice(location: tuple[int | str, ...], key: str, tables: Sequence[_Table]) -> str:
     """What an unknown key was probably meant for."""
-    header = ".".join(part for part in key.replace("]", "").replace("[", ".").split(".")[:-1])
-    own = f"[{'.'.join(part for part in header.split('.') if not part.isdigit())}]".strip("[]")
+    name = str(location[-1])
+    own = ".".join(part.partition("[")[0] for part in key.split(".")[:-1])
+    here = [table for table in tables if table[0].strip("[]") == own]
     homes = [table for table in tables if name in table[2]]
-    kinds = dict.fromkeys(choice for h, choice, _ in homes if h.strip("[]") == own and choice)
+    kinds = dict.fromkeys(choice for _, choice, keys in here if choice and name in keys)
     if kinds:
         return f"it goes with {' or '.join(kinds)}."
-    below = [table for table in homes if own and table[0].strip("[]").startswith(own)]
-    homes = below or homes
+    near = [table for table in homes if own and table[0].strip("[]").startswith(f"{own}.")]
     if homes:
-        return f"it belongs to {' or '.join(dict.fromkeys(h or 'the top' for h, _, _ in homes))}."
-    for here in (True, False):
-        keys = {k for h, _, keys in tables if (h.strip("[]") == own) is here for k in keys}
-        close = get_close_matches(name, sorted(keys), n=1, cutoff=0.65 if here else 0.8)
-        close = close or [k for k in sorted(keys) if name in k.split("_")][:1]
+        headers = dict.fromkeys(header or "the top" for header, _, _ in near or homes)
+        return f"it belongs to {' or '.join(headers)}."
+    chosen = [t for t in here if not t[1] or any(t[1].endswith(f'"{x}"') for x in location[:-1])]
+    for group, cutoff in ((chosen, 0.65), (here, 0.65), (tables, 0.8)):
+        known = sorted({k for _, _, keys in group for k in keys})
+        close = get_close_matches(name, known, n=1, cutoff=cutoff)
+        close = close or [k for k in known if name in k.split("_")][:1]
         if close:
-            header = min(h for h, _, keys in tables if close[0] in keys) or "the top"
-            return f"did you mean {close[0]}{'' if here else f' of {header}'}?"
+            header, choice, _ = next(table for table in group if close[0] in table[2])
+            where = f", which goes with {choice}" if group is here and choice else ""
+            where = f" of {header or 'the top'}" if group is tables else where
+            return f"did you mean {close[0]}{where}?"
     return "remove it or check its spelling."
 
 

@@ -64,16 +64,11 @@ def check_models(models: Sequence[str], gate: bool) -> None:
         If correctors cannot be run here.
     """
     if any(not model.strip() for model in models):
-        raise InputError(
-            "--model '': an empty name: expected the name of a folder in models, or a path."
-        )
+        raise InputError("--model '': expected the name of a model, or the path of its folder.")
     if models:
         require_extra("torch", "learn")
     elif not gate:
-        raise InputError(
-            "--no-gate without --model: there is no corrector whose gate could be left out: "
-            "expected --model NAME beside it; leave --no-gate out."
-        )
+        raise InputError("--no-gate without --model: expected --model NAME beside it.")
 
 
 def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -> Any:

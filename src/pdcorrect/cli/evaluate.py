@@ -83,7 +83,7 @@ def evaluate(
 
 def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
-    from pdcorrect.evaluation.report import refused_corrections
+    from pdcorrect.evaluation.report import grouped, refused_corrections
 
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
@@ -92,26 +92,25 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
             f"{len(found.missing)} of {count} files of the split are missing: all figures are of "
             "the others."
         )
+    told: list[tuple[str, str]] = []
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
-    for one in saved:
-        run = found.runs[one.candidate.name]
-        refused = refused_corrections(r for t in run.trajectories for r in t.reasons)
-        notes += [f"{one.candidate.name}: {refused}"] if refused else []
+        rollouts = found.runs[one.candidate.name].trajectories
+        reasons = [reason for rollout in rollouts for reason in rollout.reasons]
+        told.append((one.candidate.name, refused_corrections(reasons, runs=len(rollouts))))
     for name, run in found.runs.items():
-        notes += [
-            f"{name}: {count} of {len(run.trajectories)} trajectories have no {measure}; its mean "
-            "is that of the others."
-            for measure, count in run.gaps().items()
-        ]
+        count = len(run.trajectories)
+        lacking = ", ".join(f"{n} no {measure}" for measure, n in run.gaps().items())
+        told.append((name, f"of {count} trajectories {lacking}: left out there." * bool(lacking)))
         failures = run.failures()
         if failures:
             first = failures[0]
-            notes.append(
-                f"{name} failed in {len(failures)} of {len(run.trajectories)} trajectories, first "
-                f"on mesh {first.mesh}, simulation {first.simulation}, step {first.failed}: held "
-                "from there on, and counted so."
-            )
+            told.append((
+                name,
+                f"failed in {len(failures)} of {count} trajectories, first on mesh {first.mesh}, "
+                f"simulation {first.simulation}, step {first.failed}: held from there on.",
+            ))  # fmt: skip
+    notes += grouped((name, text) for name, text in told if text)
     return notes
 
 

@@ -72,7 +72,7 @@ def simulate(
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
-        _corrections(log.arrays())
+        _corrections(log.arrays(), getattr(stepper, "trained_step", ""))
         say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
@@ -85,15 +85,10 @@ def simulate(
 
 def _check_corrected(model: str, solver: SolverName, refine: int) -> None:
     """Refuse what a corrector is not for."""
-    if refine != 1:
+    if refine != 1 or solver is not SolverName.pd:
         raise InputError(
-            f"--refine {refine} with --model {model}: a corrector is for the scene's coarse mesh: "
-            "expected --refine 1; leave it out, or run the finer mesh without a model."
-        )
-    if solver is not SolverName.pd:
-        raise InputError(
-            f"--solver {solver} with --model {model}: a corrector is run on projective dynamics: "
-            "expected --solver pd; leave it out, or run Newton without a model."
+            f"--model {model} with --refine {refine} --solver {solver}: a corrector is for "
+            "projective dynamics on the coarse mesh: expected --refine 1 and --solver pd."
         )
 
 
@@ -110,13 +105,15 @@ def _make_stepper(
 
 
 def _told_of_model(stepper: Stepper) -> str:
-    """Which model corrects; empty without one."""
+    """Which model corrects, and whether it knows the scene's integrator; empty without one."""
     about = getattr(stepper, "origin", None)
     if not about:
         return ""
+    trained, now = about["trained_integrator"], stepper.problem.scene.time.integrator
+    other = "" if trained == now else f"; the scene has {now}, for which it may be of no use"
     return (
         f"model {about['model']} on the base {about['base']}, trained on {about['dataset']} with "
-        f"{about['trained_integrator']}"
+        f"{trained}{other}"
     )
 
 
@@ -213,7 +210,7 @@ def _described(stepper: Stepper) -> dict[str, str]:
     return told
 
 
-def _corrections(stats: dict[str, Any]) -> None:
+def _corrections(stats: dict[str, Any], trained_step: str) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
     from pdcorrect.evaluation.report import refused_corrections
 
@@ -221,7 +218,7 @@ def _corrections(stats: dict[str, Any]) -> None:
         return
     if not stats["refused"].all():
         say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
-    say(refused_corrections(stats["gate"]))
+    say(refused_corrections(stats["gate"], trained_step))
 
 
 def _other_work(stats: dict[str, Any]) -> str:

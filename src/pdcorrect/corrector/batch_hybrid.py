@@ -22,7 +22,7 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrected_step import corrected_step
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import FeatureView
-from pdcorrect.corrector.gate import Gate, GateMeasures, check_gate
+from pdcorrect.corrector.gate import PAUSE, Gate, GateMeasures, check_gate, steps_left
 from pdcorrect.corrector.graph_replay import (
     UNRECORDABLE,
     RecordedCorrector,
@@ -30,7 +30,6 @@ from pdcorrect.corrector.graph_replay import (
     recordable,
     stored_and_ratios,
 )
-from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Values, Velocity, check_velocity, moved
 from pdcorrect.errors import InputError
 

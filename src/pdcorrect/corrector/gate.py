@@ -7,7 +7,7 @@ not finite, and those of steps that the coarse solver failed, are refused withou
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Annotated, ClassVar
@@ -73,7 +73,7 @@ def refusals(reasons: Iterable[float]) -> tuple[Refusal, ...]:
     reasons : iterable of numbers of `Reason`
         Of each step, such as ``run.stats["gate"]``.
     """
-    counts = Counter(Reason(int(number)) for number in reasons if number)
+    counts = Counter(Reason(int(number)) for number in reasons if number > 0)
     return tuple(Refusal(reason, steps) for reason, steps in counts.most_common())
 
 
@@ -285,3 +285,18 @@ def check_gate(gate: object, corrector: Corrector) -> None:
             f"gate.limit with placement {placement!r}: expected placement 'state', whose answers "
             "can be scaled back without solving again."
         )
+
+
+PAUSE = "gate_pause"
+"""For how many steps more a gate is shut, in the memory of states; absent where it is open."""
+
+
+def steps_left(gate: Gate | None, memory: Mapping[str, Values]) -> Values | None:
+    """For how many steps the gate of each scene is shut, (1,) or (B,); None where none is.
+
+    Never for more than its own pause, whichever gate counted before.
+    """
+    if gate is None or PAUSE not in memory:
+        return None
+    kept = memory[PAUSE]
+    return kept[..., 0, 0].reshape(-1).clip(max=gate.pause)

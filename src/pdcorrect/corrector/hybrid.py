@@ -23,9 +23,8 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
 from pdcorrect.corrector.corrected_step import Decision, corrected_step
 from pdcorrect.corrector.corrector import Answers, Corrector
-from pdcorrect.corrector.gate import Gate, check_gate
+from pdcorrect.corrector.gate import PAUSE, Gate, check_gate, steps_left
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
-from pdcorrect.corrector.pause import PAUSE, steps_left
 from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError

@@ -108,7 +108,8 @@ def _of_the_solver(comparison: Comparison) -> str:
     material, effective = comparison.scene.material, comparison.scene.material.effective
     told = (
         f"The energy's small-strain moduli are E = {effective.young:.6g} Pa and ν = "
-        f"{effective.poisson:.4g} (asked for: {material.young:.6g} and {material.poisson:g}). "
+        f"{effective.poisson:.4g} (asked for: {material.young:.6g} and {material.poisson:g}"
+        f"{'; regions have others' if comparison.scene.materials else ''}). "
         f"PD stops at {comparison.scene.solver.tolerance:g} of a coarse cell, Newton at 1e-10"
     )
     if comparison.solver_error is not None:
@@ -142,24 +143,36 @@ def _of_the_models(comparison: Comparison) -> str:
     for label, about in comparison.models.items():
         trained, now = about["trained_integrator"], comparison.scene.time.integrator
         step = f" with {trained}, not {now}" if trained != now else ""
-        refused = (
-            refused_corrections(comparison.runs[label].stats["gate"])
-            if label in comparison.runs
-            else ""
-        )
-        told.append(f"{label} was trained on {about['dataset']}{step}. {refused}".strip())
-    return " ".join(told)
+        text = f"trained on {about['dataset']}{step}, elsewhere it may be of no use."
+        if label in comparison.runs:
+            run = comparison.runs[label]
+            refused = refused_corrections(run.stats["gate"], run.attributes["trained_step"])
+            text = f"{text} {refused}".strip()
+        told.append((label, text))
+    return " ".join(grouped(told))
 
 
-def refused_corrections(reasons: Iterable[float]) -> str:
-    """One sentence: how many corrections of a run were refused, and why; empty if none was.
+def grouped(told: Iterable[tuple[str, str]]) -> list[str]:
+    """Sentences with the names that they are told of, each sentence once."""
+    names: dict[str, list[str]] = {}
+    for name, text in told:
+        names.setdefault(text, []).append(name)
+    return [f"{', '.join(every)}: {text}" for text, every in names.items()]
+
+
+def refused_corrections(reasons: Iterable[float], trained_step: str = "", runs: int = 1) -> str:
+    """One sentence: how many corrections were refused, and why; empty if none was.
 
     Parameters
     ----------
     reasons : iterable of numbers of `pdcorrect.corrector.gate.Reason`
         Of each step, 0 where it was corrected.
+    trained_step : str
+        See `HybridStepper.trained_step`; told where it is the reason.
+    runs : int
+        Of which the steps are.
     """
-    from pdcorrect.corrector.gate import refusals
+    from pdcorrect.corrector.gate import Reason, refusals
 
     every = list(reasons)
     found = refusals(every)
@@ -167,8 +180,11 @@ def refused_corrections(reasons: Iterable[float]) -> str:
         return ""
     total = sum(one.steps for one in found)
     counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
-    alone = ": the run is that of the coarse model alone" if total == len(every) else ""
-    return f"{total} of {len(every)} corrections were refused ({counts}){alone}."
+    if trained_step and any(one.reason is Reason.TIME_STEP for one in found):
+        counts += f", {trained_step} for cells of this size"
+    alone = "the run is" if runs == 1 else "all runs are"
+    rest = f": {alone} of the coarse model alone" if total == len(every) else ""
+    return f"{total} of {len(every)} corrections were refused ({counts}){rest}."
 
 
 def _of_the_faults(comparison: Comparison) -> str:

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem import kernels as tangent_kernels
+from pdcorrect.fem import kernels
 from pdcorrect.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Assembly:
         """Sum cell-wise node blocks (C, K, K, 3, 3) into (3N, 3N)."""
         indptr, indices, place = self._pattern
         data = np.zeros((len(indices), 3, 3))
-        tangent_kernels.add_blocks(place, blocks.reshape(-1, 3, 3), data)
+        kernels.add_blocks(place, blocks.reshape(-1, 3, 3), data)
         size = 3 * self._count
         return sp.bsr_matrix((data, indices, indptr), shape=(size, size)).tocsr()
 
@@ -79,7 +79,7 @@ class Linearisation:
         """Tangent times x, both (N, 3), without assembling."""
         self.assembly.check(x)
         assembly, out = self.assembly, np.empty_like(x)
-        tangent_kernels.apply_linearised(
+        kernels.apply_linearised(
             x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
             np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
         )  # fmt: skip
@@ -93,7 +93,7 @@ class Linearisation:
         """The tangent of each cell, (C, L, L, 3, 3), N/m."""
         count, width = self.assembly.cells.shape
         blocks = np.empty((count, width, width, 3, 3))
-        tangent_kernels.cell_stiffness(
+        kernels.cell_stiffness(
             self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
         )
         return blocks

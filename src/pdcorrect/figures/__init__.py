@@ -28,7 +28,7 @@ from pdcorrect.figures.panels import (
     Image,
     Painter,
     check_offscreen,
-    replacing,
+    picture_file,
     shown_points,
     write_film,
     write_png,
@@ -139,7 +139,7 @@ def render(
     width = (window or (_FILM if film else _STILL)) if columns > 1 else (window or 900)
     picture = _Picture(bodies, names, colour, film, round(width * scale))
     try:
-        with replacing(output) as part:
+        with picture_file(output) as part:
             if film:
                 write_film(part, picture.pages(), fps)
             else:
@@ -206,7 +206,7 @@ def render_overlay(
     sheet = Sheet(view, [""], 1, None, _font(window, 2), longest=time, key=key)
     painter = Painter(bodies, view, "viridis", 1.0, rest=False, colours=colours)
     try:
-        with replacing(output) as part:
+        with picture_file(output) as part:
             write_png(part, sheet.page([painter.overlay(0)], [time]))
     finally:
         painter.close()

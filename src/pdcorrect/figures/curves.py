@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError, require_extra
-from pdcorrect.figures.panels import replacing
+from pdcorrect.figures.panels import picture_file
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ def _save(figure: Any, output: str | Path) -> Path:
     known = figure.canvas.get_supported_filetypes()
     if suffix not in known:
         raise InputError(f"{output}: expected a name ending in .{', .'.join(sorted(known))}.")
-    with replacing(Path(output)) as part:
+    with picture_file(Path(output)) as part:
         figure.savefig(part, dpi=150)
     return Path(output)
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pdcorrect import _files as replacement
+from pdcorrect._files import replacing
 from pdcorrect.errors import InputError, OutputError, require_extra
 from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
 from pdcorrect.trajectory import Trajectory
@@ -258,7 +258,7 @@ Image = NDArray[np.uint8]
 
 
 @contextlib.contextmanager
-def replacing(output: Path) -> Iterator[Path]:
+def picture_file(output: Path) -> Iterator[Path]:
     """A name to write to, which becomes ``output`` when all is written."""
     if output.is_dir():
         raise OutputError(f"{output}: is a folder; give the name of a file in it.")
@@ -266,7 +266,7 @@ def replacing(output: Path) -> Iterator[Path]:
         raise OutputError(f"{output}: there is no folder {output.parent}; create it first.")
     part = output.with_name(f"{output.stem}.part{output.suffix}")
     try:
-        with replacement.replacing(output, part):
+        with replacing(output, part):
             yield part
     except OSError as error:
         raise OutputError(f"{output}: cannot be written ({error.strerror or error}).") from error

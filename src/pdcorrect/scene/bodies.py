@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import Cells, Count, Positive, PositiveCount, Strict, Vector
-from pdcorrect.scene import voxels as shapes
+from pdcorrect.scene import voxels
 
 
 class _VoxelBody(Strict):
@@ -23,9 +23,9 @@ class Beam(_VoxelBody):
     shape: Literal["beam"]
     cells: Cells
 
-    def occupancy(self) -> shapes.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `shapes`."""
-        return shapes.beam(self.cells)
+    def occupancy(self) -> voxels.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
+        return voxels.beam(self.cells)
 
 
 class Cross(_VoxelBody):
@@ -38,9 +38,9 @@ class Cross(_VoxelBody):
     arm_width: PositiveCount = 2
     arm_length: PositiveCount
 
-    def occupancy(self) -> shapes.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `shapes`."""
-        return shapes.cross(self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length)
+    def occupancy(self) -> voxels.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
+        return voxels.cross(self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length)
 
 
 class Weight(_VoxelBody):
@@ -54,9 +54,9 @@ class Weight(_VoxelBody):
     weight_start: Count
     weight_cells: Cells
 
-    def occupancy(self) -> shapes.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `shapes`."""
-        return shapes.weight(
+    def occupancy(self) -> voxels.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
+        return voxels.weight(
             self.support_cells,
             self.second_support_length,
             self.pendulum_start,
@@ -80,9 +80,9 @@ class Voxels(_VoxelBody):
             raise ValueError("expected all planes and rows of occupancy to have the same length")
         return self
 
-    def occupancy(self) -> shapes.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `shapes`."""
-        return shapes.voxels(np.array(self.occupancy_list))
+    def occupancy(self) -> voxels.Occupancy:
+        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
+        return voxels.voxels(np.array(self.occupancy_list))
 
 
 class MeshFile(Strict):
