@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-SOURCE = Path(__file__).parent.parent / "src" / "pdcorrect"
+ROOT = Path(__file__).parent.parent
+SOURCE = ROOT / "src" / "pdcorrect"
+TINY = ROOT / "datasets" / "tiny"
 LAYERS = [
     "_version", "errors", "_config", "_files", "_environment", "state", "scene", "fem",
     "trajectory", "solvers", "metrics", "figures", "io", "batch", "corrector", "data", "training",
@@ -107,6 +109,27 @@ def test_stepping_loads_neither_torch_nor_files_nor_pictures():
 def test_rendering_does_not_load_torch():
     code = "import pdcorrect.figures\nimport pdcorrect.evaluation.report"
     assert "torch" not in loaded_after(code)
+
+
+WITHOUT_TORCH = (
+    "data.check", "data.generate", "data.import_files", "data.summary", "io.trajectory",
+    "evaluation.compare", "cli.program",
+)  # fmt: skip
+
+
+def test_data_sets_files_comparisons_and_the_program_do_not_load_torch():
+    modules = ", ".join(f"pdcorrect.{name}" for name in WITHOUT_TORCH)
+    assert "torch" not in loaded_after(f"import {modules}")
+
+
+def test_a_data_set_is_checked_without_torch():
+    code = (
+        "import sys\nsys.modules['torch'] = None\n"
+        "from pdcorrect.cli import main\n"
+        f"sys.argv = ['pdcorrect', 'dataset', 'check', {str(TINY)!r}]\nmain()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_public_names_exist():

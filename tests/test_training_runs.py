@@ -209,18 +209,6 @@ def test_the_command_trains_stops_in_time_and_goes_on(short, tmp_path, program):
 
 # --- several processes -------------------------------------------------------------------
 
-_WORKER = """
-import sys
-from pdcorrect.training.training import Training
-from pdcorrect.training.recipe import TrainingConfig
-from pdcorrect.training.distributed import joined
-import torch
-torch.set_num_threads(1)
-with joined("cpu") as (world, device):
-    assert world.size == 2
-    Training(TrainingConfig.load(sys.argv[1]), sys.argv[2], sys.argv[3], world=world).run()
-"""
-
 
 @pytest.mark.slow  # two processes import torch, and join
 def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
@@ -228,11 +216,9 @@ def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
         samples.one_step(iterations=3, batch=2), checkpoint_every={"iterations": 3}
     )
     (tmp_path / "c.toml").write_text(settings.to_toml())
-    script = tmp_path / "worker.py"
-    script.write_text(_WORKER)
     command = [
         sys.executable, "-m", "torch.distributed.run", "--nproc-per-node=2", "--standalone",
-        str(script), str(tmp_path / "c.toml"), str(folder), str(tmp_path / "out"),
+        "-m", "pdcorrect", "train", tmp_path / "c.toml", "--data", folder, "-o", tmp_path / "out",
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
