@@ -185,7 +185,7 @@ def test_a_row_whose_corrections_are_all_refused_is_the_base_and_says_so(stiff, 
     assert found.rows[1].refused_frames == 2
     name = f"hybrid {MODEL} (all refused)"
     assert [line[0] for line in report.table(found)] == ["best coarse PD", name]
-    assert any(f"{hybrid.label} " in note and "2 of 2" in note for note in report.notes(found))
+    assert any(f"{hybrid.label}: " in note and "2 of 2" in note for note in report.notes(found))
     assert f"| {name} |" in report.write_report(found, tmp_path, draw=False).read_text()
     np.testing.assert_array_equal(
         found.runs[hybrid.label].positions, found.runs["best coarse PD"].positions

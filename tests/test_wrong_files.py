@@ -33,7 +33,8 @@ def test_a_file_of_another_kind_is_refused_by_name_and_key(kind, other):
         (path, kind.load),
         ("own", lambda p: kind.from_toml(p.read_text(), "own")),
     ):
-        with pytest.raises(kind.error, match=rf"^{source}: .*: (unknown key|missing)"):
+        key = next(k for k in tomllib.loads(path.read_text()) if k not in kind.model_fields)
+        with pytest.raises(kind.error, match=rf"^{source}: .*\b{key}\b"):
             load(path)
 
 

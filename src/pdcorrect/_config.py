@@ -165,7 +165,7 @@ def as_toml(value: object) -> str:
 def explained(error: ValidationError, model: type[BaseModel]) -> str:
     """One paragraph: each wrong key, its value, and what was expected."""
     tables = _tables_of(model)
-    items = error.errors()
+    items = sorted(error.errors(), key=lambda x: x["type"] != "extra_forbidden")
     nested = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
     every = dict.fromkeys(_sentence(x, tables) for x in items if x["loc"] not in nested)
     sentences = list(every)[:_MOST_SENTENCES]

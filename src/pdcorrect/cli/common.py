@@ -72,17 +72,7 @@ def check_models(models: Sequence[str], gate: bool) -> None:
 
 
 def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -> Any:
-    """A `rich.progress.Progress`: what, how far, and the time that is left.
-
-    Parameters
-    ----------
-    unit : str
-        Of what is counted.
-    hidden : bool
-        Whether to print nothing.
-    apart : bool
-        On standard error, so that standard output holds only results.
-    """
+    """A `rich.progress.Progress`, which counts in ``unit``; ``apart``: on standard error."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
