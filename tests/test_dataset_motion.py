@@ -1,4 +1,4 @@
-"""`check_dataset` on files whose seal, hash and manifest are in order and whose motion is not."""
+"""What a check finds wrong in the motions of a data set that could be read."""
 
 import json
 import shutil

@@ -60,6 +60,14 @@ class MissingExtraError(PdcorrectError, ImportError):
     """An optional dependency is not installed."""
 
 
+EXTRAS = {
+    "torch": "learn", "torch_geometric": "learn", "safetensors": "learn", "tensorboard": "learn",
+    "pyvista": "view", "matplotlib": "view", "imageio": "view", "dask": "cluster",
+    "distributed": "cluster",
+}  # fmt: skip
+"""Optional dependencies, by the extra that contains them."""
+
+
 def require_extra(module: str, extra: str) -> ModuleType:
     """Import an optional dependency, or say how to install it.
 

@@ -39,8 +39,8 @@ def tell_of_compiling() -> None:
         def on_start(self, event: object) -> None:
             if not self.done:
                 typer.echo(
-                    "compiling kernels, which takes up to a minute or two; they are kept on disk "
-                    "for the next time",
+                    "compiling kernels, which takes a few minutes; they are kept on disk for the "
+                    "next time",
                     err=True,
                 )
             self.done = True
@@ -85,22 +85,16 @@ def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -
 
     counted = (TextColumn(unit),) if unit else ()
     return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *counted,
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), *counted,
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), disable=hidden,
         console=Console(stderr=apart),
     )  # fmt: skip
 
 
 class FileLines:
-    """Prints a line for each finished file of a data set, for logs: see `OnFile`.
+    """Prints a line for each finished file of a data set: see `OnFile`.
 
-    Seconds since the start, the file, simulations that are there of all, and the seconds that
-    the rest takes at the pace until now.
-
-    Attributes
-    ----------
-    done, total : int
-        Simulations that are there, and that were asked for; 0 until that is known.
+    ``done`` and ``total`` are simulations that are there and that were asked for.
     """
 
     def __init__(self) -> None:

@@ -111,9 +111,9 @@ def _print_table(comparison: Comparison) -> None:
 
     from pdcorrect.evaluation import report
 
-    console = Console()
+    console = Console(markup=False)
     if not console.is_terminal:  # a file or a pipe, which has no width
-        console = Console(width=_WIDE)
+        console = Console(width=_WIDE, markup=False)
     table = Table(
         title=comparison.scene.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )

@@ -116,7 +116,7 @@ def info(
 
     with _progress("reading", len(dataset_files(folder))) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
-    console = Console() if sys.stdout.isatty() else Console(width=200)
+    console = Console(width=None if sys.stdout.isatty() else 200, markup=False)
     console.print(found.tables())
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)

@@ -20,8 +20,9 @@ def doctor() -> None:
     checks = look()
     table = Table("what", "found", "")
     for check in checks:
-        table.add_row(check.name, check.found, "ok" if check.ok else "PROBLEM")
-    Console().print(table)
+        state = "optional" if "missing" in check.found else "ok"
+        table.add_row(check.name, check.found, state if check.ok else "PROBLEM")
+    Console(markup=False).print(table)
     if not all(check.ok for check in checks):
         raise typer.Exit(FAILED)
 

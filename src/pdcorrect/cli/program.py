@@ -19,7 +19,7 @@ from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
 from pdcorrect.cli.train import train
 from pdcorrect.cli.validate import validate
-from pdcorrect.errors import ConvergenceError, OutputError, PdcorrectError
+from pdcorrect.errors import EXTRAS, ConvergenceError, OutputError, PdcorrectError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -62,6 +62,12 @@ def main() -> None:
         _stop(str(error), FAILED)
     except PdcorrectError as error:
         _stop(str(error), BAD_INPUT)
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRAS:
+            raise
+        install = f"pip install 'pdcorrect[{EXTRAS[module]}]'"
+        _stop(f"{module} is needed for this and is not installed: {install}", BAD_INPUT)
     except MemoryError:
         _stop("not enough memory: use a smaller --refine.", FAILED)
 

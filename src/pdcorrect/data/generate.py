@@ -17,12 +17,11 @@ from pdcorrect._files import clear_parts, make_folder, write_text
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.produce import shard_path
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_arrays import read_header
 from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.data.simulate import lacking, work_per_node
-from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed
+from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, shard_path
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _MOST_DIFFERENCES = 5

@@ -25,6 +25,9 @@ from pdcorrect.trajectory import Trajectory
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 
+_NOT_UNIQUE = 100.0
+"""Tolerances by which PD and Newton differ where they have taken different branches."""
+
 HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
 )  # fmt: skip
@@ -86,6 +89,8 @@ def _of_the_errors(comparison: Comparison) -> str:
 def _of_the_reference(comparison: Comparison) -> str:
     """What is left of the reference's own error, in space and in time."""
     run = comparison.runs[comparison.reference]
+    if comparison.scene.time.integrator == "quasi-static":
+        return f"The reference ({_discretisation(run)}) has a mesh error of its own."
     lost = _lost_share(run)
     share = "" if lost is None else f" (it dissipates {100 * lost:.0f} % of the loads' work)"
     return (
@@ -114,6 +119,13 @@ def _of_the_solver(comparison: Comparison) -> str:
     )
     if comparison.solver_error is not None:
         told += f"; on the coarse mesh they differ by {1e3 * comparison.solver_error:.2g} mm"
+        problem = comparison.runs[comparison.reference].problem
+        unit = 0.0 if problem is None else comparison.scene.solver.tolerance * problem.cell_size
+        if comparison.solver_error > _NOT_UNIQUE * unit > 0.0:
+            told += (
+                ", far more than that: the motion seems not to be unique (does the body buckle?), "
+                "and distances from one reference mean little"
+            )
     return f"{told}."
 
 
