@@ -63,12 +63,12 @@ def rewrite_weights(folder, change):
     rewrite_json(folder, lambda content: content.update(weights_sha256=digest))
 
 
-def rewrite_json(folder, change, seal=True):
-    """Change the content, and its checksum with it."""
+def rewrite_json(folder, change, fits=True):
+    """Change the content, and its checksum with it unless it is not to fit."""
     content = json.loads((folder / JSON).read_text())
     checksum = content.pop("checksum")
     change(content)
-    checksum = content_digest(content) if seal else checksum
+    checksum = content_digest(content) if fits else checksum
     (folder / JSON).write_text(json.dumps({**content, "checksum": checksum}))
 
 
@@ -410,20 +410,20 @@ def test_other_versions_are_refused_with_both_versions(model, version, shown):
 @pytest.mark.parametrize("version", [1, 4, 0, "6", 6.0, True, None])
 def test_an_altered_version_is_damage_and_no_other_version(model, version):
     """A newer version alone may have another checksum."""
-    rewrite_json(model, put_json("version", value=version), seal=False)
+    rewrite_json(model, put_json("version", value=version), fits=False)
     with pytest.raises(FileFormatError, match=JSON) as refusal:
         load_model(model)
     assert not isinstance(refusal.value, FileVersionError)
-    rewrite_json(model, put_json("version", value=7), seal=False)
+    rewrite_json(model, put_json("version", value=7), fits=False)
     with pytest.raises(FileVersionError, match="7: expected 5"):
         load_model(model)
 
 
 def test_a_changed_entry_is_found_by_the_checksum(model):
-    rewrite_json(model, put_json("record", "metrics", "omega", value=99.0), seal=False)
+    rewrite_json(model, put_json("record", "metrics", "omega", value=99.0), fits=False)
     with pytest.raises(FileFormatError, match=rf"{JSON}: damaged: its checksum"):
         load_model(model)
-    rewrite_json(model, lambda content: content.clear() or content.update(format="x"), seal=False)
+    rewrite_json(model, lambda content: content.clear() or content.update(format="x"), fits=False)
     with pytest.raises(FileFormatError, match="expected format"):
         load_model(model)
 

@@ -246,7 +246,7 @@ def test_other_formats_folders_and_pipes_are_refused(tmp_path):
 def test_another_version_is_named(saved, tmp_path, monkeypatch):
     path = tmp_path / "shard.h5"
     monkeypatch.setattr(checksum, "VERSION", 2)
-    resealed(path, saved.read_bytes())
+    with_checksum(path, saved.read_bytes())
     for expected in (1, 3):
         monkeypatch.setattr(checksum, "VERSION", expected)
         for verify in (True, False):
@@ -255,19 +255,19 @@ def test_another_version_is_named(saved, tmp_path, monkeypatch):
             assert str(expected) in words
 
 
-def resealed(path, data):
-    """Write bytes with a seal that fits them."""
+def with_checksum(path, data):
+    """Write bytes with a checksum that fits them."""
     image = bytearray(data)
     checksum.seal(memoryview(image))
     path.write_bytes(image)
 
 
 def edited(saved, path, edit):
-    """A copy whose HDF5 content ``edit`` has changed, with a seal that fits."""
+    """A copy whose HDF5 content ``edit`` has changed, with a checksum that fits."""
     shutil.copy(saved, path)
     with h5py.File(path, "r+") as file:
         edit(file)
-    resealed(path, path.read_bytes())
+    with_checksum(path, path.read_bytes())
 
 
 def replaced(place, values):

@@ -1,4 +1,4 @@
-"""What a check finds wrong in the motions of a data set that could be read."""
+"""`check_dataset` on files whose checksums and manifest are in order and whose motion is not."""
 
 import json
 import shutil
