@@ -10,6 +10,7 @@ _MOTIONS = ("impulse", "stretch", "torsion")
 _METHODS = {
     "plain": "coarse PD",
     "plain, Newton": "coarse Newton",
+    "fitted stiffness": "modulus fitted to this very scene",
     "best": "best coarse PD",
     "hybrid, {}-exact": "corrected best coarse",
     "plain 2×2×2": "intermediate PD (2×2×2)",

@@ -20,12 +20,17 @@ def read(path: str | Path) -> Any:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """``value`` to ``digits`` significant digits; a dash for none."""
+    """``value`` to ``digits`` significant digits; a dash for none.
+
+    >>> [number(x) for x in (0.9996, 9.996, 99.94, 99.96, 1234.5, None)]
+    ['1.00', '10.0', '99.9', '100', '1234', '–']
+    >>> [number(x, 2) for x in (9.94, 9.96, 0.0)]
+    ['9.9', '10', '0.0']
+    """
     if value is None:
         return "–"
-    if abs(value) >= 10 ** (digits - 1):
-        return f"{value:.0f}"
-    return f"{value:#.{digits}g}"
+    text = f"{value:.0f}" if abs(value) >= 10 ** (digits - 1) else f"{value:#.{digits}g}"
+    return text.removesuffix(".")  # 9.96 to two digits is "10."
 
 
 def percent(value: float, digits: int = 1) -> str:

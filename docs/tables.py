@@ -16,6 +16,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import benchmark_tables
@@ -30,9 +31,9 @@ _SKIPPED = {".git", ".venv", "node_modules", "_build"}
 # --- the tables ------------------------------------------------------------------------------
 
 
-def demo() -> Rows:
-    """The comparison of `make demo`."""
-    record = read(RECORDS / "unseen_cross.json")
+def comparison(name: str) -> Rows:
+    """A run of ``pdcorrect compare`` with the model torsion-exact."""
+    record = read(RECORDS / f"{name}.json")
     labels = (
         "coarse PD",
         "best coarse PD",
@@ -59,7 +60,8 @@ def _millimetres(metres: float | None, reference: bool) -> str:
 
 
 TABLES: dict[str, Callable[[], Rows]] = {
-    "demo": demo,
+    "demo": partial(comparison, "unseen_cross"),
+    "twisted-cross": partial(comparison, "twisted_cross"),
     **dict(model_tables.tables()),
     **dict(benchmark_tables.tables()),
     **dict(page_tables.tables()),

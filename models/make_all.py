@@ -195,7 +195,8 @@ def evaluation(work: Path, name: str, split: str, options: argparse.Namespace) -
     output = work / "evaluations" / label
     arguments = [
         "evaluate", str(work / "data" / name), "--split", split, "--device", options.device,
-        "--batch", "100", "--workers", str(options.measurers), "-o", str(output), "--no-figures",
+        "--batch", str(options.batch), "--workers", str(options.measurers),
+        "-o", str(output), "--no-figures",
     ]  # fmt: skip
     return Job(f"evaluate-{label}", "evaluate", arguments, replaces=output)
 
@@ -213,7 +214,9 @@ def main() -> None:
     parser.add_argument(
         "--generators", type=int, default=1, help="processes that generate data; 0: it is there"
     )
-    parser.add_argument("--batch", type=int, default=60, help="simulations that each computes")
+    parser.add_argument(
+        "--batch", type=int, default=60, help="simulations at a time, of each process"
+    )
     parser.add_argument("--together", type=int, default=1, help="trainings at a time on a GPU")
     parser.add_argument("--measurers", type=int, default=1, help="processes that measure")
     parser.add_argument("--seconds", type=float, default=None, help="when trainings are stopped")

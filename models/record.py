@@ -21,6 +21,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from program import run_script
+
+from pdcorrect.errors import InputError
+
 MODELS = Path(__file__).resolve().parent
 HARM = 1.05
 """Times the RMS error of the base alone: more counts as harm."""
@@ -139,17 +143,16 @@ def evaluation_record(name: str, found: Evaluation) -> dict[str, Any]:
 
 def further_record(gated: Evaluation, without: Evaluation) -> dict[str, Any]:
     """The record of one further split, with the gate of its day and without one."""
-    runs, applied = gated.runs, gated.values(gated.run, "gate_rate")
+    runs, refused = gated.runs, gated.values(gated.run, "gate_rate")
     ratios = gated.over(gated.base)
-    harmed = [r for r, rate in zip(ratios, applied.values(), strict=True) if rate < 100.0]
     return {
         "split": gated.summary["data"]["split"],
         "date": gated.summary["date"],
         "command": gated.summary["command"],
         "device": gated.summary["environment"].get("device", "cpu"),
         "simulations": len(ratios),
-        "refused_steps": runs[gated.run]["measures"]["gate_rate"]["mean"],
-        "corrected_simulations": len(harmed),
+        "refused_steps": refused_steps(gated),
+        "corrected_simulations": sum(rate < 100.0 for rate in refused.values()),
         "omega_base": runs[gated.base]["measures"]["omega"]["mean"],
         "omega": {k: runs[gated.run]["measures"]["omega"][k] for k in ("mean", "smallest")},
         "omega_without_gate": without.runs[without.run]["measures"]["omega"]["mean"],
@@ -158,12 +161,27 @@ def further_record(gated: Evaluation, without: Evaluation) -> dict[str, Any]:
     }
 
 
+def refused_steps(gated: Evaluation) -> float:
+    """Mean per cent of a run's steps."""
+    return float(gated.runs[gated.run]["measures"]["gate_rate"]["mean"])
+
+
 def further_records(folders: Iterable[Path]) -> list[dict[str, Any]]:
-    """Of all further splits; where a gate refused nothing it stands for the run without one."""
+    """Of all further splits; where a gate refused nothing it stands for the run without one.
+
+    Raises
+    ------
+    InputError
+        If a gate refused steps, and there is no run without it.
+    """
     gated, without = {}, {}
     for folder in folders:
         found = Evaluation(folder)
         (gated if found.with_gate else without)[found.summary["data"]["split"]] = found
+    for split, one in gated.items():
+        if split not in without and refused_steps(one) != 0.0:
+            told = f"the gate refused {refused_steps(one):.3g} % of the steps of {split!r}"
+            raise InputError(f"--further: {told}: expected a folder made with --no-gate, too.")
     return [further_record(one, without.get(split, one)) for split, one in gated.items()]
 
 
@@ -213,4 +231,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,7 +24,7 @@ sys.modules["make_models"] = make
 SPEC.loader.exec_module(make)
 
 OPTIONS = Namespace(
-    device="cpu", generators=1, batch=60, measurers=1, seconds=None, split=["evaluation"]
+    device="cpu", generators=1, batch=7, measurers=1, seconds=None, split=["evaluation"]
 )
 
 
@@ -108,6 +108,9 @@ def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_pat
         "train-torsion-many-best-without-ahead", "train-torsion-exact-force",
         "evaluate-torsion-exact-evaluation", "evaluate-torsion-many-evaluation",
     ]  # fmt: skip
+    for name in ("generate-torsion-exact", "evaluate-torsion-exact-evaluation"):
+        given = jobs[name].arguments
+        assert given[given.index("--batch") + 1] == "7"
     needed = {name: [one.name for one in each.needs] for name, each in jobs.items()}
     assert needed["train-torsion-exact-force"] == ["generate-torsion-exact"]
     assert needed["train-torsion-many-best-without-ahead"] == [

@@ -1,6 +1,7 @@
 """The scripts of `models` and `docs/tables.py`, and what released models know of their training."""
 
 import csv
+import doctest
 import importlib.util
 import json
 import subprocess
@@ -135,6 +136,29 @@ def test_an_evaluation_is_condensed_into_a_record(tmp_path):
     assert len((short / "trajectories.csv").read_text().splitlines()) == 5
 
 
+class Gated:
+    """In the place of an evaluation with the gate, on a split of which it refused so much."""
+
+    with_gate, run = True, "model"
+
+    def __init__(self, refused):
+        self.summary = {"data": {"split": "stiffer"}}
+        self.runs = {"model": {"measures": {"gate_rate": {"mean": refused}}}}
+
+
+@pytest.mark.parametrize("refused", [0.0, 0.1])
+def test_a_gate_that_refused_steps_does_not_stand_for_the_run_without_one(monkeypatch, refused):
+    record = script("models/record.py")
+    monkeypatch.setattr(record, "Evaluation", lambda gated: gated)
+    monkeypatch.setattr(record, "further_record", lambda *pair: pair)
+    gated = Gated(refused)
+    if refused:
+        with pytest.raises(pdcorrect.errors.InputError, match=r"stiffer.*--no-gate"):
+            record.further_records([gated])
+    else:
+        assert record.further_records([gated]) == [(gated, gated)]
+
+
 def test_baselines_are_steps_of_changed_problems():
     baselines = script("models/baselines.py")
     cases = read_cases(TINY, "evaluation", skip_damaged=False).cases[:2]
@@ -171,3 +195,7 @@ def test_tables_are_written_between_their_marks(monkeypatch):
     assert tables.filled(text) == text
     with pytest.raises(KeyError):
         tables.filled(page.replace("two", "three"))
+
+
+def test_numbers_of_tables_have_their_digits():
+    assert doctest.testmod(script("docs/records.py")).failed == 0
