@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dataset_configs import small
-from pdcorrect.data import engines, generate, workers
+from pdcorrect.data import batch_engine, engines, generate, workers
 from pdcorrect.data.engines import Job, OneByOne
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.simulate import work_per_node
@@ -107,9 +107,10 @@ def one_job(frames):
 def test_a_step_of_too_many_iterations_fails_alike_one_by_one_and_in_batches(monkeypatch):
     pytest.importorskip("torch")
     config, job = one_job(2)
-    monkeypatch.setattr(engines, "MOST_ITERATIONS", 1)
+    for module in (engines, batch_engine):
+        monkeypatch.setattr(module, "MOST_ITERATIONS", 1)
     told = set()
-    for engine in (OneByOne("pd", config.tolerance), engines.Batched("cpu", config.tolerance)):
+    for engine in (OneByOne("pd", config.tolerance), batch_engine.Batched("cpu", config.tolerance)):
         (found,) = engine.rollouts([job], 2)
         told.add(found.failure)
     (failure,) = told
