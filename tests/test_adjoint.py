@@ -636,9 +636,9 @@ def test_a_result_of_another_step_is_refused_with_what_is_off(element):
     problem = pc.discretise(scene(element))
     stepper, state = pc.ProjectiveDynamics(problem), asymmetric_state(problem)
     result, g = stepper(state), np.ones_like(state.positions)
-    with pytest.raises(InputError, match=r"0\.01 s after the state, but time_step = 0\.011 s"):
+    with pytest.raises(InputError, match=r"0\.01 s.*time_step = 0\.011 s"):
         pc.adjoint(stepper, state, result, g, time_step=0.011)
-    with pytest.raises(InputError, match="0.02 s after the state"):
+    with pytest.raises(InputError, match=r"0\.02 s"):
         pc.adjoint(stepper, state, stepper(state, time_step=0.02), g)
     forces = np.full_like(g, 0.05)
     other = pc.State(state.positions, 1.1 * state.velocities)

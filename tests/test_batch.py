@@ -375,12 +375,12 @@ def test_batches_that_cannot_be_are_refused_by_name():
         batch(*(unlike(i, time=time) for i, time in enumerate(radii)))
     shift = {"times": [0.0, 1.0], "displacement": [[0, 0, 0], [0.1, 0, 0]]}
     moved = [{"region": {"plane": "x", "at": 0.0}, "motion": shift}]
-    with pytest.raises(InputError, match="moving clamps with midpoint"):
+    with pytest.raises(InputError, match="clamps.*midpoint"):
         batch(unlike(0, clamps=moved), integrator="midpoint")
     with pytest.raises(InputError, match=r"damping\.stiffness"):
         batch(unlike(0, damping={"stiffness": 0.1}))
     adrift = batch(beam((2, 1, 1), clamps=[], loads=[]), integrator="quasi-static")
-    with pytest.raises(ConvergenceError, match="not positive definite"):
+    with pytest.raises(ConvergenceError, match="scene 'scene'"):
         adrift(adrift.rest_state())
     stepper = batch(unlike(0), unlike(1))
     with pytest.raises(InputError, match="1 states: expected 2"):
@@ -549,7 +549,7 @@ def test_steps_of_another_length_start_bdf2_anew():
         exact = pc.ProjectiveDynamics(problem, 1e-9, time_step=0.005)(state).state
         assert furthest(exact, after) < 1e-9
     mixed = stepper.state([states[0], found[1]])
-    with pytest.raises(InputError, match="the state of scene 0 came from a step of another"):
+    with pytest.raises(InputError, match="scene 0 "):
         stepper(mixed)
 
 

@@ -452,9 +452,10 @@ def test_parts_that_do_not_fit_are_refused():
             hybrid(part, corrector, velocity="kept")
 
 
-def test_a_correction_before_of_other_bodies_is_refused():
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_correction_before_of_other_bodies_is_refused(placement):
     stepper = pc.BatchStepper([pc.discretise(soft_beam())])
-    corrector = fitted(stepper.problems)
+    corrector = fitted(stepper.problems, placement=placement)
     state, other = stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="previous"):
         BatchHybrid(stepper, corrector)(state, other)

@@ -20,11 +20,10 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.produce import make_engines
 from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
-from pdcorrect.data.workers import Workers, local_scheduler
+from pdcorrect.data.workers import Workers, local_scheduler, make_engines
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
 
 distributed = pytest.importorskip("distributed")

@@ -73,9 +73,9 @@ def test_a_mirrored_mesh_is_told_from_a_bad_cell():
 def test_lexicographic_node_order_is_told_from_a_mirrored_mesh():
     mesh = grid(3, 2, 1)
     order = [0, 1, 3, 2, 4, 5, 7, 6]
-    with pytest.raises(MeshError, match="lexicographic one with x fastest") as refused:
+    with pytest.raises(MeshError, match="lexicographic") as refused:
         HexMesh.create(mesh.positions, mesh.cells[:, np.argsort(order)])
-    assert f"Take nodes {', '.join(map(str, order))} of every cell" in str(refused.value)
+    assert ", ".join(map(str, order)) in str(refused.value)
     assert "mirror" not in str(refused.value)
 
 
@@ -113,7 +113,7 @@ def test_a_face_of_three_cells_is_refused():
 
 def test_two_cells_on_one_side_of_a_face_are_refused():
     cells = [box([0, 0, 0], [1, 1, 1]), box([0, 0, 0], [0.6, 1, 1])]
-    with pytest.raises(MeshError, match=r"cells 0 and 1 share the face around \[0.  0.5 0.5\]"):
+    with pytest.raises(MeshError, match=r"cells 0 and 1 .*\[0\.  0\.5 0\.5\]"):
         HexMesh.create(*glue(np.array(cells)))
 
 

@@ -14,10 +14,10 @@ import pytest
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.produce import make_engines
 from pdcorrect.data.schema import MANIFEST
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import simulate
+from pdcorrect.data.workers import make_engines
 
 TINY = Path(__file__).parents[1] / "datasets" / "tiny"
 

@@ -542,10 +542,7 @@ def test_a_linear_system_that_is_not_solved_is_told(monkeypatch):
     layer(p, v, f)[0].sum().backward()
     assert layer.differentiable.all()
     assert layer.failed_derivatives == [(0, 0), (0, 1)]
-    with pytest.raises(
-        ConvergenceError,
-        match=r"the derivative of step 1 of 1: scene 0 \('scene'\), whose step converged;",
-    ):
+    with pytest.raises(ConvergenceError, match="step 1 of 1: scene 0 "):
         pc.PDLayer(stepper)(p, v, f)[0].sum().backward()
 
 

@@ -52,6 +52,13 @@ def test_the_coarse_model_by_total_mass_weighs_what_the_refined_scene_does(refin
     assert len(found.positions) == len(plain.positions)
 
 
+@pytest.mark.parametrize("rule", ["lumped", "averaged", "consistent"])
+def test_where_masses_are_of_volumes_the_total_mass_changes_nothing(rule):
+    scene = cross().with_changes(solver={"mass": rule})
+    found = pc.coarse_model(scene, "total-mass")
+    np.testing.assert_allclose(found.mass, pc.discretise(scene).mass, rtol=1e-12)
+
+
 def test_coarse_models_are_known_by_name():
     assert pc.coarse_model(cross(), "best").element == pc.best_coarse(cross()).solver.element
     assert pc.coarse_model(cross()).element == "hex8"

@@ -16,7 +16,7 @@ import pytest
 
 from motion import assert_same, remembering, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
-from pdcorrect.io.growing_file import GrowingFile
+from pdcorrect.io.growing_file import GrowingFile, Reserve
 from pdcorrect.io.superblock import read_superblock
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
 from pdcorrect.state import State, Status, StepResult
@@ -154,6 +154,27 @@ def test_what_states_remember_is_stored_with_them(run, tmp_path, first):
     with h5py.File(path) as file:
         assert file["memory/acceleration"].shape == run.positions.shape
         assert np.isnan(file["memory/acceleration"][:first]).all()
+
+
+def test_room_is_made_for_memory_that_comes_late(tmp_path, monkeypatch):
+    promised, filled = [], []
+    ensure, fill = Reserve.ensure, GrowingFile._add
+
+    def ensuring(self, used, need):
+        promised.append(used + need)
+        ensure(self, used, need)
+
+    def filling(self, columns):
+        fill(self, columns)
+        self._file.flush()
+        if "memory/acceleration" in columns:
+            filled.append((promised[-1], self._file.id.get_filesize()))
+
+    monkeypatch.setattr(Reserve, "ensure", ensuring)
+    monkeypatch.setattr(GrowingFile, "_add", filling)
+    save_trajectory(tmp_path / "run.h5", remembering(trajectory(frames=300), 298))
+    ((room, used),) = filled
+    assert used <= room < 1.5 * used
 
 
 # --- what a writer refuses -------------------------------------------------------------
@@ -439,8 +460,8 @@ def replace(file, name, data):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda f: f.attrs.__delitem__("format"), ""),
-        (lambda f: f.attrs.__setitem__("format", "other"), ""),
+        (lambda f: f.attrs.__delitem__("format"), "'pdcorrect-trajectory'"),
+        (lambda f: f.attrs.__setitem__("format", "other"), "'pdcorrect-trajectory'"),
         (lambda f: f.attrs.__setitem__("format_version", 2), "version 2"),
         (lambda f: f.__delitem__("velocities"), "'velocities'"),
         (lambda f: f.__delitem__("mesh"), "'mesh/points'"),
