@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -13,17 +12,11 @@ from pdcorrect.data.summary import dataset_info
 from pdcorrect.errors import FileFormatError, InputError
 
 
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("original")
-    write_dataset(folder)
-    return folder
-
-
 @pytest.fixture
-def dataset(original, tmp_path):
+def dataset(tmp_path):
     """A data set to spoil."""
-    return shutil.copytree(original, tmp_path / "sample")
+    write_dataset(tmp_path / "sample")
+    return tmp_path / "sample"
 
 
 def counted_shard(split, number, size):

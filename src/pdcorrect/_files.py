@@ -39,34 +39,21 @@ def part_of(path: Path) -> Path:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all, whoever else writes it at the time.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
-    with _own_part(path) as part:
-        part.write_text(text, encoding="utf-8")
+    """Write a text file in UTF-8, see `write_bytes`."""
+    write_bytes(path, text.encode())
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """The same for any content.
+    """Write a file whole or not at all, whoever else writes it at the time.
 
     Raises
     ------
     OutputError
         If it cannot be written.
     """
-    with _own_part(path) as part:
-        part.write_bytes(data)
-
-
-@contextlib.contextmanager
-def _own_part(path: Path) -> Iterator[Path]:
     try:
         with replacing(path, part_of_process(path)) as part:
-            yield part
+            part.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
 
