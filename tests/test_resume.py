@@ -521,12 +521,12 @@ def test_sigterm_while_a_report_is_written_leaves_no_half_of_a_file(
     folder.mkdir()
     (folder / "report.csv").write_text("of yesterday")
 
-    def half(self, text, **options):
-        with self.open("w") as file:
-            file.write(text[: len(text) // 2])
+    def half(self, data):
+        with self.open("wb") as file:
+            file.write(data[: len(data) // 2])
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr(Path, "write_bytes", half)
     arguments = ("compare", scene_file, "-o", folder, "--frames", 1, "--no-figures")
     status, _, err = program(*arguments)
     assert status == TERMINATED
