@@ -15,6 +15,10 @@ class PdcorrectError(Exception):
     """Base class of everything this package raises on purpose."""
 
 
+class PdcorrectWarning(UserWarning):
+    """What was asked for can be done, and is likely to be something else than was meant."""
+
+
 class InputError(PdcorrectError, ValueError):
     """An argument, array or file content is not acceptable."""
 

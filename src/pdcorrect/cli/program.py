@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated
+import warnings
+from typing import Annotated, Any
 
 import typer
 
@@ -19,7 +20,13 @@ from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
 from pdcorrect.cli.train import train
 from pdcorrect.cli.validate import validate
-from pdcorrect.errors import EXTRAS, ConvergenceError, OutputError, PdcorrectError
+from pdcorrect.errors import (
+    EXTRAS,
+    ConvergenceError,
+    OutputError,
+    PdcorrectError,
+    PdcorrectWarning,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -51,7 +58,8 @@ def options(
 def main() -> None:
     """Entry point: one paragraph and an exit status instead of a traceback."""
     try:
-        with terminable():
+        with terminable(), warnings.catch_warnings():
+            _tell_warnings()
             app()
     except Terminated:
         typer.echo("stopped by SIGTERM", err=True)
@@ -70,6 +78,20 @@ def main() -> None:
         _stop(f"{module} is needed for this and is not installed: {install}", BAD_INPUT)
     except MemoryError:
         _stop("not enough memory: use a smaller --refine.", FAILED)
+
+
+def _tell_warnings() -> None:
+    """Have the package's own warnings printed as one line, each text once."""
+    others, told = warnings.showwarning, set[str]()
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **named: Any) -> None:
+        if not issubclass(category, PdcorrectWarning):
+            others(message, category, *place, **named)
+        elif str(message) not in told:
+            told.add(str(message))
+            typer.echo(f"warning: {message}", err=True)
+
+    warnings.showwarning = show
 
 
 def _stop(message: str, status: int) -> None:

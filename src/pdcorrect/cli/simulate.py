@@ -146,7 +146,7 @@ def _run(
 
     problem = stepper.problem
     if earlier is None:
-        state, done, log = problem.rest_state(), 0, StepLog()
+        state, done, log = problem.initial_state(), 0, StepLog()
         writer = TrajectoryWriter(
             output, problem.positions, problem.cells, state, overwrite=overwrite,
             scene_toml=problem.scene.to_toml(), attributes=run_attributes(stepper),

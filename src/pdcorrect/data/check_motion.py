@@ -150,7 +150,7 @@ def _again(
 ) -> float:
     """How far a stored step from a row of ``starts`` is from one that is taken now, m."""
     h, rest = problem.time_step, problem.positions
-    state = problem.rest_state()
+    state = problem.initial_state()
     if row > 0:
         frame, before = (starts[k].astype(np.float64) for k in (row, row - 1))
         frame, before = (np.where(problem.free, x, rest) for x in (frame, before))

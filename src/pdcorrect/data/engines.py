@@ -99,7 +99,7 @@ class OneByOne:
             log = _Log(job.nodes)
             with log.timed():
                 stepper = self._stepper(steppers, job.problem, divisor)
-            state = job.problem.rest_state()
+            state = job.problem.initial_state()
             for _ in range(steps):
                 worst = log.begin()
                 with log.timed():

@@ -301,9 +301,9 @@ def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Ste
 
 def _states(reference: Steps, meshed: _Meshed) -> list[State]:
     """The reference's frames but the last, on the coarse nodes (Algorithms 1 and 2)."""
-    rest = meshed.problems[PLAIN].rest_state()
+    first = meshed.problems[PLAIN].initial_state()
     later = zip(reference.positions[:-1], reference.velocities[:-1], strict=True)
-    return [rest, *(State(p, v, (t + 1) * meshed.plan.step) for t, (p, v) in enumerate(later))]
+    return [first, *(State(p, v, (t + 1) * meshed.plan.step) for t, (p, v) in enumerate(later))]
 
 
 def _shard(

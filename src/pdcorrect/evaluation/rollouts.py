@@ -76,13 +76,14 @@ class Rollout:
 
 
 def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> list[Rollout]:
-    """All scenes of a stepper from rest, each for its number of steps.
+    """All scenes of a stepper from their initial states, each for its number of steps.
 
     A failed scene is held at its last state, so its error is that of a simulation that has
     stopped: it is neither left out nor replaced by anything better.
     """
     rest = stepper.rest_state()
-    state, previous = rest, None
+    state = stepper.state([problem.initial_state() for problem in stepper.problems])
+    previous = None
     frames, reasons = [rest.positions], []
     failed: list[int | None] = [None] * len(steps)
     for number in range(1, max(steps) + 1):
@@ -178,8 +179,8 @@ def _by_node(stepper: BatchStepper, scenes: Tensor) -> Tensor:
 
 
 def roll_out_alone(hybrid: HybridStepper, steps: int) -> Rollout:
-    """From rest; a body that fails is held where it was before, see `roll_out`."""
-    state = hybrid.problem.rest_state()
+    """From its initial state; a body that fails is held where it was, see `roll_out`."""
+    state = hybrid.problem.initial_state()
     rest = state.positions
     size = float(np.linalg.norm(np.ptp(rest, axis=0)))
     frames, reasons = [rest], np.zeros(steps, dtype=np.int64)

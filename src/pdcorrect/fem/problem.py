@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,7 +14,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
-from pdcorrect.errors import InputError, MeshError, SceneError
+from pdcorrect.errors import InputError, MeshError, PdcorrectWarning, SceneError
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
@@ -109,6 +110,32 @@ class Problem(ElasticBody):
         """Rest positions, no velocity, time zero."""
         return State(self.positions.copy(), np.zeros_like(self.positions), 0.0)
 
+    def initial_state(self) -> State:
+        """Rest positions with the scene's initial velocities, time zero: where runs start.
+
+        Clamped components have none; where the scene gives them some, a `PdcorrectWarning`
+        says so.
+        """
+        return State(self.positions.copy(), self._initial_velocities.copy(), 0.0)
+
+    @cached_property
+    def _initial_velocities(self) -> Array:
+        initial = self.scene.initial
+        if initial is None:
+            return np.zeros_like(self.positions)
+        mass = self.mass
+        if self.mass_rule == "per-node":  # whose centre depends on the mesh
+            mass = lumped(mass_matrix("lumped", self.space, self.materials.density))
+        wanted = initial.velocities(self.positions, mass @ self.positions / mass.sum())
+        if wanted[~self.free].any():
+            warnings.warn(
+                "initial: some of the nodes that it sets in motion are clamped; their clamped "
+                "components follow the clamps.",
+                PdcorrectWarning,
+                stacklevel=3,
+            )
+        return np.where(self.free, wanted, 0.0)
+
     # --- loads and clamps ---------------------------------------------------------
 
     def external_forces(
@@ -123,6 +150,11 @@ class Problem(ElasticBody):
         for load in self.loads:
             total += load.forces(start, start if end is None else end, positions)
         return total
+
+    @cached_property
+    def has_followers(self) -> bool:
+        """Whether a load depends on the positions."""
+        return any(load.sample is not None for load in self.loads)
 
     def clamped_positions(self, time: float) -> Array:
         """Prescribed positions (N, 3), m, at a time (s); meaningful where not `free`."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pdcorrect.scene.bodies import Beam, Body, Cross, MeshFile, Voxels, Weight
 from pdcorrect.scene.clamps import Clamp, Motion
+from pdcorrect.scene.initial import Initial
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region
@@ -24,6 +25,7 @@ __all__ = [
     "EffectiveModuli",
     "Force",
     "Gravity",
+    "Initial",
     "Load",
     "Material",
     "MaterialRegion",

@@ -6,12 +6,13 @@ from pathlib import Path, PurePath
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp
+from pdcorrect.scene.initial import Initial
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
 
@@ -38,17 +39,25 @@ class Time(Strict):
 
 
 class Damping(Strict):
-    """Rayleigh damping: forces -(mass M + stiffness K) v.
+    """Damping of the material, and Rayleigh damping: forces -(mass M + stiffness K) v.
+
+    A mode of angular frequency w loses its amplitude as exp(-r t) with
+    r = (viscosity w^2 + stiffness w^2 + mass)/2.
 
     Attributes
     ----------
+    viscosity
+        s; Kelvin-Voigt: a stress of viscosity times the small-strain law of the rate
+        of the right stretch tensor (`pdcorrect.fem.viscosity`), which is zero in any
+        rigid motion.
     mass
         1/s.
     stiffness
-        s; K is the tangent stiffness at the start of each step, made positive
-        semi-definite.  It turns with the body, a step late.
+        s; K is the tangent stiffness where the step is expected to lead, made positive
+        semi-definite.
     """
 
+    viscosity: NonNegative = 0.0
     mass: NonNegative = 0.0
     stiffness: NonNegative = 0.0
 
@@ -98,6 +107,7 @@ class Scene(TomlConfig):
     material: Material
     materials: tuple[MaterialRegion, ...] = ()
     time: Time
+    initial: Initial | None = None
     damping: Damping = Damping()
     clamps: tuple[Clamp, ...] = ()
     loads: tuple[Load, ...] = ()
@@ -115,6 +125,15 @@ class Scene(TomlConfig):
         if not name.strip():
             raise ValueError("expected a name that is not empty")
         return name
+
+    @model_validator(mode="after")
+    def _motion_has_inertia(self) -> Scene:
+        if self.initial is not None and self.time.integrator == "quasi-static":
+            raise ValueError(
+                'initial with time.integrator = "quasi-static", which has no inertia: expected one '
+                "of them only"
+            )
+        return self
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:

@@ -47,7 +47,7 @@ def march(
     _check_stepper(stepper)
     problem = stepper.problem
     frames = whole("frames", problem.scene.time.frames if frames is None else frames)
-    current = problem.rest_state() if state is None else state
+    current = problem.initial_state() if state is None else state
     for frame in range(1, frames + 1):
         started = time.perf_counter()
         result = stepper(current, forces(current) if forces else None)
@@ -79,7 +79,7 @@ def rollout(
     frames : int, optional
         Steps to take; the scene's by default.
     state : State, optional
-        Where to start; at rest by default.
+        Where to start; `Problem.initial_state` by default.
     forces : callable, optional
         Extra nodal forces (N, 3), N, for the step from a state.
     on_step : callable, optional
@@ -95,7 +95,7 @@ def rollout(
         ``frames + 1`` frames, the first one the initial state.
     """
     _check_stepper(stepper)
-    states = [stepper.problem.rest_state() if state is None else state]
+    states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
     steps = march(stepper, frames, state=states[0], forces=forces, on_failure=on_failure)
     try:
