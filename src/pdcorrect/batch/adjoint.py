@@ -217,7 +217,3 @@ class BatchGradients:
             self._pull(scheme.origin, scheme.clamped_origin, self._damping * momentum)
         back = torch.where(self._free, 0.0, by_y - image)
         scheme.clamped.transpose(back, self._sums)
-        if stepper.loads.follow:
-            positions = scheme.loads_at(stage.known)
-            slope = stepper.loads.pulled(stage.spans, positions, self._nodal)
-            scheme.loads_at.transpose(slope, self._sums)

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
@@ -16,7 +18,12 @@ from pdcorrect.batch.objective import by_scene
 from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.integrators import Integrator, equal_steps, nodal_solution
+from pdcorrect.solvers.integrators import (
+    Integrator,
+    clamp_rates,
+    equal_steps,
+    nodal_solution,
+)
 from pdcorrect.solvers.schemes import Linear, Scheme, by_component
 
 
@@ -118,8 +125,8 @@ class BatchStaging:
         return torch.cat([nodal, modes], dim=1)
 
     def _scheme(self, state: BatchState) -> Scheme:
-        started = self._integrate.started(state.memory, self._h, partial(self._is_a_step, state))
-        return self._integrate.scheme_of(self._h, started)
+        usable = self._integrate.usable(state.memory, partial(self._is_a_step, state))
+        return self._integrate.scheme_of(self._h, usable)
 
     def _is_a_step(self, state: BatchState, before: Tensor) -> bool:
         """Whether the times before (B, N, 3) are a step of this length earlier, in all scenes."""
@@ -145,16 +152,21 @@ class BatchStaging:
             "time": torch.zeros_like(state.positions)
             + by_scene(_on_device(state.times, state.positions)),
             **state.memory,
-            "clamp_velocity": 0.0,
-            "clamp_velocity_at_y": 0.0,
-            "clamp_jump": 0.0,
+            **self._clamp_rates(scheme, state.times),
         }
-        if "accelerations" in scheme.memory and "accelerations" not in known:
-            raise InputError(
-                "generalised-alpha in a batch starts from states with accelerations: expected "
-                "memory. Take the first step of each scene with ProjectiveDynamics."
-            )
         return known
+
+    def _clamp_rates(self, scheme: Scheme, times: Sequence[float]) -> dict[str, Any]:
+        """See `integrators.clamp_rates`, (B, N, 3) each."""
+        pairs = list(zip(self._problems, times, strict=True))
+        if not self._moving:
+            return clamp_rates(*pairs[0], self._h, scheme.at)
+        rates = [clamp_rates(problem, t, self._h, scheme.at) for problem, t in pairs]
+        still = [np.zeros_like(problem.positions) for problem in self._problems]
+        return {
+            name: self._nodal([a[name] + zero for a, zero in zip(rates, still, strict=True)])
+            for name in rates[0]
+        }
 
     def prescribed(self, times: Sequence[float]) -> Tensor:
         """Clamped positions of the scenes at their times (s), (B, N, 3), m."""
@@ -162,8 +174,10 @@ class BatchStaging:
 
     def _held(self, times: Sequence[float]) -> Tensor:
         pairs = zip(self._problems, times, strict=True)
-        held = self._cells.nodal([p.clamped_positions(t) for p, t in pairs])
-        return held[:, : self._cells.sizes.nodes]
+        return self._nodal([p.clamped_positions(t) for p, t in pairs])
+
+    def _nodal(self, arrays: Sequence[NDArray[np.float64]]) -> Tensor:
+        return self._cells.nodal(arrays)[:, : self._cells.sizes.nodes]
 
     def _split(self, known: dict[str, Any], on_free: Linear, on_clamped: Linear | None) -> Tensor:
         """A sum (B, N, 3) in memory of its own."""

@@ -352,7 +352,7 @@ class BatchStepper:
         objective.target.copy_(stage.target)
         if objective.damping:
             objective.origin.copy_(stage.origin)
-        total = self.loads(stage.spans, scheme.loads_at(stage.known))
+        total = self.loads(stage.spans, state.positions)
         objective.forces.copy_(total if forces is None else total + self.staging.extended(forces))
         if self._minimiser is None or factors != (objective.inertia, objective.damping):
             self._make_minimiser(scheme.gain)

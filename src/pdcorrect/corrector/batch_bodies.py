@@ -109,8 +109,7 @@ def external_forces(stepper: BatchStepper, state: BatchState) -> Tensor:
     Differentiable by the state, on which only the former depend.
     """
     stage = stepper.staging(state)
-    at = stage.scheme.loads_at(stage.known)
-    found: Tensor = _Loads.apply(stepper, stage.spans, at)  # type: ignore[no-untyped-call]
+    found: Tensor = _Loads.apply(stepper, stage.spans, state.positions)  # type: ignore[no-untyped-call]
     return found
 
 

@@ -80,8 +80,8 @@ class SingleCoarseStep:
         self._coarse, self._graph, self._velocity = coarse, bodies, velocity
         self._problem, self._state, self._forces = coarse.problem, state, forces
         self._previous, self.seconds = previous, 0.0
-        stage = coarse.integrate(self._problem, state, coarse.time_step, forces)
-        loads = self._problem.external_forces(*stage.loads_over, stage.loads_at)
+        stage = coarse.integrate(self._problem, state, coarse.time_step)
+        loads = self._problem.external_forces(*stage.loads_over, state.positions)
         self._loads: Array = loads if forces is None else loads + forces
 
     @property

@@ -4,7 +4,8 @@ Thesis eq. 3-30 iterates x <- G^-1 (g + (G - H) x), which needs nothing but G's 
 and converges where the spectral radius of G^-1 (G - H) is below 1 (eq. 3-38, the
 quasi-Newton form of the same, has the same iterates).  Conjugate gradients with the
 same preconditioner take the square root of its iterations, and converge wherever H is
-positive definite; a factor of H itself needs not even that.
+positive definite; a factor of H itself needs not even that.  Loads that follow the body add
+a part that is not symmetric, for which GMRES takes the place of both.
 """
 
 from __future__ import annotations
@@ -21,18 +22,44 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.multigrid import conjugate_gradients
-from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
+from pdcorrect.solvers.step import GlobalSolver, HessianOperator
 
 Array = NDArray[np.float64]
 Solve = Callable[[Array], Array]
 AdjointSolver = Literal["auto", "cg", "direct", "fixed-point"]
 
 _CG_STEPS = 300
+_GMRES_STEPS = 400
 _FIXED_POINT_STEPS = 20000
 _DIRECT_STEPS = 4
-"""The first solution and refinements: LU pivots little."""
+"""The first solution and refinements: LU pivots little, GMRES looks at another norm."""
 _HOPELESS = 1e3
 """Growth of the fixed point's change at which it is given up."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdjointOperator:
+    """x -> (dr/dy)^T x for the residual r of a step's equation.
+
+    Attributes
+    ----------
+    hessian : HessianOperator
+    loads : callable or None
+        Nodal x (N, 3) -> derivatives of x . (loads that follow the body) by the positions.
+    """
+
+    hessian: HessianOperator
+    loads: Callable[[Array], Array] | None = None
+
+    def __call__(self, x: Array) -> Array:
+        return self.product(x) * self.hessian.objective.free
+
+    def product(self, x: Array) -> Array:
+        """The same on all components."""
+        out, problem = self.hessian.product(x), self.hessian.objective.problem
+        if self.loads is None:
+            return out
+        return out - problem.extended(self.loads(x[: len(problem.positions)]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +88,7 @@ def check_solver(name: str) -> None:
 
 
 def solve_adjoint(
-    H: HessianOperator,
+    H: AdjointOperator,
     g: Array,
     solver: AdjointSolver,
     precondition: Callable[[], Solve],
@@ -72,11 +99,12 @@ def solve_adjoint(
 
     Parameters
     ----------
-    H : HessianOperator
+    H : AdjointOperator
     g : (N + B, 3)
         Zero where clamped.
     solver : str
-        "auto" is conjugate gradients, and a direct solution where they fail.
+        "auto" is conjugate gradients, and a direct solution where they fail; with loads
+        that follow the body GMRES, as is "direct" with a factor of the symmetric part.
     precondition, global_solver : callable
         Make the preconditioner of conjugate gradients, and G^-1.
     tolerance : float
@@ -91,6 +119,13 @@ def solve_adjoint(
         return AdjointSolution(np.zeros_like(g), "none needed", 0, 0.0)
     if solver == "fixed-point":
         return _fixed_point(H, g, global_solver(), tolerance)
+    if H.loads is not None:
+        if solver == "cg":
+            raise InputError(
+                "solver = 'cg' with loads that follow the body, whose matrix is not symmetric: "
+                "expected 'auto', 'direct' or 'fixed-point'."
+            )
+        return _gmres(H, g, precondition() if solver == "auto" else _factor(H), tolerance)
     if solver != "direct":
         found = conjugate_gradients(
             H, g, precondition(), tolerance=0.1, max_steps=_CG_STEPS, residual_share=tolerance
@@ -106,13 +141,13 @@ def solve_adjoint(
     return _direct(H, g, tolerance)
 
 
-def _residual(H: HessianOperator, g: Array, x: Array) -> tuple[Array, float]:
+def _residual(H: AdjointOperator, g: Array, x: Array) -> tuple[Array, float]:
     """G - H x, and its size relative to g's."""
     r = g - H(x)
     return r, float(np.linalg.norm(r) / np.linalg.norm(g))
 
 
-def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -> AdjointSolution:
+def _fixed_point(H: AdjointOperator, g: Array, solve: Solve, tolerance: float) -> AdjointSolution:
     x, r = np.zeros_like(g), g
     for step in range(1, _FIXED_POINT_STEPS + 1):
         x = x + solve(r)
@@ -127,20 +162,12 @@ def _fixed_point(H: HessianOperator, g: Array, solve: Solve, tolerance: float) -
     )
 
 
-def _direct(H: HessianOperator, g: Array, tolerance: float) -> AdjointSolution:
+def _direct(H: AdjointOperator, g: Array, tolerance: float) -> AdjointSolution:
     """By a sparse LU factorisation of H, which may be indefinite, and refinements of its x."""
-    matrix, free = assembled(H.objective, H)
-    try:
-        factor = spla.splu(matrix.tocsc())
-    except RuntimeError as error:
-        raise ConvergenceError(
-            f"adjoint: the Hessian at this state is singular ({error}); the step has no "
-            "derivative there."
-        ) from None
-    flat, r = np.zeros(g.size), g
-    x = flat.reshape(g.shape)
+    solve = _factor(H)
+    x, r = np.zeros_like(g), g
     for step in range(1, _DIRECT_STEPS + 1):
-        flat[free] += factor.solve(r.ravel()[free])
+        x = x + solve(r)
         r, left = _residual(H, g, x)
         if left <= tolerance:
             return AdjointSolution(x, "direct", step, left)
@@ -151,16 +178,52 @@ def _direct(H: HessianOperator, g: Array, tolerance: float) -> AdjointSolution:
     )
 
 
-def assembled(
-    objective: StepObjective, H: HessianOperator
-) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
+def _factor(H: AdjointOperator) -> Solve:
+    """The inverse of the Hessian, without loads, by a sparse LU factorisation."""
+    matrix, free = assembled(H.hessian)
+    try:
+        factor = spla.splu(matrix.tocsc())
+    except RuntimeError as error:
+        raise ConvergenceError(
+            f"adjoint: the Hessian at this state is singular ({error}); the step has no "
+            "derivative there."
+        ) from None
+
+    def solve(r: Array) -> Array:
+        out = np.zeros(r.size)
+        out[free] = factor.solve(r.ravel()[free])
+        return out.reshape(r.shape)
+
+    return solve
+
+
+def _gmres(H: AdjointOperator, g: Array, solve: Solve, tolerance: float) -> AdjointSolution:
+    def flat(function: Callable[[Array], Array]) -> spla.LinearOperator:
+        return spla.LinearOperator(
+            (g.size, g.size), matvec=lambda x: function(x.reshape(g.shape)).ravel(), dtype=g.dtype
+        )
+
+    steps: list[float] = []
+    x, r, left = np.zeros_like(g), g, 1.0
+    for _ in range(_DIRECT_STEPS):
+        change, _ = spla.gmres(
+            flat(H), r.ravel(), rtol=0.5 * tolerance / left, atol=0.0, restart=_GMRES_STEPS,
+            maxiter=1, M=flat(solve), callback=steps.append, callback_type="pr_norm",
+        )  # fmt: skip
+        x = x + change.reshape(g.shape)
+        r, left = _residual(H, g, x)
+        if left <= tolerance:
+            return AdjointSolution(x, "gmres", len(steps), left)
+    raise ConvergenceError(
+        f"adjoint by GMRES: relative residual {left:.1e} after {len(steps)} steps, expected "
+        f"{tolerance:g} or less. Use solver='direct', or a larger tolerance."
+    )
+
+
+def assembled(H: HessianOperator) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
     """H as a sparse matrix on the free components of configurations, and their numbers."""
-    problem = objective.problem
-    blocks = H.tangent.blocks()
-    damping = objective.damping
-    if damping is not None and damping.stiffness:
-        blocks = blocks + damping.stiffness * damping.tangent.blocks()
-    matrix = Assembly(problem.space.local, problem.unknowns).matrix(blocks)
+    objective, problem = H.objective, H.objective.problem
+    matrix = Assembly(problem.space.local, problem.unknowns).matrix(H.blocks())
     mass = problem.mass_matrix.copy()
     mass.resize((problem.unknowns, problem.unknowns))
     matrix = matrix + objective.factors[0] * sp.kron(mass, sp.eye_array(3))

@@ -1,7 +1,7 @@
-"""What damping and a first acceleration add to the derivatives of a step.
+"""What damping adds to the derivatives of a step.
 
-Each term is a force on the body, or what follows from one, pulled back through its own
-inputs.  Internal modes at the start of the step follow the nodes and the material there.
+Each term is a force on the body, pulled back through its own inputs.  Internal modes of
+configurations before y follow the nodes and the material there.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes
-from pdcorrect.solvers.integrators import forces_at, solve_mass
-from pdcorrect.solvers.step import StepDamping
-from pdcorrect.state import State
+from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress, stress_slopes
+from pdcorrect.solvers.damping import Rayleigh, Viscous
 
 Array = NDArray[np.float64]
 Weights = tuple[Array, Array]
@@ -45,16 +44,13 @@ def follower_slope(problem: Problem, x: Array, positions: Array, start: float, e
     return out
 
 
-class DampingTerm:
+class RayleighTerm:
     """- x . d C (y - o), by what the step starts from."""
 
-    def __init__(self, problem: Problem, damping: StepDamping, y: Array, x: Array) -> None:
+    def __init__(self, problem: Problem, damping: Rayleigh, y: Array, x: Array) -> None:
         self._problem, self._damping, self._x = problem, damping, x
         self._offset = y - damping.origin
-        by_origin = damping.mass * problem.mass_times(x)
-        if damping.stiffness:
-            by_origin = by_origin + damping.stiffness * damping.tangent.apply(x)
-        self._by_origin = by_origin
+        self._by_origin = damping.times(x)
 
     @cached_property
     def origin(self) -> Array:
@@ -64,11 +60,11 @@ class DampingTerm:
         return self._at_origin.reduced(self._by_origin)
 
     @cached_property
-    def positions(self) -> Array:
-        """By the positions at the start, through C, (N, 3)."""
+    def place(self) -> Array:
+        """By where the stiffness is taken, with its modes in equilibrium, (N, 3)."""
         if not self._damping.stiffness:
             return np.zeros_like(self._problem.positions)
-        return self._before.reduced(self._by_shape)
+        return self._at.reduced(self._by_place)
 
     @cached_property
     def weights(self) -> Weights:
@@ -78,8 +74,7 @@ class DampingTerm:
             nothing = np.zeros(len(self._problem.cells))
             return nothing, nothing
         _, by_mu, by_omega = self._slopes
-        modes = -self._before.response(self._by_shape)
-        more = weight_slopes(self._problem, self._damping.before, modes)
+        more = weight_slopes(self._problem, self._damping.at, -self._at.response(self._by_place))
         modes = -self._at_origin.response(self._by_origin)
         last = weight_slopes(self._problem, self._damping.origin, modes)
         return (
@@ -94,87 +89,67 @@ class DampingTerm:
         slope = mass_slope(self._problem, self._x[:count], self._offset[:count])
         return -self._damping.mass * slope
 
+    @property
+    def by_mass(self) -> float:
+        """By d alpha."""
+        return -float(np.vdot(self._x, self._problem.mass_times(self._offset)))
+
+    @property
+    def by_stiffness(self) -> float:
+        """By d beta."""
+        return -float(np.vdot(self._x, self._damping.tangent.apply(self._offset)))
+
     @cached_property
     def _at_origin(self) -> Following:
         return Following(self._problem, self._damping.origin)
 
     @cached_property
-    def _before(self) -> Following:
-        return Following(self._problem, self._damping.before)
+    def _at(self) -> Following:
+        return Following(self._problem, self._damping.at)
 
     @cached_property
     def _slopes(self) -> tuple[Array, Array, Array]:
-        return tangent_slopes(self._problem, self._damping.before, self._x, self._offset)
+        return tangent_slopes(self._problem, self._damping.at, self._x, self._offset)
 
     @cached_property
-    def _by_shape(self) -> Array:
-        """By the configuration at the start."""
+    def _by_place(self) -> Array:
+        """By the configuration there."""
         return -self._damping.stiffness * self._slopes[0]
 
 
-class FirstAccelerationTerm:
-    """g . a for the acceleration a = M^-1 (f_int + f_ext - C v) that starts generalised-alpha.
+class ViscousTerm:
+    """- x . (force of viscosity at y), by what the step starts from."""
 
-    Attributes
-    ----------
-    forces : (N, 3)
-        By forces on the nodes: z = M^-1 g.
-    """
-
-    def __init__(self, problem: Problem, state: State, forces: Array | None, g: Array) -> None:
-        self._problem, self._state = problem, state
-        self._applied = forces
-        self.forces = solve_mass(problem, g * problem.free)
-        self._at = problem.relaxed(state.positions)
-        self._exact = Following(problem, self._at)
+    def __init__(self, problem: Problem, damping: Viscous, y: Array, x: Array) -> None:
+        self._problem, self._damping = problem, damping
+        at_y = Stretches(problem, y)
+        self._change, self._rates = damping.change(at_y), at_y.rates(x)
+        self._along = damping.rate * small_strain_stress(problem, self._rates)
+        self._following = [Following(problem, place) for place in damping.places]
 
     @cached_property
-    def positions(self) -> Array:
-        """By the positions, (N, 3)."""
-        problem, z, state = self._problem, self.forces, self._state
-        K = problem.stiffness(state.positions)
-        out = -(K @ z.ravel()).reshape(z.shape)
-        out += follower_slope(problem, z, state.positions, state.time, state.time)
-        if problem.scene.damping.stiffness:
-            out += self._exact.reduced(self._by_shape)
-        return out
-
-    @cached_property
-    def velocities(self) -> Array:
-        """By the velocities, (N, 3)."""
-        problem, damping = self._problem, self._problem.scene.damping
-        out = -damping.mass * problem.mass_times(self.forces)
-        if damping.stiffness:
-            K = problem.stiffness(self._state.positions, project=True)
-            out = out - damping.stiffness * (K @ self.forces.ravel()).reshape(out.shape)
-        return out
+    def places(self) -> list[Array]:
+        """By each of the earlier positions that stretches are of, (N, 3)."""
+        pairs = zip(self._following, self._slopes, strict=True)
+        return [following.reduced(slope) for following, slope in pairs]
 
     @cached_property
     def weights(self) -> Weights:
         """By mu and omega, each (C,)."""
-        direction = -self._exact.lifted(self.forces)
-        beta = self._problem.scene.damping.stiffness
-        if not beta:
-            return weight_slopes(self._problem, self._at, direction)
-        direction = direction - self._exact.response(self._by_shape)
-        by_mu, by_omega = weight_slopes(self._problem, self._at, direction)
-        return by_mu - beta * self._slopes[1], by_omega - beta * self._slopes[2]
+        by_mu, by_omega = stress_slopes(self._problem, self._change, self._rates)
+        total = [-self._damping.rate * by_mu, -self._damping.rate * by_omega]
+        places = zip(self._damping.places, self._following, self._slopes, strict=True)
+        for place, following, slope in places:
+            more = weight_slopes(self._problem, place, -following.response(slope))
+            total = [a + b for a, b in zip(total, more, strict=True)]
+        return total[0], total[1]
+
+    @property
+    def by_rate(self) -> float:
+        """By the strain rate's factor times the viscosity."""
+        return -float(product(self._change, self._along).sum()) / self._damping.rate
 
     @cached_property
-    def density(self) -> Array:
-        """By the cells' densities, (C,)."""
-        problem, state, z = self._problem, self._state, self.forces
-        force = forces_at(problem, state, self._applied) * problem.free
-        out = -mass_slope(problem, z, solve_mass(problem, force))
-        out -= problem.scene.damping.mass * mass_slope(problem, z, state.velocities)
-        return out + gravity_slope(problem, z, state.time, state.time)
-
-    @cached_property
-    def _slopes(self) -> tuple[Array, Array, Array]:
-        projected = Following(self._problem, self._at, project=True)
-        z, v = projected.lifted(self.forces), projected.lifted(self._state.velocities)
-        return tangent_slopes(self._problem, self._at, z, v)
-
-    @cached_property
-    def _by_shape(self) -> Array:
-        return -self._problem.scene.damping.stiffness * self._slopes[0]
+    def _slopes(self) -> list[Array]:
+        """By the configurations there."""
+        return [a * part.forces(self._along) for a, part in self._damping.parts]

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.errors import InputError
 from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
+    AdjointOperator,
     AdjointSolution,
     AdjointSolver,
     solve_adjoint,
     spectral_radius,
 )
 from pdcorrect.solvers.adjoint_terms import (
-    DampingTerm,
-    FirstAccelerationTerm,
+    RayleighTerm,
+    ViscousTerm,
     follower_slope,
     gravity_slope,
     mass_slope,
@@ -27,10 +30,12 @@ from pdcorrect.solvers.adjoint_terms import (
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.integrators import Integrator
 from pdcorrect.solvers.schemes import Linear
-from pdcorrect.solvers.step import GlobalSolver, HessianOperator, StepObjective
+from pdcorrect.solvers.step import GlobalSolver, StepObjective
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+Term = TypeVar("Term", RayleighTerm, ViscousTerm)
 
 _STEP = 1e-3
 """Of the time step, for differences of fourth order at fixed y."""
@@ -61,15 +66,16 @@ class TakenStep:
         return self.stepper.global_solver(objective.factors, volume_scale=1.0)
 
     def solve(
-        self, H: HessianOperator, y: Array, g: Array, solver: AdjointSolver, tolerance: float
+        self, H: AdjointOperator, y: Array, g: Array, solver: AdjointSolver, tolerance: float
     ) -> AdjointSolution:
-        """X with H x = g for the Hessian H at y."""
+        """X with H x = g for the operator H at y."""
+        objective = H.hessian.objective
         return solve_adjoint(
             H,
             g,
             solver,
-            lambda: self.stepper.preconditioner(H.objective, y),
-            lambda: self.global_solver(H.objective),
+            lambda: self.stepper.preconditioner(objective, y),
+            lambda: self.global_solver(objective),
             tolerance,
         )
 
@@ -94,6 +100,7 @@ class Gradients:
         self._step, self._after, self._y = step, after, y
         self._problem = step.stepper.problem
         self._objective = step.objective(step.time_step)
+        self._objective.follow(y)
         self._scheme = step.integrate.scheme(step.state, step.time_step)
         self._sums: dict[str, Array] = {}
         self._pull(self._scheme.positions, None, after["positions"])
@@ -102,20 +109,19 @@ class Gradients:
             if name in after:
                 self._pull(*rows, after[name])
         by_y = self._sums.pop("y")
-        self._H = self._objective.hessian_operator(y)
+        self._H = AdjointOperator(self._objective.hessian_operator(y), self._load_slopes(y))
         g = self._problem.extended(by_y) * self._objective.free
         found = step.solve(self._H, y, g, step.solver, step.tolerance)
         self.x, self.solver, self.iterations = found.x, found.solver, found.iterations
         self.residual = found.residual
         self._nodal = self.x[: len(by_y)]
-        self._damping: DampingTerm | None = None
-        if self._objective.damping is not None:
-            self._damping = DampingTerm(self._problem, self._objective.damping, y, self.x)
+        objective, problem = self._objective, self._problem
+        self._rayleigh = self._viscous = None
+        if objective.rayleigh is not None:
+            self._rayleigh = RayleighTerm(problem, objective.rayleigh, y, self.x)
+        if objective.viscous is not None:
+            self._viscous = ViscousTerm(problem, objective.viscous, y, self.x)
         self._pull_stage(by_y)
-        self._first: FirstAccelerationTerm | None = None
-        if "accelerations" in self._sums and "accelerations" not in step.state.memory:
-            by_first = self._sums.pop("accelerations")
-            self._first = FirstAccelerationTerm(self._problem, step.state, step.forces, by_first)
 
     def __repr__(self) -> str:
         return (
@@ -128,22 +134,17 @@ class Gradients:
     @cached_property
     def positions(self) -> Array:
         """By the positions at the start of the step, (N, 3), 1/m."""
-        out = self._sum("positions")
-        for term in (self._damping, self._first):
-            if term is not None:
-                out = out + term.positions
-        return out
+        return self._sum("positions")
 
     @cached_property
     def velocities(self) -> Array:
         """By the velocities at the start of the step, (N, 3), s/m."""
-        out = self._sum("velocities")
-        return out if self._first is None else out + self._first.velocities
+        return self._sum("velocities")
 
     @cached_property
     def forces(self) -> Array:
         """By nodal forces during the step, (N, 3), 1/N."""
-        return self._nodal if self._first is None else self._nodal + self._first.forces
+        return self._nodal
 
     @cached_property
     def clamped_positions(self) -> Array:
@@ -206,17 +207,46 @@ class Gradients:
         offset = self._y[: len(x)] - stage.target
         out = gravity_slope(problem, x, *stage.loads_over)
         out -= stage.inertia * mass_slope(problem, x, offset)
-        for term in (self._damping, self._first):
-            if term is not None:
-                out = out + term.density
-        return out
+        return out if self._rayleigh is None else out + self._rayleigh.density
+
+    # --- by damping ---------------------------------------------------------------------
+
+    @property
+    def viscosity(self) -> float:
+        """By ``damping.viscosity``, 1/s.
+
+        Raises
+        ------
+        InputError
+            If the scene has none, as of the next two.
+        """
+        term = self._damped(self._viscous, "viscosity")
+        return self._objective.stage.strain_rate * term.by_rate
+
+    @property
+    def rayleigh_mass(self) -> float:
+        """By ``damping.mass``, s."""
+        return self._objective.stage.rate * self._damped(self._rayleigh, "mass").by_mass
+
+    @property
+    def rayleigh_stiffness(self) -> float:
+        """By ``damping.stiffness``, 1/s."""
+        return self._objective.stage.rate * self._damped(self._rayleigh, "stiffness").by_stiffness
+
+    def _damped(self, term: Term | None, name: str) -> Term:
+        if term is None or not getattr(self._problem.scene.damping, name):
+            raise InputError(
+                f"damping.{name} is 0 in this scene, or its integrator has no velocity: expected "
+                "a positive number, however small."
+            )
+        return term
 
     # --- how good they are ----------------------------------------------------------------
 
     @cached_property
     def spectral_radius(self) -> float:
         """Of G^-1 (G - H), the convergence factor of the thesis's fixed point (eq. 3-30)."""
-        return spectral_radius(self._H, self._step.global_solver(self._objective))
+        return spectral_radius(self._H.hessian, self._step.global_solver(self._objective))
 
     def estimated_errors(self) -> dict[str, float]:
         """How much the gradients change in one Newton step from y, relative.
@@ -225,7 +255,8 @@ class Gradients:
         exactly; first order in what it left.
         """
         _, gradient = self._objective.value_and_gradient(self._y)
-        found = self._step.solve(self._H, self._y, gradient, "auto", 1e-6)
+        symmetric = AdjointOperator(self._H.hessian)
+        found = self._step.solve(symmetric, self._y, gradient, "auto", 1e-6)
         better = Gradients(self._step, self._after, self._y - found.x)
         out = {}
         for name in ("positions", "velocities", "forces", "young", "poisson", "density"):
@@ -235,6 +266,13 @@ class Gradients:
         return out
 
     # --- internals --------------------------------------------------------------------------
+
+    def _load_slopes(self, y: Array) -> Callable[[Array], Array] | None:
+        """What loads that follow the body add to the operator at y."""
+        problem, positions = self._problem, y[: len(self._problem.positions)]
+        if not problem.has_followers:
+            return None
+        return lambda x: follower_slope(problem, x, positions, *self._objective.stage.loads_over)
 
     def _pull(self, on_free: Linear, on_clamped: Linear | None, g: Array) -> None:
         """Add g's share to the derivatives by what a linear combination is made of."""
@@ -246,19 +284,21 @@ class Gradients:
         on_clamped.transpose(g * ~free, self._sums)
 
     def _pull_stage(self, by_y: Array) -> None:
-        scheme, stage, problem, x = self._scheme, self._objective.stage, self._problem, self._nodal
+        scheme, problem, x = self._scheme, self._problem, self._nodal
         if scheme.inertia:
             by_target = scheme.inertia * problem.mass_times(x)
             self._pull(scheme.target, scheme.clamped_target, by_target)
-        if self._damping is not None:
-            self._pull(scheme.origin, scheme.clamped_origin, self._damping.origin)
+        if self._rayleigh is not None:
+            self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
+            self._pull(scheme.start, scheme.clamped, self._rayleigh.place)
+        if self._viscous is not None:
+            pairs = zip(scheme.strains, self._viscous.places, strict=True)
+            for (_, place), slope in pairs:
+                place.transpose(slope, self._sums)
         held = ~problem.free
         if held.any():
             back = (by_y - self._H.product(self.x)[: len(x)]) * held
             scheme.clamped.transpose(back, self._sums)
-        if any(load.pull is not None for load in problem.loads):
-            slope = follower_slope(problem, x, stage.loads_at, *stage.loads_over)
-            scheme.loads_at.transpose(slope, self._sums)
 
     def _sum(self, name: str) -> Array:
         found = self._sums.get(name)
@@ -269,7 +309,7 @@ class Gradients:
         """By each cell's mu and omega, 0 for a term that the energy does not have."""
         problem = self._problem
         parts = [weight_slopes(problem, self._y, -self.x)]
-        parts += [term.weights for term in (self._damping, self._first) if term is not None]
+        parts += [term.weights for term in (self._rayleigh, self._viscous) if term is not None]
         rule = problem.scene.material
         by_mu = np.sum([part[0] for part in parts], axis=0)
         by_omega = np.sum([part[1] for part in parts], axis=0)
@@ -285,6 +325,7 @@ class Gradients:
         objective = self._step.objective(h)
         stage, count = objective.stage, len(self._problem.positions)
         y = np.where(objective.free, self._y, self._problem.extended(stage.start))
+        objective.follow(y)
         _, residual = objective.balance(y)
         end = stage.finish(y[:count])
         value = np.vdot(self._after["positions"], end.positions)

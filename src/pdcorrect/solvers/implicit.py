@@ -15,6 +15,7 @@ from threadpoolctl import ThreadpoolController
 from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
@@ -105,7 +106,8 @@ class ImplicitStepper:
         positive("time_step", self.time_step)
         time = problem.scene.time
         self.integrator = time.integrator if integrator is None else integrator
-        self.integrate = make_integrator(self.integrator, time.spectral_radius)
+        viscous = problem.scene.damping.viscosity > 0.0
+        self.integrate = make_integrator(self.integrator, time.spectral_radius, viscous)
         self._options = MinimiserOptions(self.tolerance * problem.cell_size)
         self._backend = backend
         self._recover = recover
@@ -205,13 +207,15 @@ class ImplicitStepper:
 
     def _factorisation(self) -> str:
         rest = self.problem.rest_state()
-        stage = self.integrate(self.problem, rest, self.time_step, None)
+        stage = self.integrate(self.problem, rest, self.time_step)
         return self.global_solver(hessian_factors(self.problem, stage)).backend
 
     # --- one attempt ----------------------------------------------------------------
 
-    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        """Minimise the step's objective from its starting point."""
+    def _minimise(
+        self, objective: StepObjective, start: Array, options: MinimiserOptions
+    ) -> Minimum:
+        """Minimise the step's objective from a configuration."""
         raise TypeError(f"{type(self).__name__} does not say how to minimise a step")
 
     def _volume_scale(self) -> float:
@@ -251,14 +255,11 @@ class ImplicitStepper:
         From where positions after the step are ``guess`` (N, 3), if that is given.
         """
         integrate = self.integrate if integrate is None else integrate
-        stage = integrate(self.problem, state, time_step, forces)
+        stage = integrate(self.problem, state, time_step)
         if guess is not None:
             y = nodal_solution(integrate.scheme(state, time_step), state.positions, guess)
             stage = replace(stage, start=np.where(self.problem.free, y, stage.start))
-        loads = self.problem.external_forces(*stage.loads_over, stage.loads_at)
-        if forces is not None:
-            loads = loads + forces
-        return StepObjective(self.problem, state, stage, loads)
+        return StepObjective(self.problem, state, stage, forces)
 
     def _attempt(
         self,
@@ -269,25 +270,40 @@ class ImplicitStepper:
         integrate: Integrator,
         guess: Array | None = None,
     ) -> _Outcome:
-        """The method itself, then Newton-CG from where it stopped."""
         objective = self.objective(state, forces, h, integrate, guess)
         stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
-        minimum = self._minimise(objective, options)
+        if self.problem.has_followers:
+            options = replace(options, tolerance=0.5 * options.tolerance)
+            again = replace(options, unmoved=1.0)
+            minimum = settle(
+                objective,
+                lambda y: self._solved(objective, y, options if y is objective.start else again),
+            )
+        else:
+            minimum = self._solved(objective, objective.start, options)
         effort.add(minimum)
-        failed = not minimum.status.ok and minimum.status is not Status.NOT_FINITE
-        if failed and self._recover:
-            options = replace(options, max_iterations=_FALLBACK_ITERATIONS)
-            solver = self.global_solver(objective.factors)
-            minimum = newton_cg(objective, minimum.positions, solver, options)
-            effort.add(minimum)
-            if minimum.status is Status.CONVERGED:
-                minimum.status = Status.RECOVERED
         if minimum.status.ok and self._adrift:
             y, gradient = objective.carried(minimum.positions, minimum.gradient)
             minimum = replace(minimum, positions=y, gradient=gradient)
         minimum.estimate *= stage.gain
         return _outcome(self.problem, state, objective, minimum, h)
+
+    def _solved(self, objective: StepObjective, start: Array, options: MinimiserOptions) -> Minimum:
+        """The method itself, then Newton-CG from where it stopped."""
+        found = self._minimise(objective, start, options)
+        if found.status.ok or found.status is Status.NOT_FINITE or not self._recover:
+            return found
+        options = replace(options, max_iterations=_FALLBACK_ITERATIONS)
+        solver = self.global_solver(objective.factors)
+        again = newton_cg(objective, found.positions, solver, options)
+        if again.status is Status.CONVERGED:
+            again.status = Status.RECOVERED
+        return replace(
+            again,
+            iterations=found.iterations + again.iterations,
+            evaluations=found.evaluations + again.evaluations,
+        )
 
     def _substeps(
         self, state: State, forces: Array | None, h: float, effort: _Effort
@@ -296,7 +312,7 @@ class ImplicitStepper:
 
         None without inertia: parts by backward Euler would solve another problem.
         """
-        if self.integrate(self.problem, state, h, forces).inertia == 0.0:
+        if self.integrate.scheme(state, h).inertia == 0.0:
             return None
         for level in range(1, _SUBSTEP_LEVELS + 1):
             count = 2**level

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.multigrid import conjugate_gradients
+from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
 from pdcorrect.solvers.schemes import Linear, Scheme, SchemeOf, by_component
@@ -25,8 +24,6 @@ Array = NDArray[np.float64]
 
 _EQUAL_STEPS = 1e-6
 """Relative difference up to which two steps count as equal."""
-_MASS_TOLERANCE, _MASS_STEPS = 1e-15, 200
-"""Of solving with a consistent mass matrix, whose condition does not depend on the mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +41,9 @@ class StepEquation:
     loads_over : tuple of float
         Loads are averaged over this time interval (s), or taken at its ends if
         these are equal.
-    loads_at : (N, 3)
-        Positions at which follower loads are sampled, m.
+    strain_rate : float
+    strains : tuple of (float, (N, 3))
+        See `Scheme`; none in scenes without viscosity.
     finish : callable
         y -> the state after the step.
     """
@@ -56,53 +54,46 @@ class StepEquation:
     origin: Array
     start: Array
     loads_over: tuple[float, float]
-    loads_at: Array
     finish: Callable[[Array], State]
+    strain_rate: float = 0.0
+    strains: tuple[tuple[float, Array], ...] = ()
     gain: float = 1.0
 
 
 class Integrator:
-    """(problem, state, h, forces) -> the stage from ``state`` to its time + h.
-
-    ``forces`` (N, 3), N, act besides the scene's loads; only a first acceleration
-    needs them.
-    """
+    """(problem, state, h) -> the equation of the step from ``state`` to its time + h."""
 
     def __init__(self, scheme_of: SchemeOf) -> None:
         self.scheme_of = scheme_of
 
     def scheme(self, state: State, h: float) -> Scheme:
         """The scheme of a step of h seconds from a state."""
-        return _scheme(self.scheme_of, h, self._begun(state, h))
+        return _scheme(self.scheme_of, h, self._usable(state, h))
 
     def held(self, state: State, h: float) -> Integrator:
         """The same integrator with the scheme of that step, whatever the length of its own step.
 
         As if the steps before ``state`` had the same length.
         """
-        started = self._begun(state, h)
-        return Integrator(lambda length, _: self.scheme_of(length, started))
+        usable = self._usable(state, h)
+        return Integrator(lambda length, _: self.scheme_of(length, usable))
 
-    def started(
-        self, memory: Mapping[str, Any], h: float, is_a_step: Callable[[Any], bool]
-    ) -> bool:
-        """Whether a state's memory has what a step of h seconds needs; other entries do not count.
+    @staticmethod
+    def usable(memory: Mapping[str, Any], is_a_step: Callable[[Any], bool]) -> frozenset[str]:
+        """The entries of a state's memory that a step may use.
 
-        ``is_a_step`` says of the times before, where they are needed, whether they are h earlier.
+        ``is_a_step`` says of the times of the state before, if these are there, whether they
+        are one step earlier.
         """
-        needed = _scheme(self.scheme_of, h, False).memory.keys()
-        if not needed <= memory.keys():
-            return False
-        return "previous_times" not in needed or is_a_step(memory["previous_times"])
+        names = frozenset(memory)
+        if "previous_times" in names and not is_a_step(memory["previous_times"]):
+            names -= schemes.HISTORY
+        return names
 
-    def _begun(self, state: State, h: float) -> bool:
-        return self.started(
-            state.memory, h, lambda before: equal_steps(state.time - before[0, 0], h)
-        )
+    def _usable(self, state: State, h: float) -> frozenset[str]:
+        return self.usable(state.memory, lambda before: equal_steps(state.time - before[0, 0], h))
 
-    def known(
-        self, problem: Problem, state: State, h: float, forces: Array | None
-    ) -> dict[str, Any]:
+    def known(self, problem: Problem, state: State, h: float) -> dict[str, Any]:
         """What the linear combinations of a scheme combine, by name."""
         scheme, end = self.scheme(state, h), state.time + h
         known: dict[str, Any] = {
@@ -111,25 +102,13 @@ class Integrator:
             "prescribed": problem.clamped_positions(end),
             "time": np.full_like(state.positions, state.time),
             **state.memory,
-            "clamp_velocity": 0.0,
-            "clamp_velocity_at_y": 0.0,
-            "clamp_jump": 0.0,
+            **clamp_rates(problem, state.time, h, scheme.at),
         }
-        if "accelerations" in scheme.memory and "accelerations" not in known:
-            known["accelerations"] = accelerations(problem, state, forces)
-        if problem.clamps.moving:
-            at_y = state.time + scheme.loads_over[1] * h
-            known["clamp_velocity"] = _clamp_velocity(problem, end, h)
-            known["clamp_velocity_at_y"] = _clamp_velocity(problem, at_y, h)
-            known["clamp_jump"] = _clamp_acceleration(problem, at_y, h)
-            known["clamp_jump"] -= _clamp_acceleration(problem, state.time + 0.5 * h, h)
         return known
 
-    def __call__(
-        self, problem: Problem, state: State, h: float, forces: Array | None = None
-    ) -> StepEquation:
+    def __call__(self, problem: Problem, state: State, h: float) -> StepEquation:
         scheme, free = self.scheme(state, h), problem.free
-        known = self.known(problem, state, h, forces)
+        known = self.known(problem, state, h)
 
         def split(on_free: Linear, on_clamped: Linear | None) -> Array:
             return np.asarray(by_component(np, free, known, on_free, on_clamped))
@@ -141,6 +120,7 @@ class Integrator:
             return State(scheme.positions(known), velocities, state.time + h, memory)
 
         first, last = (state.time + share * h for share in scheme.loads_over)
+        viscous = bool(problem.scene.damping.viscosity)
         return StepEquation(
             scheme.inertia,
             split(scheme.target, scheme.clamped_target),
@@ -148,15 +128,32 @@ class Integrator:
             split(scheme.origin, scheme.clamped_origin),
             split(scheme.start, scheme.clamped),
             (first, last),
-            scheme.loads_at(known),
             finish,
+            scheme.strain_rate,
+            tuple((a, x(known)) for a, x in scheme.strains) if viscous else (),
             scheme.gain,
         )
 
 
+def clamp_rates(problem: Problem, time: float, h: float, at: float) -> dict[str, Any]:
+    """The entries of a step's `Integrator.known` that only moving clamps have, else 0.
+
+    ``at`` is y's time in steps from ``time`` (s).
+    """
+    if not problem.clamps.moving:
+        return {"clamp_velocity": 0.0, "clamp_velocity_at_y": 0.0, "clamp_jump": 0.0}
+    at_y, middle = time + at * h, time + 0.5 * h
+    return {
+        "clamp_velocity": _clamp_velocity(problem, time + h, h),
+        "clamp_velocity_at_y": _clamp_velocity(problem, at_y, h),
+        "clamp_jump": _clamp_acceleration(problem, at_y, h)
+        - _clamp_acceleration(problem, middle, h),
+    }
+
+
 @lru_cache(maxsize=64)
-def _scheme(scheme_of: SchemeOf, h: float, started: bool) -> Scheme:
-    return scheme_of(h, started)
+def _scheme(scheme_of: SchemeOf, h: float, known: frozenset[str]) -> Scheme:
+    return scheme_of(h, known)
 
 
 def solution(scheme: Scheme, before: State, after: State, problem: Problem) -> Array:
@@ -179,15 +176,17 @@ def equal_steps(a: float, b: float) -> bool:
 backward_euler = Integrator(schemes.backward_euler)
 
 
-def integrator(name: str, spectral_radius: float = 0.8) -> Integrator:
-    """An integrator by its name in a scene.
+def integrator(name: str, spectral_radius: float = 0.8, viscous: bool = False) -> Integrator:
+    """An integrator by its name in a scene; ``viscous`` where the scene has a viscosity.
 
     Raises
     ------
     InputError
     """
     if name == "generalised-alpha":
-        return Integrator(schemes.generalised_alpha(spectral_radius))
+        return Integrator(schemes.generalised_alpha(spectral_radius, viscous))
+    if name == "midpoint" and viscous:
+        return Integrator(partial(schemes.midpoint, viscous=True))
     if name not in INTEGRATORS:
         raise InputError(f"integrator {name!r}: expected {', '.join(INTEGRATORS)}.")
     return Integrator(_SCHEMES[name])
@@ -208,55 +207,6 @@ def _clamp_acceleration(problem: Problem, time: float, h: float) -> Array:
     """Acceleration of the prescribed positions by central differences, (N, 3), m/s2."""
     places = [problem.clamped_positions(time + k * h) for k in (-1, 0, 1)]
     return (places[0] - 2.0 * places[1] + places[2]) / h**2
-
-
-def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:
-    """f_int + f_ext - C v at a state, (N, 3), N, without the clamps' forces.
-
-    ``forces`` (N, 3), N, act besides the scene's loads.
-    """
-    damping = problem.scene.damping
-    out = problem.forces(state.positions)
-    out += problem.external_forces(state.time, None, state.positions)
-    if forces is not None:
-        out += forces
-    if damping.mass:
-        out -= damping.mass * problem.mass_times(state.velocities)
-    if damping.stiffness:
-        K = problem.stiffness(state.positions, project=True)
-        out -= damping.stiffness * (K @ state.velocities.ravel()).reshape(out.shape)
-    return out
-
-
-def accelerations(problem: Problem, state: State, forces: Array | None = None) -> Array:
-    """M^-1 `forces_at` a state, (N, 3), m/s2; zero where clamped.
-
-    Raises
-    ------
-    ConvergenceError
-        If the mass matrix could not be solved with.
-    """
-    return solve_mass(problem, forces_at(problem, state, forces) * problem.free)
-
-
-def solve_mass(problem: Problem, force: Array) -> Array:
-    """M^-1 force on the free components, for (N, 3) that is zero where clamped."""
-    if problem.mass_is_diagonal:
-        return force / problem.mass[:, None]
-    diagonal = problem.mass_matrix.diagonal()[:, None]
-    found = conjugate_gradients(
-        lambda x: problem.mass_times(x) * problem.free,
-        force,
-        lambda r: r / diagonal,
-        tolerance=_MASS_TOLERANCE,
-        max_steps=_MASS_STEPS,
-    )
-    if not found.converged:
-        raise ConvergenceError(
-            f"M a = f was not solved in {found.steps} steps of conjugate gradients: expected "
-            "finite forces and densities within a factor of 1e6 of each other."
-        )
-    return found.x
 
 
 _SCHEMES: dict[str, SchemeOf] = {

@@ -72,11 +72,14 @@ class MinimiserOptions:
     history : int
         Pairs that L-BFGS keeps; 0 is plain local/global.
     max_iterations : int
+    unmoved : float
+        The share of the tolerance within which a start is accepted as it is.
     """
 
     tolerance: float
     history: int = 16
     max_iterations: int = 1000
+    unmoved: float = NO_MOTION
 
 
 @dataclass(eq=False)
@@ -206,7 +209,7 @@ def minimise(
         length = largest_displacement(direction)
         if length <= threshold:
             exact, estimate = newton_step(objective, p, gradient, solve, direction)
-            if estimate <= (options.tolerance if iteration else NO_MOTION * options.tolerance):
+            if estimate <= options.tolerance * (1.0 if iteration else options.unmoved):
                 status = Status.CONVERGED
                 break
             if estimate > options.tolerance:

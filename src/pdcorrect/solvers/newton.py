@@ -21,7 +21,7 @@ from pdcorrect.solvers.minimise import (
     largest_displacement,
     newton_loop,
 )
-from pdcorrect.solvers.step import HessianOperator, StepObjective
+from pdcorrect.solvers.step import StepObjective
 from pdcorrect.solvers.tangent_solver import TangentFactory, TangentSolver
 
 Array = NDArray[np.float64]
@@ -100,8 +100,10 @@ class Newton(ImplicitStepper):
     def _factorisation(self) -> str:
         return "amg" if self.linear_solver == "cg" else self._tangents.backend
 
-    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        return newton_loop(objective, objective.start, self._solver(objective, options), options)
+    def _minimise(
+        self, objective: StepObjective, start: Array, options: MinimiserOptions
+    ) -> Minimum:
+        return newton_loop(objective, start, self._solver(objective, options), options)
 
     def _solver(self, objective: StepObjective, options: MinimiserOptions) -> Direction:
         """What gives the Newton steps of one time step."""
@@ -159,7 +161,7 @@ class _IterativeSteps:
     def _solve(self, p: Array, b: Array, project: bool = False) -> Solution:
         objective = self._objective
         found = conjugate_gradients(
-            HessianOperator(objective, objective.problem.linearise(p, project)),
+            objective.hessian_operator(p, project),
             b,
             self._precondition,
             tolerance=_CG_TOLERANCE,

@@ -148,23 +148,27 @@ class ProjectiveDynamics(ImplicitStepper):
         self._true.note(result.iterations, result.state.time)
         return replace(result, stats={**result.stats, "hessian_age": float(self._true.age)})
 
-    def _minimise(self, objective: StepObjective, options: MinimiserOptions) -> Minimum:
-        if self._true is None:
-            solver = self.global_solver(objective.factors)
-            return minimise(objective, objective.start, solver, options)
-        try:
-            return self._minimise_true(self._true, objective, options)
-        except NotPositiveDefinite:  # G always is, if the step has a minimum
-            self._true.forget()
-            solver = self.global_solver(objective.factors)
-            return minimise(objective, objective.start, solver, options)
+    def _minimise(
+        self, objective: StepObjective, start: Array, options: MinimiserOptions
+    ) -> Minimum:
+        if self._true is not None:
+            try:
+                return self._minimise_true(self._true, objective, start, options)
+            except NotPositiveDefinite:  # G always is, if the step has a minimum
+                self._true.forget()
+        return minimise(objective, start, self.global_solver(objective.factors), options)
 
     def _minimise_true(
-        self, hessian: TrueHessian, objective: StepObjective, options: MinimiserOptions
+        self,
+        hessian: TrueHessian,
+        objective: StepObjective,
+        start: Array,
+        options: MinimiserOptions,
     ) -> Minimum:
         """L-BFGS; a Hessian that has not led to the minimum after a while is renewed on the way."""
         limit, most = min(_PATIENCE, options.max_iterations), options.max_iterations
-        solver, start = hessian.solver(objective), objective.start
+        first = start is objective.start
+        solver = hessian.solver(objective) if first else hessian.at(objective, start)
         found = minimise(objective, start, solver, replace(options, max_iterations=limit))
         while found.status is Status.ITERATION_LIMIT and found.iterations < most:
             solver = hessian.renew(objective, found.positions)

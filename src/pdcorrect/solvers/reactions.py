@@ -5,14 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.integrators import accelerations as accelerations_at
-from pdcorrect.solvers.integrators import forces_at
+from pdcorrect.fem.sensitivities import Following
+from pdcorrect.fem.viscosity import Stretches, small_strain_stress
 from pdcorrect.solvers.step import check_input
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+_MASS_TOLERANCE, _MASS_STEPS = 1e-15, 200
+"""Of solving with a consistent mass matrix, whose condition does not depend on the mesh."""
 
 
 def reactions(
@@ -48,7 +52,7 @@ def reactions(
     """
     check_input(problem, state, forces)
     if accelerations is None:
-        accelerations = accelerations_at(problem, state, forces)
+        accelerations = solve_mass(problem, forces_at(problem, state, forces) * problem.free)
     else:
         accelerations = np.asarray(accelerations, dtype=np.float64)
         _check(accelerations, problem.positions.shape)
@@ -65,3 +69,46 @@ def _check(accelerations: Array, shape: tuple[int, ...]) -> None:
         )
     if not np.isfinite(accelerations).all():
         raise InputError("accelerations contain NaN or infinite entries: expected finite numbers.")
+
+
+def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:
+    """f_int + f_ext - C v at a state, (N, 3), N, without the clamps' forces.
+
+    ``forces`` (N, 3), N, act besides the scene's loads.
+    """
+    damping = problem.scene.damping
+    out = problem.forces(state.positions)
+    out += problem.external_forces(state.time, None, state.positions)
+    if forces is not None:
+        out += forces
+    if damping.mass:
+        out -= damping.mass * problem.mass_times(state.velocities)
+    if damping.stiffness:
+        K = problem.stiffness(state.positions, project=True)
+        out -= damping.stiffness * (K @ state.velocities.ravel()).reshape(out.shape)
+    if damping.viscosity:
+        here = problem.relaxed(state.positions)
+        at = Stretches(problem, here)
+        rate = at.rates(Following(problem, here).lifted(state.velocities))
+        out -= damping.viscosity * at.forces(small_strain_stress(problem, rate))[: len(out)]
+    return out
+
+
+def solve_mass(problem: Problem, force: Array) -> Array:
+    """M^-1 force on the free components, for (N, 3) that is zero where clamped."""
+    if problem.mass_is_diagonal:
+        return force / problem.mass[:, None]
+    diagonal = problem.mass_matrix.diagonal()[:, None]
+    found = conjugate_gradients(
+        lambda x: problem.mass_times(x) * problem.free,
+        force,
+        lambda r: r / diagonal,
+        tolerance=_MASS_TOLERANCE,
+        max_steps=_MASS_STEPS,
+    )
+    if not found.converged:
+        raise ConvergenceError(
+            f"M a = f was not solved in {found.steps} steps of conjugate gradients: expected "
+            "finite forces and densities within a factor of 1e6 of each other."
+        )
+    return found.x

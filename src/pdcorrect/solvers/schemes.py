@@ -2,13 +2,19 @@
 
 A step of h seconds solves
 
-    c M (y - q) + d C (y - o) = f_int(y) + f_ext
+    c M (y - q) + d C (y - o) + f_visc(y) = f_int(y) + f_ext
 
 for one unknown configuration y, so every integrator minimises the same kind of
 function (thesis eq. 3-6) and projective dynamics needs no more than other factors in G.
-C is Rayleigh damping, d (y - o) the velocity at y.  Everything else in a step is a
-linear combination of what is known at its start and of y, with coefficients that
-depend on h alone.
+C is Rayleigh damping, d (y - o) the velocity at y; f_visc is the force of the rate of
+stretch e (S(y) - sum of a_k S(x_k)) of viscosity.  Everything else in a step is a linear
+combination of what is known at its start and of y, with coefficients that depend on h
+alone.
+
+Loads are averaged over intervals that follow each other without gap or overlap, centred
+where the equation is.  So the momentum of a body is that of the loads at any step, and
+second order is kept.  In the first step of several, whose equation weighs more, the
+interval begins at its start and is as much longer.
 """
 
 from __future__ import annotations
@@ -98,6 +104,9 @@ _Y, _PRESCRIBED = Linear(y=1.0), Linear(prescribed=1.0)
 _CLAMP_VELOCITY = Linear(clamp_velocity=1.0)
 
 
+Strains = tuple[tuple[float, Linear], ...]
+
+
 @dataclass(frozen=True)
 class Scheme:
     """The equation of one step and what follows from its solution.
@@ -118,16 +127,20 @@ class Scheme:
     target, origin : Linear
         q and o, m.
     start : Linear
-        First iterate, m.
-    loads_at : Linear
-        Positions at which follower loads are sampled, m.
+        First iterate, m: y to second order (backward Euler's to its own).
     positions, velocities : Linear
         After the step.
     clamped : Linear
         The prescribed y.
+    at : float
+        The time of y, in steps from the start.
     loads_over : tuple of float
         Loads are averaged over this time interval, in steps from the start, or taken at
         its ends if these are equal.
+    strain_rate : float
+        e, 1/s.
+    strains : tuple of (float, Linear)
+        a_k and x_k, m.
     gain : float
         dp'/dy, by which an error of y grows.
     memory : mapping of str to (Linear, Linear)
@@ -139,112 +152,167 @@ class Scheme:
     target: Linear
     origin: Linear
     start: Linear
-    loads_at: Linear
     positions: Linear
     velocities: Linear
     clamped: Linear = _PRESCRIBED
     clamped_target: Linear | None = None
     clamped_origin: Linear | None = None
     clamped_velocities: Linear | None = None
+    at: float = 1.0
     loads_over: tuple[float, float] = (0.0, 1.0)
+    strain_rate: float = 0.0
+    strains: Strains = ()
     gain: float = 1.0
     memory: Mapping[str, tuple[Linear, Linear]] = field(default_factory=dict)
 
 
-SchemeOf = Callable[[float, bool], Scheme]
-"""(h, started) -> the scheme; ``started`` says whether the state has the memory for it."""
+SchemeOf = Callable[[float, frozenset[str]], Scheme]
+"""(h, known) -> the scheme; ``known`` are the entries of the state's memory that it may use."""
+
+HISTORY = {
+    "previous_positions", "previous_velocities", "previous_times",
+    "strained", "strained_before",
+}  # fmt: skip
+"""Entries of a memory that are of use only to a step as long as the last one."""
+_TIME = Linear(time=1.0)
 
 
-def backward_euler(h: float, started: bool = False) -> Scheme:
+def backward_euler(h: float, known: frozenset[str] = frozenset()) -> Scheme:
     """Thesis eq. 3-1 to 3-4: v' = (p' - p)/h, M (v' - v)/h = f(p').  First order."""
     target = _P + h * _V
-    return Scheme(1.0 / h**2, 1.0 / h, target, _P, target, _P, _Y, (_Y - _P) / h)
+    return Scheme(
+        1.0 / h**2, 1.0 / h, target, _P, target, _Y, (_Y - _P) / h,
+        strain_rate=1.0 / h, strains=((1.0, _P),),
+    )  # fmt: skip
 
 
-def bdf2(h: float, started: bool) -> Scheme:
+def bdf2(h: float, known: frozenset[str]) -> Scheme:
     """Two-step backward differences: p' = (4 p - p_)/3 + 2h/3 v', the same for v'.
 
     Second order.  Without the state one step of the same length before the step is one
     of backward Euler, which, at the start only, does not lower the order.
     """
-    rate, origin, drift = 1.0 / h, _P, _V
+    started = "previous_positions" in known
+    rate: float = 1.0 / h
+    strains: Strains = ((1.0, _P),)
     if started:
-        rate = 1.5 / h
-        origin = (4.0 * _P - Linear(previous_positions=1.0)) / 3.0
-        drift = (4.0 * _V - Linear(previous_velocities=1.0)) / 3.0
-    target, ahead = origin + drift / rate, _P + h * _V
-    kept = {
-        "previous_positions": _P,
-        "previous_velocities": _V,
-        "previous_times": Linear(time=1.0),
-    }
+        rate, strains = 1.5 / h, ((4.0 / 3.0, _P), (-1.0 / 3.0, Linear(previous_positions=1.0)))
+    origin = _backward(_P, "previous_positions") if started else _P
+    drift = _backward(_V, "previous_velocities") if started else _V
+    target = origin + drift / rate
+    kept = {"previous_positions": _P, "previous_velocities": _V, "previous_times": _TIME}
     return Scheme(
-        rate**2, rate, target, origin, target, ahead, _Y, rate * (_Y - origin),
-        loads_over=(1.0, 1.0), memory={name: (row, row) for name, row in kept.items()},
+        rate**2, rate, target, origin, target, _Y, rate * (_Y - origin),
+        loads_over=(0.5 if started else 0.0, 1.5), strain_rate=rate, strains=strains,
+        memory={name: (row, row) for name, row in kept.items()},
     )  # fmt: skip
 
 
-def midpoint(h: float, started: bool = False) -> Scheme:
+def _backward(now: Linear, before: str) -> Linear:
+    """(4 now - before)/3, see `bdf2`."""
+    return (4.0 * now - Linear(**{before: 1.0})) / 3.0
+
+
+def midpoint(h: float, known: frozenset[str] = frozenset(), *, viscous: bool = False) -> Scheme:
     """Implicit midpoint: y = (p + p')/2, M (v' - v)/h = f(y), p' - p = h (v + v')/2.
 
     Second order, symplectic; keeps linear and angular momentum.
     """
     target, clamped = _P + 0.5 * h * _V, 0.5 * (_P + _PRESCRIBED)
+    rate, strains, memory = _between(h, 0.5, known, viscous)
     return Scheme(
-        4.0 / h**2, 2.0 / h, target, _P, target, target, 2.0 * _Y - _P,
-        (4.0 / h) * (_Y - _P) - _V, clamped,
+        4.0 / h**2, 2.0 / h, target, _P, target, 2.0 * _Y - _P, (4.0 / h) * (_Y - _P) - _V,
+        clamped,
         clamped_target=clamped - 0.25 * h * (_CLAMP_VELOCITY - _V),
         clamped_velocities=_CLAMP_VELOCITY,
-        gain=2.0,
+        at=0.5, strain_rate=rate, strains=strains, gain=2.0, memory=memory,
     )  # fmt: skip
 
 
-def generalised_alpha(spectral_radius: float) -> SchemeOf:
-    """Chung and Hulbert (1993): second order, with chosen damping of high frequencies."""
+def _between(
+    h: float, at: float, known: frozenset[str], viscous: bool
+) -> tuple[float, Strains, dict[str, tuple[Linear, Linear]]]:
+    """Rate of stretch at a y between two frames, and the memory that it needs.
+
+    Such a y lies on the chord of a turning node's path, so that S(y) is a little smaller
+    than S at either frame.  Differences of the stretches at y alone, of this step and of
+    two before, are free of that, and second order (as `bdf2`).  The first two steps have
+    less to go by.
+    """
+    if not viscous:
+        return 0.0, (), {}
+    last, before = Linear(strained=1.0), Linear(strained_before=1.0)
+    memory = {"strained": (_Y, _Y), "previous_times": (_TIME, _TIME)}
+    if "strained" not in known:
+        return 1.0 / (at * h), ((1.0, _P),), memory
+    memory["strained_before"] = (last, last)
+    if "strained_before" not in known:
+        return 1.0 / h, ((1.0, last),), memory
+    return 1.5 / h, ((4.0 / 3.0, last), (-1.0 / 3.0, before)), memory
+
+
+def generalised_alpha(spectral_radius: float, viscous: bool = False) -> SchemeOf:
+    """Chung and Hulbert (1993): second order, with chosen damping of high frequencies.
+
+    A step from a state without accelerations takes its own for the one at its start too,
+    which, at the start only, does not lower the order.
+
+    Parameters
+    ----------
+    spectral_radius : float
+        At infinite frequency, 0 to 1.
+    viscous : bool
+        Whether the steps need the rate of stretch.
+    """
     r = spectral_radius
     if not 0.0 <= r <= 1.0:
         raise InputError(f"spectral_radius = {r!r}: expected a number from 0 to 1.")
-    alpha_m, alpha_f = (2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0)
-    gamma = 0.5 - alpha_m + alpha_f
-    beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2
+    alpha_f = r / (r + 1.0)
 
-    def scheme(h: float, started: bool) -> Scheme:
+    def scheme(h: float, known: frozenset[str]) -> Scheme:
+        started = "accelerations" in known
+        alpha_m = (2.0 * r - 1.0) / (r + 1.0) if started else 0.0
+        gamma = 0.5 - alpha_m + alpha_f if started else 1.0
+        beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2 if started else 0.5
+        a = _A if started else Linear()
         scale = 1.0 / ((1.0 - alpha_f) * beta * h**2)
-        at_rest = -_V / (beta * h) - (0.5 / beta - 1.0) * _A  # a' for y = p
+        at_rest = -_V / (beta * h) - (0.5 / beta - 1.0) * a  # a' for y = p
         rate = gamma / (beta * h)
         inertia = (1.0 - alpha_m) * scale
 
         def ahead(acceleration: Linear) -> Linear:
-            return _V + h * ((1.0 - gamma) * _A + gamma * acceleration)
+            return _V + h * ((1.0 - gamma) * a + gamma * acceleration)
 
         new = at_rest + scale * (_Y - _P)
-        start = _P + (1.0 - alpha_f) * h * _V
         clamped = alpha_f * _P + (1.0 - alpha_f) * _PRESCRIBED
         # the clamps' mean acceleration over the step, moved to y's time:
         acceleration = (_CLAMP_VELOCITY - _V) / h
         if started:
             acceleration += Linear(clamp_jump=1.0)
+        strain_rate, strains, memory = _between(h, 1.0 - alpha_f, known, viscous)
         return Scheme(
             inertia,
             rate,
-            target=_P - (at_rest + alpha_m / (1.0 - alpha_m) * _A) / scale,
+            target=_P - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale,
             origin=_P - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * _V) / rate,
-            start=start,
-            loads_at=start,
+            start=_P + (1.0 - alpha_f) * h * _V,
             positions=_P + (_Y - _P) / (1.0 - alpha_f),
             velocities=ahead(new),
             clamped=clamped,
             clamped_target=clamped - acceleration / inertia,
             clamped_origin=clamped - Linear(clamp_velocity_at_y=1.0) / rate,
             clamped_velocities=_CLAMP_VELOCITY,
-            loads_over=(1.0 - alpha_f, 1.0 - alpha_f),
+            at=1.0 - alpha_f,
+            loads_over=(0.5 - alpha_f if started else 0.0, 1.5 - alpha_f),
+            strain_rate=strain_rate,
+            strains=strains,
             gain=1.0 / (1.0 - alpha_f),
-            memory={"accelerations": (new, Linear())},
+            memory={"accelerations": (new, Linear()), **memory},
         )
 
     return scheme
 
 
-def quasi_static(h: float, started: bool = False) -> Scheme:
+def quasi_static(h: float, known: frozenset[str] = frozenset()) -> Scheme:
     """Equilibrium f(p') = 0 under the loads and clamps at the end of the step."""
-    return Scheme(0.0, 0.0, _P, _P, _P, _P, _Y, Linear(), loads_over=(1.0, 1.0))
+    return Scheme(0.0, 0.0, _P, _P, _P, _Y, Linear(), loads_over=(1.0, 1.0))

@@ -1,10 +1,11 @@
 """The minimisation that one implicit step is (thesis eq. 3-6), and its preconditioner G.
 
-    gamma(y) = c/2 (y - q)^T M (y - q) + d/2 (y - o)^T C (y - o) + W(y) - f . (y - X)
+    gamma(y) = c/2 (y - q)^T M (y - q) + D(y) + W(y) - f . (y - X)
 
 with the constants of a `StepEquation`; for backward Euler c = 1/h^2 and q = p_t + h v_t, and the
-stationary point satisfies eq. 3-4.  M is never inverted.  Clamped components of y are
-prescribed; gradients are zero there.
+stationary point satisfies eq. 3-4.  D is what `damping` adds.  M is never inverted.  Clamped
+components of y are prescribed; gradients are zero there.  Loads that follow the body have no
+potential: f is theirs at a y that `StepObjective.follow` is told.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.damping import Rayleigh, Viscous, ViscousTangent
 from pdcorrect.solvers.integrators import StepEquation
 from pdcorrect.state import State
 
@@ -45,36 +47,51 @@ class StepObjective:
         At the start of the step.
     stage : StepEquation
         The integrator's equation.
-    forces : (N, 3)
-        All external forces of the step, N.
+    extra : (N, 3), optional
+        Forces besides the scene's loads, N.
 
     Attributes
     ----------
     start : (N + B, 3)
         First iterate, prescribed where clamped.
+    forces : (N + B, 3)
+        All external forces, N.
     scale : float
         Size of the terms of gamma where it was last evaluated, J: round-off in
         gamma is relative to this.
     factors : tuple of float
         On mass and on stiffness in the Hessian: 1/s2 and 1.
-    damping : StepDamping or None
+    rayleigh : Rayleigh or None
+    viscous : Viscous or None
     """
 
-    def __init__(self, problem: Problem, state: State, stage: StepEquation, forces: Array) -> None:
+    def __init__(
+        self, problem: Problem, state: State, stage: StepEquation, extra: Array | None = None
+    ) -> None:
         self.problem = problem
         self.state = state
         self.stage = stage
         self.free = problem.free_unknowns
         self.scale = 0.0
-        self.forces = problem.extended(forces)
         self.start = problem.relaxed(stage.start, steps=_MODE_STEPS)
+        self._extra = extra
+        self.forces = self._forces(stage.start)
         self.factors = hessian_factors(problem, stage)
         self._rest = problem.extended(problem.positions)
         self._target = problem.extended(stage.target)
-        self.damping: StepDamping | None = None
         damping = problem.scene.damping
-        if stage.rate and (damping.mass or damping.stiffness):
-            self.damping = StepDamping(problem, state, stage)
+        has_rayleigh = stage.rate and (damping.mass or damping.stiffness)
+        self.rayleigh = Rayleigh(problem, stage) if has_rayleigh else None
+        self.viscous = Viscous(problem, stage) if stage.strains else None
+
+    def follow(self, y: Array) -> None:
+        """Sample the loads that follow the body at a configuration."""
+        if self.problem.has_followers:
+            self.forces = self._forces(y[: len(self.problem.positions)])
+
+    def _forces(self, positions: Array) -> Array:
+        loads = self.problem.external_forces(*self.stage.loads_over, positions)
+        return self.problem.extended(loads if self._extra is None else loads + self._extra)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """Gamma (J) and its gradient (N + B, 3), N, zero where clamped."""
@@ -94,10 +111,11 @@ class StepObjective:
         value = energy + kinetic - work
         gradient -= elastic
         gradient -= self.forces
-        if self.damping is not None:
-            loss, force = self.damping.value_and_gradient(y)
-            value, self.scale = value + loss, self.scale + loss
-            gradient += force
+        for damping in (self.rayleigh, self.viscous):
+            if damping is not None:
+                loss, force = damping.value_and_gradient(y)
+                value, self.scale = value + loss, self.scale + loss
+                gradient += force
         return float(value), gradient
 
     def carried(self, y: Array, gradient: Array) -> tuple[Array, Array]:
@@ -120,9 +138,12 @@ class StepObjective:
 
     def damping_loss(self, y: Array, h: float) -> float:
         """Energy that the damping takes out in a step of h seconds, J."""
-        if self.damping is None:
-            return 0.0
-        return 2.0 * self.stage.rate * h * self.damping.value_and_gradient(y)[0]
+        out = 0.0
+        if self.rayleigh is not None:
+            out += 2.0 * self.stage.rate * h * self.rayleigh.value_and_gradient(y)[0]
+        if self.viscous is not None:
+            out += 2.0 * self.stage.strain_rate * h * self.viscous.value_and_gradient(y)[0]
+        return out
 
     def cell_hessians(self, y: Array, project: bool = False, at_rest: bool = False) -> Array:
         """Second derivative without inertia, by cell: (C, L, L, 3, 3), N/m.
@@ -131,65 +152,21 @@ class StepObjective:
         ``at_rest``: damping in proportion to the stiffness at y itself, so that the
         result does not depend on the state at the step's start.
         """
-        out = self.problem.linearise(y, project).blocks()
         if at_rest:
-            out *= self.factors[1]
-            return out
-        if self.damping is not None and self.damping.stiffness:
-            out += self.damping.stiffness * self.damping.tangent.blocks()
-        return out
+            return self.problem.linearise(y, project).blocks() * self.factors[1]
+        return self.hessian_operator(y, project).blocks()
 
-    def hessian_operator(self, y: Array) -> HessianOperator:
-        """The same, restricted to free components, without assembling."""
-        return HessianOperator(self, self.problem.linearise(y))
-
-    def add_damping(self, x: Array, out: Array) -> None:
-        """Add the stiffness-proportional damping's second derivative times x to ``out``."""
-        if self.damping is not None and self.damping.stiffness:
-            out += self.damping.stiffness * self.damping.tangent.apply(x)
-
-
-class StepDamping:
-    """d/2 (y - o)^T C (y - o) with C = alpha M + beta K(start of the step).
-
-    Attributes
-    ----------
-    mass, stiffness : float
-        d alpha and d beta.
-    origin : (N + B, 3)
-        o, with the internal modes in equilibrium there: their velocity at y, like the
-        nodes', is d times the change since.
-    before : (N + B, 3), tangent : Linearisation
-        The configuration at the start of the step and K there, projected; only if
-        ``stiffness`` is not zero.
-    """
-
-    def __init__(self, problem: Problem, state: State, stage: StepEquation) -> None:
-        damping = problem.scene.damping
-        self._problem = problem
-        self.mass = stage.rate * damping.mass
-        self.stiffness = stage.rate * damping.stiffness
-        if not self.stiffness:
-            self.origin = problem.extended(stage.origin)
-            return
-        self.before = problem.relaxed(state.positions)
-        self.tangent = problem.linearise(self.before, project=True)
-        self.origin = self.before
-        if not np.array_equal(stage.origin, state.positions):
-            self.origin = problem.relaxed(stage.origin)
-
-    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
-        offset = y - self.origin
-        force = self.mass * self._problem.mass_times(offset)
-        if self.stiffness:
-            force = force + self.stiffness * self.tangent.apply(offset)
-        return 0.5 * float(np.vdot(offset, force)), force
+    def hessian_operator(self, y: Array, project: bool = False) -> HessianOperator:
+        """The second derivative without assembling; ``project`` as in `cell_hessians`."""
+        viscous = None if self.viscous is None else self.viscous.tangent(y, project)
+        return HessianOperator(self, self.problem.linearise(y, project), viscous)
 
 
 def hessian_factors(problem: Problem, stage: StepEquation) -> tuple[float, float]:
     """What multiplies mass (1/s2) and stiffness in a stage's Hessian."""
     damping = problem.scene.damping
-    return stage.inertia + stage.rate * damping.mass, 1.0 + stage.rate * damping.stiffness
+    slowed = stage.rate * damping.stiffness + stage.strain_rate * damping.viscosity
+    return stage.inertia + stage.rate * damping.mass, 1.0 + slowed
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +175,7 @@ class HessianOperator:
 
     objective: StepObjective
     tangent: Linearisation
+    viscous: ViscousTangent | None = None
 
     def __call__(self, x: Array) -> Array:
         out = self.product(x)
@@ -207,10 +185,22 @@ class HessianOperator:
     def product(self, x: Array) -> Array:
         """The same on all components."""
         out = self.tangent.apply(x)
-        if self.objective.factors[0]:
-            out += self.objective.factors[0] * self.objective.problem.mass_times(x)
-        self.objective.add_damping(x, out)
+        objective = self.objective
+        if objective.factors[0]:
+            out += objective.factors[0] * objective.problem.mass_times(x)
+        if objective.rayleigh is not None and objective.rayleigh.stiffness:
+            out += objective.rayleigh.stiffness * objective.rayleigh.tangent.apply(x)
+        if self.viscous is not None:
+            out += self.viscous.apply(x)
         return out
+
+    def blocks(self) -> Array:
+        """Without inertia, by cell, (C, L, L, 3, 3)."""
+        out = self.tangent.blocks()
+        rayleigh = self.objective.rayleigh
+        if rayleigh is not None and rayleigh.stiffness:
+            out += rayleigh.stiffness * rayleigh.tangent.blocks()
+        return out if self.viscous is None else out + self.viscous.blocks()
 
 
 def global_backend(problem: Problem) -> Backend:

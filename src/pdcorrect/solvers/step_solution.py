@@ -38,7 +38,9 @@ def step_solution(
     _check_time(objective.state, time_step, result)
     scheme = integrate.scheme(objective.state, time_step)
     y = solution(scheme, objective.state, result.state, problem)
-    if problem.scene.damping.stiffness and problem.space.internal:
+    objective.follow(y)
+    damping = problem.scene.damping
+    if (damping.stiffness or damping.viscosity) and problem.space.internal:
         y = _damped_modes(objective, y)
     _check_balance(objective, y, result)
     return y

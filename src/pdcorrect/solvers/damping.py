@@ -1,0 +1,110 @@
+"""What damping adds to the function that a step minimises."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress
+from pdcorrect.solvers.integrators import StepEquation
+
+Array = NDArray[np.float64]
+
+
+class Rayleigh:
+    """d/2 (y - o)^T (alpha M + beta K) (y - o).
+
+    Attributes
+    ----------
+    mass, stiffness : float
+        d alpha and d beta.
+    origin : (N + B, 3)
+        o, with the internal modes in equilibrium there: their velocity at y, like the
+        nodes', is d times the change since.
+    at : (N + B, 3), tangent : Linearisation
+        The first iterate of the step, which is y to second order, and K there, projected;
+        only if ``stiffness`` is not zero.
+    """
+
+    def __init__(self, problem: Problem, stage: StepEquation) -> None:
+        damping = problem.scene.damping
+        self._problem = problem
+        self.mass = stage.rate * damping.mass
+        self.stiffness = stage.rate * damping.stiffness
+        if not self.stiffness:
+            self.origin = problem.extended(stage.origin)
+            return
+        self.at = problem.relaxed(stage.start)
+        self.tangent = problem.linearise(self.at, project=True)
+        self.origin = problem.relaxed(stage.origin)
+
+    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
+        """J and N."""
+        force = self.times(y - self.origin)
+        return 0.5 * float(np.vdot(y - self.origin, force)), force
+
+    def times(self, x: Array) -> Array:
+        """The second derivative times x."""
+        out = self.mass * self._problem.mass_times(x)
+        return out + self.stiffness * self.tangent.apply(x) if self.stiffness else out
+
+
+class Viscous:
+    """r/2 (S(y) - S') : C : (S(y) - S'), summed over points, see `fem.viscosity`.
+
+    Attributes
+    ----------
+    rate : float
+        r, the strain rate's factor times the viscosity.
+    parts : list of (float, Stretches)
+        What S' is a sum of.
+    """
+
+    def __init__(self, problem: Problem, stage: StepEquation) -> None:
+        self._problem = problem
+        self.rate = stage.strain_rate * problem.scene.damping.viscosity
+        self.places = [problem.relaxed(x) for _, x in stage.strains]
+        factors = [a for a, _ in stage.strains]
+        self.parts = [(a, Stretches(problem, x)) for a, x in zip(factors, self.places, strict=True)]
+        self._before = sum(a * part.tensor for a, part in self.parts)
+
+    def change(self, stretches: Stretches) -> Array:
+        """S(y) - S', (C, 6, Q)."""
+        return np.asarray(stretches.tensor - self._before)
+
+    def stress(self, stretches: Stretches) -> Array:
+        """R C : (S(y) - S') times the points' volumes, (C, 6, Q), J."""
+        return self.rate * small_strain_stress(self._problem, self.change(stretches))
+
+    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
+        """J and N."""
+        stretches = Stretches(self._problem, y)
+        stress = self.stress(stretches)
+        value = 0.5 * float(product(self.change(stretches), stress).sum())
+        return value, stretches.forces(stress)
+
+    def tangent(self, y: Array, project: bool = False) -> ViscousTangent:
+        """The second derivative at y; ``project`` makes it positive semi-definite."""
+        stretches = Stretches(self._problem, y)
+        return ViscousTangent(stretches, self.stress(stretches), self.rate, project)
+
+
+@dataclass(frozen=True, eq=False)
+class ViscousTangent:
+    """The second derivative of `Viscous` at one configuration."""
+
+    stretches: Stretches
+    stress: Array
+    rate: float
+    project: bool
+
+    def apply(self, x: Array) -> Array:
+        """Times x (N + B, 3)."""
+        return self.stretches.apply(self.stress, self.rate, x, self.project)
+
+    def blocks(self) -> Array:
+        """Of each cell, (C, L, L, 3, 3), N/m."""
+        return self.stretches.blocks(self.stress, self.rate, self.project)

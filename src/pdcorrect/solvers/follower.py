@@ -1,0 +1,78 @@
+"""Loads that follow the body, sampled where the step's equation is.
+
+They have no potential, so a step is a fixed point y = g(y): g minimises gamma with the loads
+held as at y.  Anderson's acceleration (Walker and Ni 2011) makes few iterations of it, also
+where the plain one diverges because the loads are stiffer than the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.solvers.minimise import Minimum
+from pdcorrect.solvers.step import StepObjective
+from pdcorrect.state import Status
+
+Array = NDArray[np.float64]
+
+MOST = 60
+"""Fixed-point iterations of a step."""
+DEPTH = 6
+"""Earlier iterations that Anderson's acceleration uses."""
+
+
+class Anderson:
+    """The next iterate of a fixed point, from all pairs (y, g(y)) so far, as flat arrays."""
+
+    def __init__(self, depth: int = DEPTH) -> None:
+        self._depth = depth
+        self._images: list[Array] = []
+        self._residuals: list[Array] = []
+
+    def __call__(self, y: Array, image: Array) -> Array:
+        self._images = [*self._images, image][-self._depth :]
+        self._residuals = [*self._residuals, image - y][-self._depth :]
+        if len(self._images) == 1:
+            return image
+        steps = np.diff(np.stack(self._residuals, axis=1), axis=1)
+        weights = np.linalg.lstsq(steps, self._residuals[-1], rcond=1e-8)[0]
+        return image - np.diff(np.stack(self._images, axis=1), axis=1) @ weights
+
+
+def settle(objective: StepObjective, minimise: Callable[[Array], Minimum]) -> Minimum:
+    """Minimise with loads that follow the body, as they are at the minimum.
+
+    Parameters
+    ----------
+    objective : StepObjective
+        Its loads are sampled at the first iterate.
+    minimise : callable
+        From a configuration on; it takes no iteration where the remaining distance is
+        within the tolerance.
+
+    Returns
+    -------
+    Minimum
+        Of which `Status.ITERATION_LIMIT` says that loads and positions did not settle.
+    """
+    accelerate = Anderson()
+    y = objective.start
+    found = minimise(y)
+    iterations, evaluations = found.iterations, found.evaluations
+    for _ in range(MOST):
+        if not found.status.ok:
+            break
+        y = accelerate(y.ravel(), found.positions.ravel()).reshape(y.shape)
+        objective.follow(y)
+        found = minimise(y)
+        iterations += found.iterations
+        evaluations += found.evaluations
+        if found.iterations == 0:
+            break
+    else:
+        found.status = Status.ITERATION_LIMIT
+    return replace(found, iterations=iterations, evaluations=evaluations)
