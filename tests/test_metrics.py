@@ -1,10 +1,14 @@
 """Omega and the other measures, on numbers worked out by hand."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+import pdcorrect as pc
+from conftest import beam
 from pdcorrect import metrics
-from pdcorrect.errors import InputError
+from pdcorrect.errors import InputError, MeshError
 
 
 def shifted(reference, distance):
@@ -71,3 +75,42 @@ def test_wrong_input_is_named(reference):
         metrics.error_corrected([reference], [reference, reference], [reference])
     with pytest.raises(InputError, match="reference"):
         metrics.error_corrected(reference, reference, reference)
+
+
+# --- to the converged motion -------------------------------------------------------------
+
+
+def test_relative_error_is_zero_for_itself_and_has_no_units(reference):
+    run = shifted(reference, 0.2)
+    assert metrics.relative_error(reference, reference) == 0
+    error = metrics.relative_error(run, reference)
+    size = np.sqrt(((reference[1:] - reference[0]) ** 2).sum(axis=2).mean())
+    assert error == pytest.approx(0.2 / size)
+    assert metrics.relative_error(1e3 * run, 1e3 * reference) == pytest.approx(error)
+    assert metrics.relative_error(run + 7.0, reference + 7.0) == pytest.approx(error)
+    still = np.broadcast_to(reference[0], reference.shape)
+    assert metrics.relative_error(still, reference) == pytest.approx(1)
+
+
+def test_relative_error_restricts_finer_runs_and_starts_from_rest_positions():
+    scene = beam((3, 1, 1), time={"frames": 2})
+    coarse, fine = (
+        pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine))) for refine in (1, 2)
+    )
+    here = pc.restrict(fine, to=coarse)
+    error = metrics.relative_error(coarse, here)
+    assert 0 < error < 1
+    size = metrics.rms_error(coarse.points[None].repeat(3, 0), coarse)
+    expected = metrics.rms_error(here, coarse) / size
+    assert metrics.relative_error(fine, coarse) == pytest.approx(expected)
+    assert metrics.relative_error(here, here) == 0
+    moved = dataclasses.replace(coarse, points=coarse.points - [1e-3, 0, 0])
+    with pytest.raises(MeshError, match="node"):
+        metrics.relative_error(coarse, moved)
+
+
+def test_relative_error_of_what_cannot_be_compared_is_refused(reference):
+    with pytest.raises(InputError, match="5 and 4 frames"):
+        metrics.relative_error(reference[:5], reference[:4])
+    with pytest.raises(InputError, match="converged"):
+        metrics.relative_error(reference, np.broadcast_to(reference[0], reference.shape))

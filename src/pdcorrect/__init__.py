@@ -55,6 +55,7 @@ _HOME = {
     "render": "pdcorrect.figures",
     "render_overlay": "pdcorrect.figures",
     "compare": "pdcorrect.evaluation.compare",
+    "converged": "pdcorrect.evaluation.converged",
 }
 _NEEDS_TORCH = (
     "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "HybridStepper", "hybrid_of",
@@ -100,6 +101,7 @@ __all__ = [  # noqa: RUF022
     "render",
     "render_overlay",
     "compare",
+    "converged",
     "metrics",
     "errors",
     "figures",
@@ -117,6 +119,7 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.hybrid import HybridStepper, hybrid_of
     from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.evaluation.compare import compare
+    from pdcorrect.evaluation.converged import converged
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, coarse_model, discretise
     from pdcorrect.fem.stress import stress

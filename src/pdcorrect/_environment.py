@@ -1,4 +1,4 @@
-"""What a result was made with: hardware, threads, versions and code; where models lie."""
+"""What a result was made with: hardware, threads, versions and code; where files of ours lie."""
 
 from __future__ import annotations
 
@@ -64,14 +64,15 @@ def environment() -> dict[str, str]:
 
 
 @functools.cache
-def code_digest() -> str:
+def code_digest(*folders: str) -> str:
     """SHA-256 of the package's own modules, names and contents, in hexadecimal digits.
 
-    Tells two states of the code apart that have the same version number.
+    Tells two states of the code apart that have the same version number; with ``folders`` of
+    those of the package only.
     """
     digest = hashlib.sha256()
     root = Path(__file__).parent
-    for path in sorted(root.rglob("*.py")):
+    for path in sorted(x for folder in folders or (".",) for x in (root / folder).rglob("*.py")):
         for content in (path.relative_to(root).as_posix().encode(), path.read_bytes()):
             digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()
@@ -105,6 +106,19 @@ def home_folder(name: str, instead: str = "") -> Path:
             f"has {name!r} in it{instead}."
         )
     return checkout / name
+
+
+CACHE = "PDCORRECT_CACHE"
+"""Environment variable: the folder of what can be computed again."""
+
+
+def cache_folder(name: str) -> Path:
+    """A folder of the user's cache: of `CACHE`, else of the XDG base directories."""
+    chosen = os.environ.get(CACHE)
+    if chosen:
+        return Path(chosen) / name
+    above = Path(os.environ.get("XDG_CACHE_HOME", ""))  # which counts only if absolute
+    return (above if above.is_absolute() else Path.home() / ".cache") / "pdcorrect" / name
 
 
 def total_memory(root: Path = Path("/")) -> float:

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.solvers.rollout import restrict
+from pdcorrect.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from pdcorrect.fem.problem import Problem
-    from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -78,6 +79,35 @@ def rms_error(run: Any, reference: Any) -> float:
     """Root mean square node distance over frames 1..T, m."""
     x, y = _pair(run, reference)
     return float(np.sqrt(((x[1:] - y[1:]) ** 2).sum(axis=2).mean()))
+
+
+def relative_error(run: Any, converged: Any) -> float:
+    """RMS distance from the converged motion over frames 1..T, over that motion's RMS displacement.
+
+    Parameters
+    ----------
+    run : Trajectory or (T+1, N, 3)
+        A trajectory on a finer mesh is restricted to the nodes of ``converged``.
+    converged : Trajectory or (T+1, N, 3)
+        As of `pdcorrect.converged`.  Displacements are from its rest positions; of an array,
+        from its frame 0.
+
+    Raises
+    ------
+    InputError
+        If shapes differ, or the converged motion is none.
+    MeshError
+        If the run's mesh lacks a node.
+    """
+    both = isinstance(run, Trajectory) and isinstance(converged, Trajectory)
+    if both and not np.array_equal(run.points, converged.points):
+        run = restrict(run, to=converged)
+    truth = _positions(converged)
+    rest = getattr(converged, "points", truth[0])
+    size = rms_error(np.broadcast_to(rest, truth.shape), truth)
+    if not size > 0.0:
+        raise InputError("the converged motion rests: expected one that an error can be over.")
+    return rms_error(run, truth) / size
 
 
 def error_over_time(run: Any, reference: Any) -> Array:
