@@ -39,6 +39,7 @@ from pdcorrect.corrector.compiled import CompiledCorrector, compilable
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.normaliser import RunningMoments
+from pdcorrect.scene import trained_coarse
 
 BODIES: dict[str, dict[str, Any]] = {
     "beam": {"shape": "beam", "cells": [14, 2, 2], "cell_size": 0.05},
@@ -147,7 +148,7 @@ def steps(
     forces, times = step.forces.numpy(), {}
     # other velocities than those that the normaliser has seen
     gate = pc.Gate(margin=1e3, average=1e3)
-    for kind, model in (("", scene), ("best_", pc.best_coarse(scene))):
+    for kind, model in (("", scene), ("best_", trained_coarse(scene))):
         coarse = pc.ProjectiveDynamics(pc.discretise(model))
         hybrid = pc.HybridStepper(coarse, corrector, gate=gate).prepare()
         assert hybrid(state, forces).stats["correction"] > 0.0

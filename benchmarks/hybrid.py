@@ -35,7 +35,7 @@ from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import models, rebuilt_problems
 from pdcorrect.evaluation.candidates import saved_candidates
 from pdcorrect.fem.problem import Problem, coarse_model, discretise
-from pdcorrect.scene import best_coarse
+from pdcorrect.scene import trained_coarse
 
 
 def options() -> argparse.Namespace:
@@ -68,7 +68,7 @@ def drawn(path: Path, split: str, base: str) -> Iterator[tuple[Problem, Problem]
     for plan in make_plan(config):
         if plan.split == split:
             scene, reference = draw_scene(config, plan, 0), models(config, plan)[REFERENCE]
-            truth = best_coarse(scene) if reference.best else scene
+            truth = trained_coarse(scene) if reference.best else scene
             yield coarse_model(scene, base, plan.refine), discretise(truth, refine=plan.refine)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import pdcorrect as pc
+from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]
 IMAGE = ROOT / "docs" / "images" / "unseen_cross.gif"
@@ -17,7 +18,7 @@ COLOURS = 48
 def runs() -> dict[str, pc.Trajectory]:
     """Four runs of one scene by their names in the picture, the reference last."""
     scene = pc.Scene.load(ROOT / "examples" / "unseen_cross.toml")
-    best = pc.best_coarse(scene)
+    best = trained_coarse(scene)
     steppers: dict[str, pc.Stepper] = {
         "coarse": pc.ProjectiveDynamics(pc.discretise(scene)),
         "best coarse": pc.ProjectiveDynamics(pc.discretise(best)),

@@ -17,7 +17,9 @@ from pdcorrect.fem.mesh import HexMesh, boundary_faces, voxel_mesh
 from pdcorrect.fem.operators import Space
 from pdcorrect.fem.problem import problem_from_body
 
-ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27")
+ELEMENTS = (
+    "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex27",
+)  # fmt: skip
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # kernels of one thread each, as the others want cores
     numba.set_num_threads(1)

@@ -7,7 +7,9 @@ import pdcorrect as pc
 from conftest import beam
 from pdcorrect.fem.hexahedron import corner_jacobians
 
-ELEMENTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27"]
+ELEMENTS = [
+    "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex27",
+]  # fmt: skip
 
 
 def flattened(problem):

@@ -15,7 +15,9 @@ from pdcorrect.fem.problem import problem_from_body
 from pdcorrect.fem.stress import stress, von_mises
 from test_mesh import distorted_mesh
 
-ELEMENTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27"]
+ELEMENTS = [
+    "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex27",
+]  # fmt: skip
 ENERGIES = [
     "corotated", "corotated-only", "arap", "volume-only", "neo-hookean", "st-venant-kirchhoff",
 ]  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 import pdcorrect as pc
 from pdcorrect.data.import_files import shard_from_trajectories
 from pdcorrect.data.schema import write_shard
+from pdcorrect.scene import trained_coarse
 
 SCENE = Path(__file__).parent / "hook.toml"
 SPLITS = {"training": 6, "validation": 2, "evaluation": 4}  # simulations
@@ -40,7 +41,7 @@ def main(
     load = scene.loads[0].model_dump(exclude_none=True)
     rng = np.random.default_rng(1)
     # mesh, operators and factorisation are those of all simulations
-    fine = pc.discretise(pc.best_coarse(scene), refine=refine)
+    fine = pc.discretise(trained_coarse(scene), refine=refine)
     coarse = pc.discretise(scene)
     for split, count in splits.items():
         references, plain = [], []

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pdcorrect as pc
+from pdcorrect.scene import trained_coarse
 
 REFINE = 3  # as in record.py
 
@@ -22,7 +23,7 @@ def main(
 ) -> dict[str, float]:
     """Draw, write, and return the RMS distances from the fine run, mm."""
     scene = pc.Scene.load(scene_file)
-    better = pc.best_coarse(scene)
+    better = trained_coarse(scene)
     coarse = pc.ProjectiveDynamics(pc.discretise(better))
     hybrid = pc.hybrid_of(scene, model)
     steppers = {

@@ -16,6 +16,7 @@ import pdcorrect as pc
 from pdcorrect._environment import home_folder
 from pdcorrect.data.configuration import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.scene import trained_coarse
 
 REFINE = 4
 """Of the reference, as in the data sets."""
@@ -64,7 +65,7 @@ def scene_of(motion: str, mesh: int, simulation: int) -> pc.Scene:
 
 def methods(scene: pc.Scene, model: str) -> dict[str, Callable[[], Any]]:
     """What makes each method's stepper."""
-    best = pc.best_coarse(scene)
+    best = trained_coarse(scene)
     problems = {
         "plain": partial(pc.discretise, scene),
         "best": partial(pc.discretise, best),
@@ -82,7 +83,7 @@ def rows_of(scene: pc.Scene, model: str) -> tuple[list[Row], float]:
     """All methods over all frames, the reference last; and the largest displacement, m."""
     coarse = pc.discretise(scene)
     reference = pc.rollout(
-        pc.ProjectiveDynamics(pc.discretise(pc.best_coarse(scene), refine=REFINE))
+        pc.ProjectiveDynamics(pc.discretise(trained_coarse(scene), refine=REFINE))
     )
     truth = pc.restrict(reference, to=coarse)
     rows: list[Row] = []

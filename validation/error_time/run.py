@@ -16,6 +16,7 @@ import pdcorrect as pc
 from pdcorrect._environment import home_folder
 from pdcorrect.data.configuration import EVALUATION, DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
+from pdcorrect.scene import trained_coarse
 
 MOTIONS, SETTINGS = ("impulse", "stretch", "torsion"), ("as-published", "exact")
 FRAMES = 30
@@ -115,7 +116,7 @@ class Comparison:
     @cached_property
     def best(self) -> pc.Scene:
         """The scene with the better element."""
-        return pc.best_coarse(self.scene)
+        return trained_coarse(self.scene)
 
     def run(self, stepper: Any, every: float = 1.0) -> pc.Trajectory:
         """All frames."""

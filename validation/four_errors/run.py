@@ -10,6 +10,7 @@ import common
 import numpy as np
 
 import pdcorrect as pc
+from pdcorrect.scene import trained_coarse
 
 Array = np.ndarray
 
@@ -45,7 +46,7 @@ FINEST = 128
 EARLY, EARLY_FINEST = 10, 32
 """Frames, and steps a frame of the reference, of the orders that quick runs measure."""
 
-BEST = pc.best_coarse(SCENE).solver.element
+BEST = trained_coarse(SCENE).solver.element
 MESHES = {
     "hex8": {"element": "hex8", "mass": "lumped"},
     BEST: {"element": BEST, "mass": "averaged"},

@@ -11,6 +11,7 @@ import numpy as np
 from scenarios import Scenario
 
 import pdcorrect as pc
+from pdcorrect.scene import trained_coarse
 
 Array = np.ndarray
 NO_GATE = "no gate"
@@ -67,7 +68,7 @@ class Run:
 def problem_of(scenario: Scenario, solver: str, refine: int = 1) -> pc.Problem:
     """The mesh that a solver works on."""
     best = solver == "PD best" or solver in MODELS
-    scene = pc.best_coarse(scenario.scene) if best else scenario.scene
+    scene = trained_coarse(scenario.scene) if best else scenario.scene
     return pc.discretise(scene, refine=refine)
 
 

@@ -29,7 +29,7 @@ from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model
-from pdcorrect.scene import Scene, best_coarse, check_scene
+from pdcorrect.scene import Scene, check_scene, trained_coarse
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State, StepResult
@@ -306,7 +306,7 @@ def _check_integrator(found: str, trained: str, name: str) -> None:
 
 def _check_problem(problem: Problem, scene: Scene, base: str, name: str) -> None:
     """Refuse another mesh, element or mass rule than the coarse model has."""
-    solver = (best_coarse(scene) if base == "best" else scene).solver
+    solver = (trained_coarse(scene) if base == "best" else scene).solver
     found = problem.refine, problem.element, problem.mass_rule
     expected = 1, solver.element, solver.mass
     if found != expected:

@@ -31,7 +31,7 @@ from pdcorrect.fem.hexahedron import (
 )
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.problem import Problem, discretise
-from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene
+from pdcorrect.scene import MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import rollout
 from pdcorrect.state import State, Status
@@ -139,8 +139,8 @@ def shard_from_arrays(
         With it, missing forces are its loads and missing predictions are computed with
         `ProjectiveDynamics`.  Its time step is replaced by this one.
     best : bool
-        Also compute the run "best": rollout and predictions of `pdcorrect.best_coarse` of the
-        scene, so that models which correct it can be trained and evaluated on this file.
+        Also compute the run "best": rollout and predictions of `pdcorrect.scene.trained_coarse` of
+        the scene, so that models which correct it can be trained and evaluated on this file.
 
     Returns
     -------
@@ -315,7 +315,7 @@ def _best_stepper(scene: Scene | None) -> ProjectiveDynamics:
     """Of the best coarse model of a scene."""
     if scene is None:
         raise InputError('the run "best" without a scene: expected the scene of the coarse model.')
-    better = best_coarse(scene)
+    better = trained_coarse(scene)
     if better.solver == scene.solver:
         raise InputError(
             f"the scene has the best coarse model's element {scene.solver.element!r} already: "

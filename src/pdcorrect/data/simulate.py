@@ -26,7 +26,7 @@ from pdcorrect.data.schema import (
 )
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import BASES, Problem, discretise
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene, trained_coarse
 from pdcorrect.state import State
 
 
@@ -38,7 +38,7 @@ class Model:
     ----------
     refine : int
     best : bool
-        `pdcorrect.best_coarse`'s element and mass.
+        `pdcorrect.scene.trained_coarse`'s element and mass.
     predict : bool
         Whether to take single steps from the reference, too.
     divisor : int
@@ -154,7 +154,9 @@ class _Meshed:
         for name, model in wanted.items():
             key = (model.refine, model.best)
             if key not in known:
-                known[key] = discretise(best_coarse(scene) if model.best else scene, model.refine)
+                known[key] = discretise(
+                    trained_coarse(scene) if model.best else scene, model.refine
+                )
             problems[name] = known[key]
             if model.heavy:
                 whole = float(problems[REFERENCE].mass.sum())
@@ -410,7 +412,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     elif run != PLAIN:
         exact = run == BEST or shard.attributes["setting"] == "exact"
         refine = int(stored.attributes.get("refine", 1))
-        scene = best_coarse(scenes[0]) if exact else scenes[0]
+        scene = trained_coarse(scenes[0]) if exact else scenes[0]
         problem = discretise_stored(scene, shard.points, shard.cells, refine)
     return [_under(problem, scene) for scene in scenes]
 

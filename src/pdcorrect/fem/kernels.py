@@ -94,7 +94,7 @@ def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def block_shape(points):  # type: ignore[no-untyped-def]
     """Cells of ``points`` quadrature points in a block, and its lanes."""
-    cells = max(1, _LANES // points)
+    cells = max(1, (2 * _LANES + points) // (2 * points))  # about _LANES of them
     return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
 
 

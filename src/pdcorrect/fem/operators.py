@@ -7,7 +7,7 @@ corners; both are converted here and nowhere else.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,7 +19,7 @@ from skfem.quadrature import get_quadrature
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
-from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature
+from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature, linear_shares, mean_shares
 
 Array = NDArray[np.float64]
 
@@ -37,21 +37,23 @@ _VTK_NODES = np.concatenate(
 class _Element(NamedTuple):
     """An element: scikit-fem's shape functions and what is added to them.
 
-    ``order`` and ``mass_order`` are the polynomial orders of the quadrature.
+    ``order`` and ``mass_order`` are the polynomial orders of the quadrature; ``volume`` is the
+    part of the deformation that the volume term sees.
     """
 
     shape: type[Element]
     order: int
     mass_order: int
-    mean_volume: bool = False
+    volume: Literal["points", "mean", "linear"] = "points"
     bubbles: bool = False
 
 
 _ELEMENTS = {
     "hex8": _Element(ElementHex1, 3, 5),
-    "hex8-mean": _Element(ElementHex1, 3, 5, mean_volume=True),
+    "hex8-mean": _Element(ElementHex1, 3, 5, "mean"),
     "hex8-bubble": _Element(ElementHex1, 3, 5, bubbles=True),
-    "hex8-bubble-mean": _Element(ElementHex1, 3, 5, mean_volume=True, bubbles=True),
+    "hex8-bubble-mean": _Element(ElementHex1, 3, 5, "mean", bubbles=True),
+    "hex8-enhanced": _Element(ElementHex1, 3, 5, "linear", bubbles=True),
     "hex27": _Element(ElementHex2, 5, 7),
 }
 
@@ -149,7 +151,20 @@ class Space:
         out = Quadrature(lanes, weights, weights)
         if self._kind.bubbles:
             out = out.with_incompatible_modes(self._corners, self._basis.quadrature[0].T)
-        return out.with_mean_volume() if self._kind.mean_volume else out
+        shares = self.volume_shares()
+        return out if shares is None else out.with_volume_points(shares)
+
+    def volume_shares(self) -> Array | None:
+        """How much stress at the volume term's own points counts at the others, (C, Q, P).
+
+        See `Quadrature.with_volume_points`; None if it has no points of its own.
+        """
+        weights = self._basis.dx
+        if self._kind.volume == "points":
+            return None
+        if self._kind.volume == "mean":
+            return mean_shares(weights)
+        return linear_shares(weights, self._basis.quadrature[0].T)
 
     def mass(self, density: Array) -> sp.csr_matrix:
         """Consistent mass, integral of density u v, (N, N), kg; ``density`` is (C,)."""

@@ -23,7 +23,7 @@ from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
-from pdcorrect.scene import Load, MeshFile, Scene, best_coarse, check_scene
+from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -349,10 +349,11 @@ def coarse_model(scene: Scene, base: str = "plain", refine: int = 4) -> Problem:
     ----------
     scene : Scene
     base : {"plain", "best", "total-mass"}
-        As the scene says; with element and masses of `best_coarse`; or with its density scaled so
-        that it has the total mass of the scene refined.  The last is for ``mass = "per-node"``, by
-        which a mesh is the heavier the coarser it is; with the other rules it changes nothing
-        but for regions of another density that end inside of coarse cells.
+        As the scene says; with element and masses of `pdcorrect.scene.trained_coarse`; or with
+        its density scaled so that it has the total mass of the scene refined.  The last is for
+        ``mass = "per-node"``, by which a mesh is the heavier the coarser it is; with the other
+        rules it changes nothing but for regions of another density that end inside of coarse
+        cells.
     refine : int
         Of the mesh with that mass: 4 is what correctors were trained beside.
 
@@ -366,7 +367,7 @@ def coarse_model(scene: Scene, base: str = "plain", refine: int = 4) -> Problem:
     if base not in BASES:
         raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
     if base == "best":
-        return discretise(best_coarse(scene))
+        return discretise(trained_coarse(scene))
     plain = discretise(scene)
     if base == "plain":
         return plain

@@ -6,6 +6,17 @@ a cell instead of eight: no volumetric locking, and because it is the true mean,
 affine deformations are exact on distorted cells too (a term at the cell's centre
 is not).
 
+*Linear volume* (hex8-enhanced): the volume term sees the part of the deformation gradient that
+is linear in the cell's own coordinates xi, incompatible modes included: its L2 projection on
+1, xi_1, xi_2, xi_3, as in B-bar methods (Simo, Taylor and Pister 1985 project it on constants).
+Bending changes volume linearly in the cell, so it keeps its stiffness; the products xi_1 xi_2
+etc., which no mode could relieve near nu = 0.5, are left out.  Nine points stand for the linear
+part: the mean, and eight like the Gauss points about it.  In small strain any points with the
+right second moments give the same.  In large bending F turns along the cell, so det F grows with
+the distance from the mean in the direction of bending: eight points at equal distances see that
+as one change of volume, which costs little; six on the axes do not, and are too stiff.  Without
+weight at the mean a folded cell could look right to all others.
+
 *Incompatible modes* (hex8-bubble): three more shape functions a cell, B_m =
 1 - (2 xi_m - 1)^2 on the unit cell, without mass and without load, which bend with the
 cell (Wilson et al. 1973).  Their gradients are (det J0 / det J) J0^-T dB/dxi with J0
@@ -24,7 +35,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect.fem.hexahedron import shape_derivatives
+from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
 
 Array = NDArray[np.float64]
 
@@ -81,17 +92,26 @@ class Quadrature:
             volume_weights=self.volume_weights[cells],
         )
 
-    def with_mean_volume(self) -> Quadrature:
-        """The volume term moved to one more point with the cell's mean gradients."""
-        volume = self.weights.sum(axis=1)
-        mean = np.einsum("cq,clxq->clx", self.weights / volume[:, None], self.lanes)
+    def with_volume_points(self, shares: Array) -> Quadrature:
+        """The volume term moved to P more points, averages of the others.
+
+        ``shares`` (C, Q, P) say how much a stress at the new points counts at the others, see
+        `mean_shares` and `linear_shares`: the gradients there are sum_q w_q shares_qp G_q / v_p
+        with v_p = sum_q w_q shares_qp, the point's weight.
+        """
+        volumes = np.einsum("cq,cqp->cp", self.weights, shares)
+        averages = self.weights[:, :, None] * shares / volumes[:, None, :]
+        count, width, _, points = self.lanes.shape
+        more = (self.lanes.reshape(count, 3 * width, points) @ averages).reshape(
+            count, width, 3, -1
+        )
         nothing = np.zeros_like(self.weights)
         return replace(
             self,
-            lanes=np.concatenate([self.lanes, mean[..., None]], axis=3),
-            weights=np.pad(self.weights, ((0, 0), (0, 1))),
-            volume_weights=np.concatenate([nothing, volume[:, None]], axis=1),
-            first_volume=self.weights.shape[1],
+            lanes=np.concatenate([self.lanes, more], axis=3),
+            weights=np.pad(self.weights, ((0, 0), (0, volumes.shape[1]))),
+            volume_weights=np.concatenate([nothing, volumes], axis=1),
+            first_volume=points,
         )
 
     def with_incompatible_modes(self, corners: Array, points: Array) -> Quadrature:
@@ -124,6 +144,41 @@ class Quadrature:
                 shape=(size, size),
             )
         )
+
+
+_MEAN_SHARE = 0.1
+"""Of the volume weight, at the mean of the linear part.  From 0.1 on folded cells come back
+(`tests/test_recovery.py`)."""
+_CORNERS = 2.0 * VTK_CORNERS - 1.0
+
+
+def mean_shares(weights: Array) -> Array:
+    """Of the cell's mean, (C, Q, 1), see `Quadrature.with_volume_points`."""
+    return np.ones((*weights.shape, 1))
+
+
+def linear_shares(weights: Array, points: Array) -> Array:
+    """Of the nine points that stand for the linear part, (C, Q, 9).
+
+    With phi_i the cell's coordinates xi_i less their mean and made orthonormal over the cell, the
+    projection of G is mean G + sum_i phi_i C_i, C_i = mean of phi_i G.  Its points are
+    mean G + a (+- C_1 +- C_2 +- C_3), a^2 = 1 / (1 - share of the mean), and mean G.
+
+    Parameters
+    ----------
+    weights : (C, Q)
+        Rest volumes, m3.
+    points : (Q, 3)
+        On the unit cell.
+    """
+    parts = weights / weights.sum(axis=1, keepdims=True)
+    centred = points - np.einsum("cq,qi->ci", parts, points)[:, None]
+    moments = np.einsum("cq,cqi,cqj->cij", parts, centred, centred)
+    values, axes = np.linalg.eigh(moments)
+    root = (axes / np.sqrt(values)[:, None, :]) @ axes.transpose(0, 2, 1)  # moments^-1/2
+    outer = 1.0 - _MEAN_SHARE
+    corners = (1.0 + (centred @ root) @ _CORNERS.T / np.sqrt(outer)) * (outer / len(_CORNERS))
+    return np.concatenate([corners, np.full((*weights.shape, 1), _MEAN_SHARE)], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

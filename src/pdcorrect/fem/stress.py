@@ -1,14 +1,15 @@
 """Stress at the quadrature points and its averages at the nodes.
 
-Where volume and shear share their points, P = dPsi/dF at each point.  In elements with a
-mean volume term (hex8-mean, hex8-bubble-mean) the energy of a cell is
+Where volume and shear share their points, P = dPsi/dF at each point.  In elements whose volume
+term has points p of its own (hex8-mean, hex8-bubble-mean: one; hex8-enhanced: nine) the energy
+of a cell is
 
-    W = sum_q w_q Psi_s(F_q) + |c| Psi_v(mean F),    mean F = sum_q (w_q / |c|) F_q,
+    W = sum_q w_q Psi_s(F_q) + sum_p v_p Psi_v(F_p),    F_p = sum_q (w_q a_qp / v_p) F_q,
 
-so that dW/dF_q = w_q (P_s(F_q) + P_v(mean F)): the volume term's first Piola-Kirchhoff
-stress is constant in the cell and is added at each point, and the nodal forces are
--sum_q w_q P_q grad N.  Its Cauchy stress is that of the mean deformation,
-P_v(mean F) (mean F)^T / det(mean F), so both parts are symmetric.  P F^T / det F of the
+so that dW/dF_q = w_q (P_s(F_q) + sum_p a_qp P_v(F_p)): the volume term's first Piola-Kirchhoff
+stress is constant or linear in the cell and is added at each point, and the nodal forces are
+-sum_q w_q P_q grad N.  Its Cauchy stress is that of those points,
+sum_p a_qp P_v(F_p) F_p^T / det F_p, so both parts are symmetric.  P F^T / det F of the
 sum would not be.
 """
 
@@ -103,11 +104,12 @@ def stress(problem: Problem, positions: Array) -> Stress:
     mu, omega = problem.materials.mu[:, None], problem.materials.volume_weight[:, None]
     moved = problem.relaxed(positions) - problem.extended(problem.positions)
     F = _deformation(moved[problem.space.local], quadrature.lanes)
-    points = quadrature.first_volume
-    if points:
-        F, mean = F[:, :points], F[:, points:]
-        shear, volume = first_piola(F, mu, 0.0, energy), first_piola(mean, 0.0, omega, energy)
-        P, sigma = shear + volume, _cauchy(shear, F) + _cauchy(volume, mean)
+    points, shares = quadrature.first_volume, problem.space.volume_shares()
+    if shares is not None:
+        F, own = F[:, :points], F[:, points:]
+        shear, volume = first_piola(F, mu, 0.0, energy), first_piola(own, 0.0, omega, energy)
+        P = shear + np.einsum("cqp,cpij->cqij", shares, volume)
+        sigma = _cauchy(shear, F) + np.einsum("cqp,cpij->cqij", shares, _cauchy(volume, own))
     else:
         P = first_piola(F, mu, omega, energy)
         sigma = _cauchy(P, F)

@@ -13,7 +13,15 @@ from pdcorrect.scene.initial import Initial
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region
-from pdcorrect.scene.scene import Damping, Scene, Solver, Time, best_coarse, check_scene
+from pdcorrect.scene.scene import (
+    Damping,
+    Scene,
+    Solver,
+    Time,
+    best_coarse,
+    check_scene,
+    trained_coarse,
+)
 
 __all__ = [
     "Beam",
@@ -42,4 +50,5 @@ __all__ = [
     "Weight",
     "best_coarse",
     "check_scene",
+    "trained_coarse",
 ]

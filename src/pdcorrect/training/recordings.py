@@ -19,7 +19,7 @@ from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Base, Problem
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene, trained_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
 Array = NDArray[Any]
@@ -145,7 +145,7 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     for recording in recordings:
         scene = Scene.from_toml(recording.scene_toml, recording.name)
         if recording.path not in known:
-            model = best_coarse(scene) if base == BEST else scene
+            model = trained_coarse(scene) if base == BEST else scene
             problem = discretise_stored(model, recording.points, recording.cells)
             _check_mesh(recording, problem)
             if recording.total_mass is not None:
