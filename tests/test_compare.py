@@ -54,12 +54,12 @@ def test_the_best_coarse_model_is_always_there_and_the_reference_has_its_element
     found = pc.compare(thick)
     assert found.reference == "fine best PD"
     assert labels(found.rows)[2] == "best coarse PD"
-    assert found.runs["fine best PD"].attributes["element"] == "hex8-bubble-mean"
+    assert found.runs["fine best PD"].attributes["element"] == pc.best_coarse(thick).solver.element
     by_hand = pc.restrict(
         pc.rollout(pc.ProjectiveDynamics(pc.discretise(pc.best_coarse(thick), 4))),
         to=pc.discretise(thick),
     )
-    own = pc.rollout(pc.ProjectiveDynamics(pc.coarse_model(thick, "best")))
+    own = pc.rollout(pc.ProjectiveDynamics(pc.discretise(pc.best_coarse(thick))))
     row = found.rows[2]
     assert row.rms_error == pytest.approx(pc.metrics.rms_error(own, by_hand), rel=1e-9)
     assert row.rms_error < 0.5 * found.rows[0].rms_error
@@ -73,9 +73,8 @@ def test_the_best_coarse_model_is_always_there_and_the_reference_has_its_element
 @pytest.mark.parametrize(
     "changes",
     [
-        {"solver": {"element": "hex8-bubble-mean", "mass": "averaged"}},
+        {"solver": {"element": "hex8-enhanced", "mass": "averaged"}},
         {"solver": {"element": "hex27"}},
-        {"material": {"energy": "volume-only"}},
     ],
 )
 def test_scenes_without_a_best_coarse_model_say_why(thick, changes):
@@ -84,7 +83,7 @@ def test_scenes_without_a_best_coarse_model_say_why(thick, changes):
     assert cases_for(scene) == CASES
     notes = report.notes(pc.compare(scene, 1, CASES[2:3]))
     assert any(why in note for note in notes)
-    other = thick.with_changes(solver={"element": "hex8-bubble-mean"})  # of another mass
+    other = thick.with_changes(solver={"element": "hex8-enhanced"})  # of another mass
     assert without_best(other) is None
     assert "best coarse PD" in labels(cases_for(other))
 
@@ -137,9 +136,15 @@ def test_models_keep_the_reference_that_they_learned_from(thick):
         "fine PD", "intermediate PD", "coarse PD", "coarse Newton", "best coarse PD",
         "hybrid torsion-as-published", "coarse PD, hex27",
     ]  # fmt: skip
-    best = cases_for(thick, [MODEL])
-    assert best == cases_with([MODEL])
-    assert labels(best).count("best coarse PD") == 1
+    trained = cases_for(thick, [MODEL])
+    assert labels(trained) == [
+        "fine PD as trained", "intermediate PD", "coarse PD", "coarse Newton", "best coarse PD",
+        "coarse PD as trained", f"hybrid {MODEL}",
+    ]  # fmt: skip
+    for label, refine in (("fine PD as trained", 4), ("coarse PD as trained", 1)):
+        (case,) = (case for case in trained if case.label == label)
+        assert case.problem(thick).element == "hex8-bubble-mean"
+        assert case.problem(thick).refine == refine
 
 
 @pytest.mark.parametrize(
@@ -166,7 +171,7 @@ def test_a_corrector_of_a_best_coarse_model_that_is_not_there_is_refused_at_once
     arguments = ("-o", tmp_path / "r", "--model", MODEL, "--no-figures")
     status, _, err = program("compare", tmp_path / "scene.toml", *arguments)
     assert status == BAD_INPUT
-    assert f"model {MODEL}: " in err
+    assert f"models {MODEL}: " in err
     assert not (tmp_path / "r").exists()
     own = pc.best_coarse(thick)  # has none beside its own, which is as good
     assert labels(cases_for(own, [MODEL]))[-1] == f"hybrid {MODEL}"
@@ -180,15 +185,15 @@ def test_large_numbers_have_no_powers_of_ten():
 
 def test_a_row_whose_corrections_are_all_refused_is_the_base_and_says_so(stiff, tmp_path):
     pytest.importorskip("torch_geometric")
-    coarse, hybrid = cases_for(stiff, [MODEL])[4:]
+    coarse, hybrid = cases_for(stiff, [MODEL])[5:]
     found = pc.compare(stiff, cases=(coarse, hybrid))
     assert found.rows[1].refused_frames == 2
     name = f"hybrid {MODEL} (all refused)"
-    assert [line[0] for line in report.table(found)] == ["best coarse PD", name]
+    assert [line[0] for line in report.table(found)] == ["coarse PD as trained", name]
     assert any(f"{hybrid.label}: " in note and "2 of 2" in note for note in report.notes(found))
     assert f"| {name} |" in report.write_report(found, tmp_path, draw=False).read_text()
     np.testing.assert_array_equal(
-        found.runs[hybrid.label].positions, found.runs["best coarse PD"].positions
+        found.runs[hybrid.label].positions, found.runs[coarse.label].positions
     )
     for count, label in ((1, f"{hybrid.label} (1 of 2 refused)"), (0, hybrid.label)):
         fewer = (found.rows[0], dataclasses.replace(found.rows[1], refused_frames=count))
@@ -289,6 +294,51 @@ def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_pa
     assert "vtu" not in program(*command, tmp_path / "new")[1]
 
 
+# --- errors to the converged motion ------------------------------------------------------
+
+
+def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, monkeypatch):
+    monkeypatch.setenv("PDCORRECT_CACHE", str(tmp_path / "cache"))
+    scene = thick.with_changes(time={"integrator": "generalised-alpha", "step": 1e-3, "frames": 8})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    folder = tmp_path / "report"
+    status, out, _ = program("compare", tmp_path / "scene.toml", "-o", folder, "--converged-error")
+    assert status == 0
+    with (folder / "report.csv").open() as file:
+        rows = {r["label"]: r for r in csv.DictReader(file)}
+    assert HEX27.label in rows
+    errors = {label: float(row["relative_error"]) for label, row in rows.items()}
+    assert max(errors, key=errors.get).startswith("coarse ")
+    assert 0 < errors["fine best PD"] < errors["best coarse PD"] < errors["coarse PD"] < 1
+    truth = pc.converged(scene)
+    own = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
+    assert errors["coarse PD"] == pytest.approx(pc.metrics.relative_error(own, truth), rel=1e-9)
+    lines = (folder / "report.md").read_text().splitlines()
+    (header,) = [line for line in lines if line.startswith("| solver")]
+    assert [x.strip() for x in header.split("|")[1:5]] == [
+        "solver", "error", "ms/frame", "speed-up"
+    ]  # fmt: skip
+    record = json.loads((folder / "report.json").read_text())
+    assert {"time_error", "mesh_error"} <= set(record["converged"])
+    shown = f"{report.three_digits(100 * errors['coarse PD'])} %"
+    assert any(line.startswith("| coarse PD |") and shown in line for line in lines)
+    assert shown in out
+    assert (folder / "error_over_time.png").stat().st_size > 5000
+
+
+def test_scenes_of_27_nodes_and_cases_that_fail_have_errors_too(thick, monkeypatch, tmp_path):
+    monkeypatch.setenv("PDCORRECT_CACHE", str(tmp_path / "cache"))
+    scene = thick.with_changes(time={"integrator": "generalised-alpha", "step": 1e-3})
+    truth = pc.converged(scene)
+    scene = scene.with_changes(solver={"element": "hex27"})
+    found = pc.compare(scene, cases=CASES[2:3], converged=truth)
+    assert 0 < found.rows[0].relative_error < 0.5
+    assert found.errors_over_time()["coarse PD"].shape == truth.times.shape
+    failed = dataclasses.replace(found, failures={"other": "why"})
+    assert report.table(failed)[-1][:2] == ("other", "failed")
+    assert pc.compare(scene, cases=CASES[2:3]).rows[0].relative_error is None
+
+
 # --- correctors --------------------------------------------------------------------------
 
 
@@ -298,16 +348,17 @@ def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program
     command = ("compare", scene, "-o", folder, "--frames", 4, "--no-figures")
     assert program(*command, "--model", MODEL)[0] == 0
     rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
-    coarse = ["coarse PD", "coarse Newton", "best coarse PD", f"hybrid {MODEL}"]
-    assert list(rows) == [*coarse, "intermediate PD", "fine best PD"]
+    coarse = ["coarse PD", "coarse Newton", "best coarse PD", "coarse PD as trained",
+              f"hybrid {MODEL}"]  # fmt: skip
+    assert list(rows) == [*coarse, "intermediate PD", "fine PD as trained"]
     errors = [float(rows[name]["rms_error"]) for name in coarse]
-    assert errors[3] < 0.5 * errors[2] < 0.5 * errors[0]
-    assert [rows[name]["refused_frames"] for name in coarse] == ["", "", "", "0"]
-    assert rows[coarse[3]]["solver"] == "hybrid"
+    assert errors[4] < 0.5 * errors[3] < 0.5 * errors[0]
+    assert [rows[name]["refused_frames"] for name in coarse] == ["", "", "", "", "0"]
+    assert rows[coarse[4]]["solver"] == "hybrid"
     record = json.loads((folder / "report.json").read_text())
-    about = record["models"][coarse[3]]
+    about = record["models"][coarse[4]]
     assert (about["base"], about["dataset"].split("+")[0]) == ("best", MODEL)
-    assert any(coarse[3] in note for note in record["notes"])
+    assert any(coarse[4] in note for note in record["notes"])
 
 
 def test_correctors_share_the_reference_of_their_base(tmp_path):
@@ -341,6 +392,8 @@ def test_a_base_is_known_and_on_a_mesh_that_it_is_for():
     with pytest.raises(InputError, match="base 'worst'"):
         dataclasses.replace(case, base="worst", refine=1).problem(scene)
     assert dataclasses.replace(case, base="best").problem(scene).element == "hex8-bubble"
+    own = dataclasses.replace(case, base="enhanced").problem(scene)
+    assert (own.element, own.refine) == (pc.best_coarse(scene).solver.element, 2)
 
 
 # --- whole reports and what fails --------------------------------------------------------
@@ -420,7 +473,7 @@ def test_compare_goes_on_after_a_case_that_fails(
 
 def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, monkeypatch):
     nodes = nodes_of(pc.Scene.load(scene_file), 4)
-    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes}, "hex8-bubble")
+    failing_after_a_step(monkeypatch, pc.ProjectiveDynamics, {nodes}, "hex8-enhanced")
     status, _, err = program("compare", scene_file, "-o", tmp_path / "report")
     assert status == FAILED
     assert "frame 2 (t = 0.02 s) failed" in err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pdcorrect.evaluation.compare import Case, Comparison
     from pdcorrect.scene import Scene
     from pdcorrect.state import StepResult
+    from pdcorrect.trajectory import Trajectory
 
 _WIDE, _NARROW = 200, 12
 """Letters in a line where there is no terminal; in a line of a name at least."""
@@ -41,6 +42,21 @@ def compare(
     hex27: Annotated[
         bool, typer.Option("--hex27", help="Also 27-node elements on the coarse mesh.")
     ] = False,
+    converged: Annotated[
+        bool,
+        typer.Option(
+            "--converged",
+            help="Also the error to the converged motion, which takes long once and is kept on "
+            "disk; adds 27-node elements.",
+        ),
+    ] = False,
+    converged_error: Annotated[
+        bool,
+        typer.Option(
+            "--converged-error",
+            help="The same, and how exact the converged motion is: several times as long.",
+        ),
+    ] = False,
     vtu: Annotated[
         bool,
         typer.Option(
@@ -51,6 +67,8 @@ def compare(
 ) -> None:
     """Run coarse, best coarse, intermediate and fine PD and coarse Newton; report error and time.
 
+    With --converged the first error is the relative one to the converged motion.
+
     The fine run has the element of the best coarse model; with correctors the one that they
     have learned from, and the coarse models that they correct are compared too.  Exit status 1 if
     a solver failed; the report then has the others, unless it was the fine run.
@@ -58,6 +76,7 @@ def compare(
     from pdcorrect._files import make_folder
     from pdcorrect.evaluation import report
     from pdcorrect.evaluation.compare import cases_for
+    from pdcorrect.evaluation.comparison_cases import HEX27
     from pdcorrect.scene import Scene
 
     if figures:
@@ -65,10 +84,14 @@ def compare(
         require_extra("matplotlib", "view")
     check_models(model or [], gate)
     loaded = Scene.load(scene)
+    converged = converged or converged_error
+    hex27 = hex27 or (converged and loaded.solver.element != HEX27.element)
     cases = cases_for(loaded, model or [], gate=gate, hex27=hex27)
     make_folder(output / report.VTU if vtu else output)
     tell_of_compiling()
-    comparison = _run(loaded, frames or loaded.time.frames, cases)
+    count = frames or loaded.time.frames
+    truth = _converged(loaded, count, converged_error) if converged else None
+    comparison = _run(loaded, count, cases, truth)
     _print_table(comparison)
     for note in report.notes(comparison):
         say("- " + note)
@@ -84,7 +107,25 @@ def compare(
         raise typer.Exit(FAILED)
 
 
-def _run(scene: Scene, count: int, cases: Sequence[Case]) -> Comparison:
+def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
+    """The converged motion, with a bar for each run that is not on disk."""
+    from pdcorrect.cli.common import progress_bar
+    from pdcorrect.evaluation import converged
+
+    with progress_bar() as progress:
+        tasks: dict[str, Any] = {}
+
+        def on_step(name: str, frame: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(f"converged: {name}", total=total)
+            progress.update(tasks[name], completed=frame)
+
+        return converged.converged(scene, count, error=error, on_step=on_step)
+
+
+def _run(
+    scene: Scene, count: int, cases: Sequence[Case], converged: Trajectory | None
+) -> Comparison:
     """The comparison, with a bar for each case."""
     from pdcorrect.cli.common import progress_bar
     from pdcorrect.evaluation import compare as evaluate
@@ -101,7 +142,7 @@ def _run(scene: Scene, count: int, cases: Sequence[Case]) -> Comparison:
                 progress.start_task(tasks[label])
             progress.update(tasks[label], completed=frame)
 
-        return evaluate.compare(scene, count, cases, on_step)
+        return evaluate.compare(scene, count, cases, on_step, converged=converged)
 
 
 def _print_table(comparison: Comparison) -> None:
@@ -117,12 +158,13 @@ def _print_table(comparison: Comparison) -> None:
     table = Table(
         title=comparison.scene.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
-    for heading in report.HEADINGS:
+    headings = report.headings(comparison)
+    for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     names = table.columns[0]
     names.justify, names.no_wrap, names.overflow = "left", False, "fold"
     rows = report.table(comparison)
-    columns = [*zip(report.HEADINGS, *rows, strict=True)][1:]
+    columns = [*zip(headings, *rows, strict=True)][1:]
     room = console.width - sum(max(map(len, column)) + 2 for column in columns)
     for name, *cells in rows:
         table.add_row("\n".join(wrap(name, max(room, _NARROW))), *cells)

@@ -12,6 +12,7 @@ import numpy as np
 from pdcorrect import metrics
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.comparison_cases import (
+    CASE_BASES,
     CASES,
     Case,
     cases_for,
@@ -19,7 +20,8 @@ from pdcorrect.evaluation.comparison_cases import (
     check_corrected,
     without_best,
 )
-from pdcorrect.fem.problem import BASES, Problem, discretise
+from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.metrics import relative_error
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -41,8 +43,9 @@ OnStep = Callable[[str, int, StepResult], None]
 class Row:
     """One line of the comparison table.
 
-    Errors are node distances on the coarse nodes over all frames, against the
-    reference case, in metres; ``omega`` is eq. 7-2 with the first case on the
+    ``relative_error`` is the one to the converged motion, see `metrics.relative_error`; None
+    where that was not computed.  The other errors are node distances on the coarse nodes over all
+    frames, against the reference case, in metres; ``omega`` is eq. 7-2 with the first case on the
     coarse mesh as its zero.  Times are medians for one frame; ``setup_seconds``
     covers meshing, assembly and the first factorisation.  ``unusual_frames``
     converged only by a fallback (see `Status`).  ``refused_frames`` are those whose correction
@@ -50,6 +53,7 @@ class Row:
     """
 
     label: str
+    relative_error: float | None
     solver: str
     refine: int
     nodes: int
@@ -91,6 +95,8 @@ class Comparison:
         Of cases that did not come to their end, by label: why.
     without_best : str or None
         Why none of the cases is the best coarse model; None if one is, or could be.
+    converged : Trajectory or None
+        The converged motion, if errors to it were asked for.
     """
 
     scene: Scene
@@ -103,14 +109,19 @@ class Comparison:
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
     without_best: str | None = None
+    converged: Trajectory | None = None
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
-        """RMS node distance from the reference in each frame, by label, m."""
-        truth = self.on_coarse[self.reference]
+        """RMS node distance in each frame, by label, m: from the converged motion or reference."""
+        if self.converged is None:
+            truth = self.on_coarse[self.reference]
+            labels = [row.label for row in self.rows if row.label != self.reference]
+        else:
+            truth = self.converged
+            labels = [row.label for row in self.rows]
         return {
-            row.label: metrics.error_over_time(self.on_coarse[row.label], truth)
-            for row in self.rows
-            if row.label != self.reference
+            label: metrics.error_over_time(restrict(self.on_coarse[label], truth), truth)
+            for label in labels
         }
 
 
@@ -149,6 +160,8 @@ def compare(
     frames: int | None = None,
     cases: Sequence[Case] | None = None,
     on_step: OnStep | None = None,
+    *,
+    converged: Trajectory | None = None,
 ) -> Comparison:
     """Run a scene with several solvers and measure error and time.
 
@@ -161,11 +174,14 @@ def compare(
         The first is the reference; those of `cases_for` by default.
     on_step : callable, optional
         For progress.
+    converged : Trajectory, optional
+        Of `pdcorrect.converged` for the same frames: relative errors are measured from it.
 
     Raises
     ------
     InputError
-        If there are no cases, or two of one label, or a model does not fit the scene.
+        If there are no cases, or two of one label, or a model does not fit the scene, or the
+        converged motion has other frames.
     ConvergenceError
         If the reference fails.  Other cases that fail are among ``failures``.
     """
@@ -175,6 +191,9 @@ def compare(
     labels = [case.label for case in cases]
     if len(set(labels)) < len(labels):
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
+    count = scene.time.frames if frames is None else frames
+    if converged is not None and len(converged) != count:
+        raise InputError(f"converged has {len(converged)} frames: expected {count}.")
     coarse = discretise(scene)
     runs, on_coarse, setup, failures = {}, {}, {}, {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
@@ -199,6 +218,7 @@ def compare(
         rows.append(
             Row(
                 label=case.label,
+                relative_error=None if converged is None else relative_error(run, converged),
                 solver="hybrid" if case.model else case.solver,
                 refine=case.refine,
                 nodes=len(run.points),
@@ -216,14 +236,14 @@ def compare(
     return Comparison(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
         _models(cases), failures,
-        None if any(case.base == "best" for case in cases) else without_best(scene),
+        None if any(case.base == "enhanced" for case in cases) else without_best(scene), converged,
     )  # fmt: skip
 
 
 def _coarse_to_fine(case: Case) -> tuple[int, bool, int, bool]:
     """Order of the rows; elements with more nodes after all that share the coarse nodes."""
     more_nodes = case.element is not None
-    return case.refine, more_nodes, BASES.index(case.base), case.solver != "pd"
+    return case.refine, more_nodes, CASE_BASES.index(case.base), case.solver != "pd"
 
 
 def _models(cases: Sequence[Case]) -> dict[str, dict[str, str]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model, discretise
-from pdcorrect.scene import Scene, best_coarse
+from pdcorrect.scene import Scene, best_coarse, trained_coarse
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,9 @@ class Case:
     solver : str
         "pd" or "newton".
     refine : int
-    base : {"plain", "best", "total-mass"}
-        As of `coarse_model`; "best" on any mesh, "total-mass" on the coarse one only.
+    base : {"plain", "enhanced", "best", "total-mass"}
+        "enhanced": element and mass of `best_coarse`.  Others as of `coarse_model`: "best" is
+        what correctors were trained on.  "total-mass" is for the coarse mesh only.
     model : str or None
         Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
     gate : bool
@@ -54,14 +55,16 @@ class Case:
         """
         if self.element is not None:
             return self._with_element(scene)
+        if self.base == "enhanced":
+            return discretise(best_coarse(scene), self.refine)
         if self.refine == 1:
             return coarse_model(scene, self.base)
         if self.base not in ("plain", "best"):
             raise InputError(
-                f"{self.label}: base {self.base!r} refined {self.refine} times: expected 'plain' "
-                "or 'best'."
+                f"{self.label}: base {self.base!r} refined {self.refine} times: expected 'plain', "
+                "'enhanced' or 'best'."
             )
-        return discretise(best_coarse(scene) if self.base == "best" else scene, self.refine)
+        return discretise(trained_coarse(scene) if self.base == "best" else scene, self.refine)
 
     def _with_element(self, scene: Scene) -> Problem:
         """Mass by the scene's rule, but "per-node" is for nodes at corners only."""
@@ -111,11 +114,18 @@ CASES = (
 HEX27 = Case("coarse PD, hex27", "pd", 1, element="hex27")
 """The scene's cells with 27 nodes each."""
 
-_FINE_BEST = replace(CASES[0], label="fine best PD", base="best")
-"""The reference with the better element."""
+_BEST = Case("best coarse PD", "pd", 1, "enhanced")
+_FINE_BEST = replace(CASES[0], label="fine best PD", base="enhanced")
+"""The coarse model and the reference with the best element."""
 
-_COARSE = {"best": "best coarse PD", "total-mass": "coarse PD, total mass"}
-"""Labels of coarse models by their base."""
+_FINE_TRAINED = replace(CASES[0], label="fine PD as trained", base="best")
+"""The reference that correctors of the base "best" have learned from."""
+
+_COARSE = {"best": "coarse PD as trained", "total-mass": "coarse PD, total mass"}
+"""Labels of coarse models that are corrected, by their base."""
+
+CASE_BASES = ("plain", "enhanced", "best", "total-mass")
+"""In the order of rows."""
 
 
 def cases_for(
@@ -123,8 +133,8 @@ def cases_for(
 ) -> tuple[Case, ...]:
     """What `compare` runs by default: `cases_with`, and always the best coarse model.
 
-    The reference is the fine mesh with the better element, that of the best coarse model; with
-    correctors it is what they learned from.  A scene that has no such model, see `without_best`,
+    The reference is the fine mesh with the element of the best coarse model; with correctors it
+    is what they learned from.  A scene that has no such model, see `without_best`,
     has its own element on the fine mesh.
 
     Parameters
@@ -144,17 +154,16 @@ def cases_for(
         the scene's own element has 27 nodes and others are asked for.
     """
     reference, *others = cases_with(models, gate=gate)
-    best, why = Case(_COARSE["best"], "pd", 1, "best"), without_best(scene)
-    if why is None:
+    if without_best(scene) is None:
         reference = reference if models else _FINE_BEST
-        others[len(CASES) - 1 : len(CASES) - 1] = [] if best in others else [best]
-    elif not _is_best(scene):
-        for case in others:
-            if case.model is not None and case.base == "best":
-                raise InputError(
-                    f"model {case.model}: corrects the best coarse model, and this scene has none: "
-                    f"{why}. Expected a scene that has one, or a model of another base."
-                )
+        others.insert(len(CASES) - 1, _BEST)
+    if reference == _FINE_TRAINED:
+        why = _impossible(scene, trained_coarse(scene))
+        if why:
+            raise InputError(
+                f"models {', '.join(models)}: correct a coarse model that this scene has not: "
+                f"{why}. Expected a scene that has one, or models of another base."
+            )
     if hex27:
         if scene.solver.element == HEX27.element:
             raise InputError(
@@ -166,8 +175,7 @@ def cases_for(
 
 def _is_best(scene: Scene) -> bool:
     """Whether the scene's own element and mass are those of its best coarse model."""
-    best, own = best_coarse(scene).solver, scene.solver
-    return (own.element, own.mass) == (best.element, best.mass)
+    return scene.solver == best_coarse(scene).solver
 
 
 def without_best(scene: Scene) -> str | None:
@@ -177,10 +185,15 @@ def without_best(scene: Scene) -> str | None:
     """
     if _is_best(scene):
         return "the scene's own element and mass are those of the best coarse model"
+    return _impossible(scene, best_coarse(scene))
+
+
+def _impossible(scene: Scene, other: Scene) -> str | None:
+    """Why the scene with another element of 8 nodes is no case beside it; None if it is one."""
     if scene.solver.element == HEX27.element:
         return "it has no nodes where the scene's 27-node elements have some"
     try:
-        discretise(best_coarse(scene))
+        discretise(other)
     except InputError as error:
         return str(error).rstrip(".")
     return None
@@ -222,7 +235,7 @@ def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
                 "expected of 'best' or of the others, as their references have unlike elements; "
                 "compare the others apart."
             )
-        reference = _FINE_BEST
+        reference = _FINE_TRAINED
     without = "" if gate else ", no gate"
     return (
         reference,

@@ -28,6 +28,7 @@ from pdcorrect.metrics import (
     largest_error,
     linear_momentum,
     mean_squared_error,
+    relative_error,
     rms_error,
 )
 
@@ -265,6 +266,8 @@ class TrajectoryMeasures:
         from that of the reference's positions, over the RMS of the latter.
     smallest_volume_ratio : float
         Smallest det F at quadrature points of the plain coarse model.
+    relative_error : float
+        RMS distance from the time-converged reference over that one's RMS displacement, per cent.
     converged_omega, converged_rms_error : float
         ``omega`` and ``rms_error`` (m) against the time-converged reference.
     gate_rate : float
@@ -275,6 +278,7 @@ class TrajectoryMeasures:
 
     mesh: int
     simulation: int
+    relative_error: float | None = None
     omega: float | None = None
     omega_base: float | None = None
     rms_reduction: float | None = None
@@ -403,6 +407,7 @@ def _of_rollout(
         },
     }
     if converged is not None:
+        found["relative_error"] = 100.0 * relative_error(positions, converged)
         found["converged_omega"] = omega(positions, plain, converged)
         found["converged_rms_error"] = rms_error(positions, converged)
     return found

@@ -17,8 +17,9 @@ import pdcorrect.figures as figures
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
+from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
-from pdcorrect.metrics import energy_balance, largest_displacement
+from pdcorrect.metrics import energy_balance, largest_displacement, rms_error
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
@@ -28,35 +29,51 @@ VTU = "vtu"
 _NOT_UNIQUE = 100.0
 """Tolerances by which PD and Newton differ where they have taken different branches."""
 
-HEADINGS = (
+_HEADINGS = (
     "solver", "nodes", "RMS mm", "worst mm", "corrected", "ms/frame", "speed-up", "iter."
+)  # fmt: skip
+_CONVERGED_FIRST = (
+    "solver", "error", "ms/frame", "speed-up", "corrected", "RMS mm", "worst mm", "nodes", "iter."
 )  # fmt: skip
 
 
+def headings(comparison: Comparison) -> tuple[str, ...]:
+    """Of `table`; where there is a converged motion, first the error to it."""
+    return _HEADINGS if comparison.converged is None else _CONVERGED_FIRST
+
+
 def table(comparison: Comparison) -> list[tuple[str, ...]]:
-    """The comparison as rows of text under `HEADINGS`."""
-    reference_seconds = next(
-        r for r in comparison.rows if r.label == comparison.reference
-    ).seconds_a_frame
-    lines: list[tuple[str, ...]] = []
+    """The comparison as rows of text under `headings`."""
+    order = headings(comparison)
+    seconds = {row.label: row.seconds_a_frame for row in comparison.rows}[comparison.reference]
     shown = shown_labels(comparison)
-    for row in comparison.rows:
-        is_reference = row.label == comparison.reference
-        lines.append(
-            (
-                shown[row.label],
-                str(row.nodes),
-                "ref." if is_reference else f"{1e3 * row.rms_error:.3g}",
-                "ref." if is_reference else f"{1e3 * row.largest_error:.3g}",
-                "ref." if is_reference else _percent(row.omega),
-                three_digits(1e3 * row.seconds_a_frame),
-                f"{three_digits(reference_seconds / row.seconds_a_frame)}x",
-                f"{row.iterations_a_frame:.1f}",
-            )
-        )
-    rest = ("",) * (len(HEADINGS) - 3)
-    lines += [(label, "", "failed", *rest) for label in comparison.failures]
-    return lines
+    found = [
+        {"solver": shown[row.label], **_cells(row, seconds, row.label == comparison.reference)}
+        for row in comparison.rows
+    ]
+    failed = "error" if "error" in order else "RMS mm"
+    found += [{"solver": label, failed: "failed"} for label in comparison.failures]
+    return [tuple(cells.get(name, "") for name in order) for cells in found]
+
+
+def _cells(row: Row, reference_seconds: float, is_reference: bool) -> dict[str, str]:
+    distances = {
+        "RMS mm": f"{1e3 * row.rms_error:.3g}",
+        "worst mm": f"{1e3 * row.largest_error:.3g}",
+        "corrected": _percent(row.omega),
+    }
+    return {
+        "error": "" if row.relative_error is None else _relative(row.relative_error),
+        "nodes": str(row.nodes),
+        **(dict.fromkeys(distances, "ref.") if is_reference else distances),
+        "ms/frame": three_digits(1e3 * row.seconds_a_frame),
+        "speed-up": f"{three_digits(reference_seconds / row.seconds_a_frame)}x",
+        "iter.": f"{row.iterations_a_frame:.1f}",
+    }
+
+
+def _relative(share: float) -> str:
+    return f"{three_digits(100.0 * share)} %"
 
 
 def _percent(share: float) -> str:
@@ -79,15 +96,36 @@ def notes(comparison: Comparison) -> list[str]:
 def _of_the_errors(comparison: Comparison) -> str:
     truth, time = comparison.on_coarse[comparison.reference], comparison.scene.time
     return (
-        f"{len(truth)} frames of {time.step:g} s by {time.integrator}. RMS and worst are distances "
+        f"{len(truth)} frames of {time.step:g} s by {time.integrator}. "
+        f"{_of_the_converged(comparison)}RMS and worst are distances "
         f"of the coarse nodes from {comparison.reference}, which moves by up to "
         f"{1e3 * largest_displacement(truth):.3g} mm; 'corrected' is the share of the coarse PD "
         "run's squared error that is gone."
     )
 
 
+def _of_the_converged(comparison: Comparison) -> str:
+    """What relative errors are of, and how exact that is itself if it is known."""
+    run = comparison.converged
+    if run is None:
+        return ""
+    size = rms_error(np.broadcast_to(run.points, run.positions.shape), run)
+    known = [
+        f"{name} {_relative(float(run.attributes[key]))}"
+        for name, key in (("time", TIME_ERROR), ("mesh", MESH_ERROR))
+        if key in run.attributes
+    ]
+    own = f" (its own error: {', '.join(known)})" if known else ""
+    return (
+        f"'error' is the RMS distance from the converged motion{own} over that motion's RMS "
+        f"displacement, {1e3 * size:.3g} mm. "
+    )
+
+
 def _of_the_reference(comparison: Comparison) -> str:
     """What is left of the reference's own error, in space and in time."""
+    if comparison.converged is not None:
+        return ""
     run = comparison.runs[comparison.reference]
     if comparison.scene.time.integrator == "quasi-static":
         return f"The reference ({_discretisation(run)}) has a mesh error of its own."
@@ -95,7 +133,8 @@ def _of_the_reference(comparison: Comparison) -> str:
     share = "" if lost is None else f" (it dissipates {100 * lost:.0f} % of the loads' work)"
     return (
         f"The reference ({_discretisation(run)}) is not the truth: its mesh error, and the error "
-        f"of the time step{share}, which all rows share, are in none of these numbers."
+        f"of the time step{share}, which all rows share, are in none of these numbers. Option "
+        "--converged measures from the converged motion instead."
     )
 
 
@@ -258,7 +297,8 @@ def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
     """The whole report as Markdown."""
     lines = [f"# {comparison.scene.name}", ""]
     lines += [f"![{name}]({name})" for name in pictures[:1]] + [""]
-    lines += ["| " + " | ".join(HEADINGS) + " |", "|---|" + "---:|" * (len(HEADINGS) - 1)]
+    names = headings(comparison)
+    lines += ["| " + " | ".join(names) + " |", "|---|" + "---:|" * (len(names) - 1)]
     lines += ["| " + " | ".join(cells) + " |" for cells in table(comparison)]
     lines += ["", *[f"- {note}" for note in notes(comparison)], ""]
     lines += [f"![{name}]({name})\n" for name in pictures[1:]]
@@ -287,6 +327,7 @@ def to_json(comparison: Comparison) -> str:
         "scene": comparison.scene.to_toml(),
         "reference": comparison.reference,
         "solver_error": comparison.solver_error,
+        "converged": None if (run := comparison.converged) is None else dict(run.attributes),
         "notes": notes(comparison),
         "cases": [dataclasses.asdict(case) for case in comparison.cases],
         "models": dict(comparison.models),
@@ -392,22 +433,27 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
     )
     figures.plot_energy(runs, folder / "energy.png", labels=labels)
     names = ["comparison.png", *(["overlay.png"] if len(overlaid) > 1 else [])]
-    if any(row.rms_error > 0 for row in comparison.rows):
+    marks = {
+        shown[row.label]: (row.seconds_a_frame, error)
+        for row in comparison.rows
+        if (error := _error(row)) > 0
+    }
+    if marks:
         names += ["error_against_time.png", "error_over_time.png"]
+        relative = comparison.converged is not None
         figures.plot_error_over_time(
             {shown[label]: errors for label, errors in comparison.errors_over_time().items()},
             truth.times,
             folder / "error_over_time.png",
+            "converged motion" if relative else "reference",
         )
-        figures.plot_error_against_time(
-            {
-                shown[row.label]: (row.seconds_a_frame, row.rms_error)
-                for row in comparison.rows
-                if row.rms_error > 0
-            },
-            folder / "error_against_time.png",
-        )
+        figures.plot_error_against_time(marks, folder / "error_against_time.png", relative)
     return [*names, "node.png", "energy.png"]
+
+
+def _error(row: Row) -> float:
+    """That which comes first: to the converged motion, or else from the reference, m."""
+    return row.rms_error if row.relative_error is None else row.relative_error
 
 
 def overlaid_labels(comparison: Comparison) -> list[str]:
@@ -428,11 +474,11 @@ def overlaid_labels(comparison: Comparison) -> list[str]:
 
 def _panel_label(comparison: Comparison, row: Row) -> str:
     """Lines above a body; a line more is narrower than a longer name."""
-    error = (
-        "reference"
-        if row.label == comparison.reference
-        else f"RMS error {1e3 * row.rms_error:.2g} mm"
-    )
+    error = f"RMS error {1e3 * row.rms_error:.2g} mm"
+    if row.relative_error is not None:
+        error = f"error {_relative(row.relative_error)}"
+    elif row.label == comparison.reference:
+        error = "reference"
     time = three_digits(1e3 * row.seconds_a_frame)
     refused = refused_share(comparison, row)
     return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame" + (

@@ -125,19 +125,25 @@ def mean_errors(evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
 
 
 def headline(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
-    """Headings and rows of the main table: shares of squared error removed, per cent."""
+    """Headings and rows of the main table: shares of squared error removed, per cent.
+
+    Where the data have a time-converged reference, first the relative error to it, per cent.
+    """
+    means = ("omega_base", "rms_reduction", "step_omega", "gate_rate")
+    every = {run.name: summaries(run, seed) for run in _shown(evaluation)}
+    first = ["relative_error"] if any("relative_error" in found for found in every.values()) else []
     headings = [
-        "run", "Omega", "95 % interval", "median", "5 %", "worst", "of own base", "RMS reduction",
-        "one step", "refused", "failed",
+        "run", *("error" for _ in first), "Omega", "95 % interval", "median", "5 %", "worst",
+        "of own base", "RMS reduction", "one step", "refused", "failed",
     ]  # fmt: skip
     rows = []
     for run in _shown(evaluation):
-        found = summaries(run, seed)
+        found = every[run.name]
         omega = found.get("omega")
         shares = (omega.median, omega.q05, omega.smallest) if omega else (None, None, None)
-        means = ("omega_base", "rms_reduction", "step_omega", "gate_rate")
         rows.append([
-            _marked(run), _number(omega.mean if omega else None), _interval(omega),
+            _marked(run), *(_mean(found, measure) for measure in first),
+            _number(omega.mean if omega else None), _interval(omega),
             *map(_number, shares), *(_mean(found, measure) for measure in means),
             f"{len(run.failures())}/{len(run.trajectories)}",
         ])  # fmt: skip

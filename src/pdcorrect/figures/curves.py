@@ -162,31 +162,38 @@ def _matters(run: Trajectory, work: str) -> bool:
     return work in run.stats and np.abs(run.stats[work]).max() > 1e-9 * max(energies, default=0.0)
 
 
-def plot_error_over_time(errors: Mapping[str, Array], times: Array, output: str | Path) -> Path:
-    """RMS node distance (m) from the reference over time, one curve a label."""
+def plot_error_over_time(
+    errors: Mapping[str, Array], times: Array, output: str | Path, truth: str = "reference"
+) -> Path:
+    """RMS node distance (m) from what ``truth`` names over time, one curve a label."""
     for label, values in errors.items():
         if values.shape != times.shape:
             raise InputError(f"{label}: {values.shape} errors at {times.shape} times.")
     figure, (axis,) = _axes(1, 4.0)
     for index, (label, values) in enumerate(errors.items()):
         axis.plot(times[1:], 1e3 * values[1:], label=label, **_style(index))
-    axis.set_ylabel("RMS distance from the reference [mm]")
+    axis.set_ylabel(f"RMS distance from the {truth} [mm]")
     axis.set_xlabel("time [s]")
     axis.set_ylim(bottom=0)
     _legend(figure, [axis])
     return _save(figure, output)
 
 
-def plot_error_against_time(points: Mapping[str, tuple[float, float]], output: str | Path) -> Path:
-    """RMS error (m) against seconds a frame, both axes logarithmic, one mark a label."""
+def plot_error_against_time(
+    points: Mapping[str, tuple[float, float]], output: str | Path, relative: bool = False
+) -> Path:
+    """RMS error (m) against seconds a frame, both axes logarithmic, one mark a label.
+
+    ``relative``: errors are shares of the motion and shown in per cent.
+    """
     figure, (axis,) = _axes(1, 4.2)
     for index, (label, (seconds, error)) in enumerate(points.items()):
         axis.loglog(
-            1e3 * seconds, 1e3 * error, "o", markersize=9, label=label,
+            1e3 * seconds, (100 if relative else 1e3) * error, "o", markersize=9, label=label,
             color=_COLOURS[index % len(_COLOURS)],
         )  # fmt: skip
     axis.set_xlabel("time a frame [ms]")
-    axis.set_ylabel("RMS error [mm]")
+    axis.set_ylabel("error to the converged motion [%]" if relative else "RMS error [mm]")
     axis.margins(0.25)
     ticker = require_extra("matplotlib.ticker", "view")
     for direction in (axis.xaxis, axis.yaxis):
