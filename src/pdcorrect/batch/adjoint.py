@@ -8,12 +8,17 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from pdcorrect.batch.adjoint_terms import DampingTerms
 from pdcorrect.batch.checks import check_kind, check_nodal, check_step
+from pdcorrect.batch.follower import Mixing
+from pdcorrect.batch.linear_solver import BatchConjugateGradients
+from pdcorrect.batch.objective import largest_displacement
 from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame_slopes
+from pdcorrect.solvers.follower import MOST
 from pdcorrect.solvers.implicit import positive
 from pdcorrect.solvers.schemes import Linear
 
@@ -75,17 +80,44 @@ class BatchGradients:
         self._free = stepper.staging.free
         self._sums: dict[str, Tensor] = {}
         with stepper.alone():
-            self._stage = stepper.prepare(before, forces)
+            self._stage = stepper.prepare(before, forces, result.y)
             self._material = stepper.present
-            self._inertia, self._damping = stepper.objective.inertia, stepper.objective.damping
+            self._factors = stepper.objective.factors.clone()
             by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
             fine = torch.tensor(in_one(result.statuses), device=by_y.device)
-            solver = stepper.solve_adjoint(self._y, stepper.staging.extended(by_y), fine, tolerance)
-            self.ok = fine & solver.converged
-            self.iterations = solver.steps
-            self.x = torch.where(self.ok[:, None, None], solver.x, 0.0)
+            solver = self._solve(by_y, fine, tolerance)
             self._nodal = self.x[:, : self._nodes]
+            self._damping = DampingTerms(stepper, self._stage, self._y, self.x)
             self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
+
+    def _solve(self, by_y: Tensor, fine: Tensor, tolerance: float) -> BatchConjugateGradients:
+        """Find ``x``; with loads that follow the body by a fixed point, x = H^-1 (g + J^T x)."""
+        stepper = self._stepper
+        g = stepper.staging.extended(by_y)
+        share = 0.1 if stepper.loads.follow else 1.0
+        solver = stepper.solve_adjoint(self._y, g, fine, share * tolerance)
+        self.ok, self.iterations, x = fine & solver.converged, solver.steps, solver.x.clone()
+        if stepper.loads.follow:
+            image, mixed = x, Mixing(len(x))
+            x = torch.zeros_like(x)
+            left = self.ok
+            for _ in range(MOST):
+                x = mixed(x, image, left)
+                more = stepper.staging.extended(self._load_slopes(x))
+                solver = stepper.solve_adjoint(self._y, g + more, fine, share * tolerance)
+                image, self.iterations = solver.x.clone(), self.iterations + solver.steps
+                change = largest_displacement(image - x)
+                left = left & (change > 0.5 * tolerance * largest_displacement(image))
+                if not bool(left.any()):
+                    break
+            self.ok, x = self.ok & solver.converged & ~left, image
+        self.x = torch.where(self.ok[:, None, None], x, 0.0)
+        return solver
+
+    def _load_slopes(self, x: Tensor) -> Tensor:
+        """Derivatives (B, N, 3) of x . (loads that follow the body) by y."""
+        nodes = self._nodes
+        return self._stepper.loads.pulled(self._stage.spans, self._y[:, :nodes], x[:, :nodes])
 
     def _pull_end(
         self, positions: Tensor | None, velocities: Tensor | None, memory: Mapping[str, Tensor]
@@ -171,17 +203,36 @@ class BatchGradients:
         with self._stepper.alone():
             fall = self._stepper.loads.acceleration(stage.spans)
             out = mass.row_slopes((self.x * fall).sum(dim=-1))
-            out = out - self._inertia * mass.slopes(self.x, self._y - stage.target)
-            if self._damping:
-                out = out - self._damping * mass.slopes(self.x, self._y - stage.origin)
+            out = out - self._factors[0] * mass.slopes(self.x, self._y - stage.target)
+            if self._stepper.objective.damped:
+                origin = self._stepper.staging.extended(stage.origin)
+                out = out - self._factors[1] * mass.slopes(self.x, self._y - origin)
             return out
+
+    # --- by damping ---------------------------------------------------------------------------
+
+    @property
+    def viscosity(self) -> Tensor:
+        """By ``damping.viscosity``, (B,), 1/s."""
+        return self._stage.scheme.strain_rate * self._damping.by_viscosity
+
+    @property
+    def rayleigh_mass(self) -> Tensor:
+        """By ``damping.mass``, (B,), s."""
+        return self._stage.scheme.rate * self._damping.by_mass
+
+    @property
+    def rayleigh_stiffness(self) -> Tensor:
+        """By ``damping.stiffness``, (B,), 1/s."""
+        return self._stage.scheme.rate * self._damping.by_stiffness
 
     @cached_property
     def _weights(self) -> tuple[Tensor, Tensor]:
         with self._stepper.alone():
-            by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, self.x)
-            has_terms = self._rule.has_shear_term, self._rule.has_volume_term
-            return -by_mu * has_terms[0], -by_omega * has_terms[1]
+            by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, -self.x)
+            more = self._damping.weights
+            by_mu, by_omega = by_mu + more[0], by_omega + more[1]
+            return by_mu * self._rule.has_shear_term, by_omega * self._rule.has_volume_term
 
     @property
     def _rule(self) -> Material:
@@ -211,9 +262,16 @@ class BatchGradients:
         stage, stepper = self._stage, self._stepper
         scheme = stage.scheme
         momentum = stepper.objective.mass(self.x)[:, : self._nodes]
-        if self._inertia:
-            self._pull(scheme.target, scheme.clamped_target, self._inertia * momentum)
-        if self._damping:
-            self._pull(scheme.origin, scheme.clamped_origin, self._damping * momentum)
+        if scheme.inertia:
+            self._pull(scheme.target, scheme.clamped_target, self._factors[0] * momentum)
+        damping = self._damping
+        if damping.has_rayleigh:
+            self._pull(scheme.origin, scheme.clamped_origin, damping.origin)
+            self._pull(scheme.start, scheme.clamped, damping.place)
+        pairs = zip(scheme.strains, damping.places, strict=False)
+        for (_, place), slope in pairs:
+            place.transpose(slope, self._sums)
         back = torch.where(self._free, 0.0, by_y - image)
+        if stepper.loads.follow:
+            back = back + torch.where(self._free, 0.0, self._load_slopes(self.x))
         scheme.clamped.transpose(back, self._sums)

@@ -65,6 +65,11 @@ class CellBatch:
     bodies : DistinctBodies
         Of the scenes.
     node_counts : list of int
+    volumes : (2, B C, Q)
+        Of the points in both terms of the energy, m3.
+    point_weights : (2, B C, Q)
+        The same times mu and omega, J.
+    points : Points
     present_nodes, present_cells : (B, N), (B, C) bool
         Which are a body's own, not padding.
     """
@@ -101,10 +106,10 @@ class CellBatch:
         self.present_nodes = self._first(self.node_counts, n.nodes)
         quadratures = [p.quadrature for p in distinct]
         volumes = [[q.weights for q in quadratures], [q.volume_weights for q in quadratures]]
-        self._volumes = torch.stack([self.repeated(v, n.cells, points) for v in volumes])
-        self._volumes = self._volumes.reshape(2, -1, points)
-        self._weights = torch.zeros_like(self._volumes)
-        self._points = Points(
+        self.volumes = torch.stack([self.repeated(v, n.cells, points) for v in volumes])
+        self.volumes = self.volumes.reshape(2, -1, points)
+        self.point_weights = torch.zeros_like(self.volumes)
+        self.points = Points(
             first.materials.model,
             first.quadrature.first_volume if first.scene.material.has_volume_term else points,
             points,
@@ -127,8 +132,8 @@ class CellBatch:
             node_counts=[self.node_counts[i] for i in numbers],
             mode_counts=[self.mode_counts[i] for i in numbers],
             _slots=slots.reshape(-1, self._slots.shape[1]),
-            _weights=self._by_scene(self._weights)[:, rows].flatten(1, 2),
-            _volumes=self._by_scene(self._volumes)[:, rows].flatten(1, 2),
+            point_weights=self.of_scenes(self.point_weights, rows),
+            volumes=self.of_scenes(self.volumes, rows),
         )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
@@ -188,22 +193,26 @@ class CellBatch:
 
     def energy_and_forces(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Elastic energies (B,), J, and forces (B, U, 3), N, of configurations (B, U, 3)."""
-        density, P = self._points.stress(self.gradients(y - self.rest), self._weights)
+        density, P = self.points.stress(self.gradients(y - self.rest), self.point_weights)
         return density.reshape(self.sizes.scenes, -1).sum(dim=1), -self.gathered(P)
 
-    def linearise(self, y: Tensor) -> Tangent:
-        """The tangent at configurations, for `apply`."""
-        return self._points.tangent(self.gradients(y - self.rest), self._weights)
+    def linearise(self, y: Tensor, project: bool = False) -> Tangent:
+        """The tangent at configurations, for `apply`; ``project`` as in `Points.tangent`."""
+        return self.points.tangent(self.gradients(y - self.rest), self.point_weights, project)
+
+    def of_scenes(self, x: Tensor, rows: Tensor) -> Tensor:
+        """What is known at points, (k, B C, Q), of some scenes."""
+        return self._by_scene(x)[:, rows].flatten(1, 2)
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
-        return self.gathered(self._points.product(tangent, self.gradients(x)))
+        return self.gathered(self.points.product(tangent, self.gradients(x)))
 
     def set_weights(self, mu: Tensor, omega: Tensor) -> None:
         """Weights of the two energy terms from now on, (B, C), Pa."""
-        volumes = self._by_scene(self._volumes)
+        volumes = self._by_scene(self.volumes)
         values = torch.stack([mu, omega])[..., None] * volumes
-        self._weights.copy_(torch.where(volumes != 0.0, values, 0.0).flatten(1, 2))
+        self.point_weights.copy_(torch.where(volumes != 0.0, values, 0.0).flatten(1, 2))
 
     def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
         """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).
@@ -217,20 +226,20 @@ class CellBatch:
         n = self.sizes
         u = torch.zeros_like(self.rest)
         u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
-        ratios = self._points.volume_ratios(self.gradients(u))
+        ratios = self.points.volume_ratios(self.gradients(u))
         by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
         return torch.where(self.present_cells, by_cell, math.inf)
 
     def rotations(self, F: Tensor) -> Tensor:
         """Nearest rotations (9, L) of matrices (9, L)."""
-        return self._points.rotations(F)
+        return self.points.rotations(F)
 
     def mean_rotations(self, u: Tensor, shares: Tensor) -> Tensor:
         """Nearest rotations (9, B C) of each cell's mean F, for displacements (B, U, 3).
 
         Points count by ``shares`` (B C, Q), which add up to one in each cell.
         """
-        return self._points.rotations((self.gradients(u) * shares).sum(dim=-1), moved=True)
+        return self.points.rotations((self.gradients(u) * shares).sum(dim=-1), moved=True)
 
     def weight_slopes(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of x . dW/dy by each cell's mu and omega, two (B, C)."""
@@ -238,9 +247,9 @@ class CellBatch:
         H, D = self.gradients(y - self.rest), self.gradients(x)
         out = []
         for term in (0, 1):
-            weights = torch.zeros_like(self._weights)
-            weights[term] = self._volumes[term]
-            _, P = self._points.stress(H, weights)
+            weights = torch.zeros_like(self.point_weights)
+            weights[term] = self.volumes[term]
+            _, P = self.points.stress(H, weights)
             out.append((P * D).sum(dim=0).reshape(n.scenes, n.cells, n.points).sum(dim=2))
         return out[0], out[1]
 
@@ -257,6 +266,15 @@ class CellBatch:
         rows = P.transpose(0, 1).reshape(*self._rows, 3 * n.points)
         local = rows @ self._gradients.transpose(-1, -2)
         return self.summed(local.reshape(n.scenes, n.cells, 3, n.width).transpose(2, 3))
+
+    def mode_gradients(self) -> Tensor:
+        """Gradients of the internal modes at the points, (B C, L - K, 3, Q), 1/m."""
+        n, nodes = self.sizes, self._corners.shape[2]
+        rows = self._gradients[..., nodes:, :]
+        found = rows.reshape(*rows.shape[:-1], 3, n.points)
+        if self._gradients.ndim == 3:
+            found = found[:, None].expand(-1, n.cells, -1, -1, -1)
+        return found.flatten(0, 1)
 
     def local(self, x: Tensor) -> Tensor:
         """A nodal field's values (B, N or U, 3) at the corners of each cell, (B, C, K, 3)."""

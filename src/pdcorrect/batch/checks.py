@@ -68,8 +68,10 @@ def check_problems(
             ("element", problem.element, first.element),
             ("material.energy", scene.material.energy, other.material.energy),
             ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
-            ("damping.mass", scene.damping.mass, other.damping.mass),
         ]
+        for name in ("viscosity", "mass", "stiffness"):
+            values = (getattr(damping, name) for damping in (scene.damping, other.damping))
+            pairs.append((f"damping.{name}", *values))
         if time_step is None:
             pairs.append(("time.step", scene.time.step, other.time.step))
         if integrator is None:
@@ -84,16 +86,6 @@ def check_problems(
                     f"scene {scene_name(problems, i)}: {key} = {mine!r}, the first one's is "
                     f"{theirs!r}: expected the same. Make a batch of each kind."
                 )
-        if scene.damping.stiffness:
-            raise InputError(
-                f"scene {scene_name(problems, i)}: damping.stiffness is not available in batches: "
-                "expected 0. Use ProjectiveDynamics."
-            )
-        if problem.clamps.moving and name in ("midpoint", "generalised-alpha"):
-            raise InputError(
-                f"scene {scene_name(problems, i)}: moving clamps with {name} are not "
-                "available in batches. Use ProjectiveDynamics."
-            )
     return problems
 
 

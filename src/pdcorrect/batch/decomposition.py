@@ -145,6 +145,25 @@ def transposed(A: list[Tensor]) -> list[Tensor]:
     return [A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]]
 
 
+def positive_part(A: list[Tensor]) -> list[Tensor]:
+    """A symmetric matrix (6), 00 11 22 01 02 12, with its negative eigenvalues raised to zero."""
+    S = list(A)
+    one, zero = torch.ones_like(A[0]), torch.zeros_like(A[0])
+    V = [one, zero, zero, zero, one, zero, zero, zero, one]
+    for _ in range(_SWEEPS[A[0].dtype]):
+        _rotate(S, V, 0, 1, 3, 4, 5)
+        _rotate(S, V, 0, 2, 4, 3, 5)
+        _rotate(S, V, 1, 2, 5, 3, 4)
+    values = [torch.clamp(x, min=0.0) for x in S[:3]]
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    return [
+        values[0] * V[3 * i] * V[3 * j]
+        + values[1] * V[3 * i + 1] * V[3 * j + 1]
+        + values[2] * V[3 * i + 2] * V[3 * j + 2]
+        for i, j in pairs
+    ]
+
+
 def nearest_volume(s: list[Tensor]) -> tuple[list[Tensor], Tensor]:
     """Nearest stretch of unit volume v (3) and multiplier k for s (3).
 

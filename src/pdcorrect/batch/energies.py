@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.decomposition import product, tiny, transposed
+from pdcorrect.batch.decomposition import positive_part, product, tiny, transposed
 from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN
 
 _KINK = 1e-9
@@ -47,14 +47,21 @@ def principal(
 
 
 def tangent(
-    model: int, s: list[Tensor], nearest: Nearest, mu: Tensor, omega: Tensor
+    model: int,
+    s: list[Tensor],
+    nearest: Nearest,
+    mu: Tensor,
+    omega: Tensor,
+    project: bool = False,
 ) -> list[Tensor]:
-    """The tangent (12) in the frame of the SVD.
+    """The tangent (12) in the frame of the SVD; ``project`` raises negative eigenvalues to zero.
 
     The diagonal block 00 11 22 01 02 12; then for the pairs 01 02 12 the factors p and m
     of P_ij = p F_ij + m F_ji.
     """
     T = _corotated(s, nearest, mu, omega) if model == COROTATED else _other(model, s, mu, omega)
+    if project:
+        T = [*positive_part(T[:6]), *(torch.clamp(x, min=0.0) for x in T[6:])]
     for pair in range(3):
         symmetric, antisymmetric = T[6 + pair], T[9 + pair]
         T[6 + pair] = 0.5 * (symmetric + antisymmetric)

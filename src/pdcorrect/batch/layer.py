@@ -38,9 +38,11 @@ from pdcorrect.state import Status
 
 Mode = Literal["unrolled", "checkpointed", "detached"]
 OnFailure = Literal["raise", "zero"]
-Frame = tuple[Tensor, Tensor]
-"""Positions and velocities."""
+Frame = tuple[Tensor, ...]
+"""Positions, velocities and the entries of the memory in the order of their names."""
 _INPUTS = ("positions", "velocities", "forces", *NAMES)
+_CONSTANT = "previous_times"
+"""Of a memory, what has no derivative."""
 
 
 @dataclass(eq=False)
@@ -57,6 +59,8 @@ class _Call:
         Of the steps taken so far.
     failures : list of (int, int)
         Step and scene of each derivative that failed.
+    names : list of tuple of str
+        Of the memory before each step taken so far, and after the last one.
     """
 
     layer: PDLayer
@@ -64,6 +68,12 @@ class _Call:
     times: tuple[float, ...]
     statuses: list[list[Status]] = field(default_factory=list)
     failures: list[tuple[int, int]] = field(default_factory=list)
+    names: list[tuple[str, ...]] = field(default_factory=list)
+
+    def before(self, step: int, frame: Frame) -> BatchState:
+        """The state that a step starts from."""
+        memory = dict(zip(self.names[step], frame[2:], strict=True))
+        return BatchState(frame[0], frame[1], self.times_before(step), memory)
 
     def times_before(self, step: int) -> tuple[float, ...]:
         h = self.layer.stepper.time_step
@@ -132,6 +142,8 @@ class PDLayer(nn.Module):
     failed_derivatives : list of (int, int)
         Step and scene of each derivative that was looked for and not found, in all backward
         passes through the last call.
+    memory : dict of str to (B, N, 3) tensor
+        `State.memory` after the last call, for ``memory`` of the next one.
 
     Notes
     -----
@@ -157,15 +169,11 @@ class PDLayer(nn.Module):
         if on_failure not in ("raise", "zero"):
             raise InputError(f"on_failure = {on_failure!r}: expected raise or zero.")
         check_kind("stepper", stepper, BatchStepper, "a BatchStepper(problems)")
-        if stepper.integrator in ("bdf2", "generalised-alpha"):
-            raise InputError(
-                f"a layer with {stepper.integrator}, which needs a memory: expected "
-                "backward-euler, midpoint or quasi-static."
-            )
         self.stepper, self.steps, self.mode = stepper, whole("steps", steps, 1), mode
         self.on_failure, self.tolerance = on_failure, positive("tolerance", tolerance)
         self.statuses: list[list[Status]] = []
         self.failed_derivatives: list[tuple[int, int]] = []
+        self.memory: dict[str, Tensor] = {}
 
     @property
     def differentiable(self) -> Tensor:
@@ -193,6 +201,7 @@ class PDLayer(nn.Module):
         poisson: Tensor | float | None = None,
         density: Tensor | float | None = None,
         times: Sequence[float] | None = None,
+        memory: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Positions and velocities after the steps.
 
@@ -208,6 +217,9 @@ class PDLayer(nn.Module):
         times : (B,) floats, optional
             At the start, s; 0 by default.  Loads and clamps that change in time need them
             in every call but the first.
+        memory : mapping of str to (B, N, 3) tensors, optional
+            Of the state at the start, as the attribute ``memory`` after the call before; an
+            integrator that has one begins without.
 
         Returns
         -------
@@ -223,9 +235,9 @@ class PDLayer(nn.Module):
             If a scene fails otherwise, unless ``on_failure`` is "zero".
         """
         frame, _ = self._run(
-            positions, velocities, forces, (young, poisson, density), times, keep=False
+            positions, velocities, forces, (young, poisson, density), times, memory, keep=False
         )
-        return frame
+        return frame[0], frame[1]
 
     def trajectory(
         self,
@@ -237,10 +249,11 @@ class PDLayer(nn.Module):
         poisson: Tensor | float | None = None,
         density: Tensor | float | None = None,
         times: Sequence[float] | None = None,
+        memory: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Like `forward`, with all frames: (steps + 1, B, N, 3), frame 0 as given."""
         _, frames = self._run(
-            positions, velocities, forces, (young, poisson, density), times, keep=True
+            positions, velocities, forces, (young, poisson, density), times, memory, keep=True
         )
         out = [torch.stack(parts) for parts in zip(*frames, strict=True)]
         return out[0], out[1]
@@ -252,6 +265,7 @@ class PDLayer(nn.Module):
         forces: Tensor | None,
         material: Sequence[Tensor | float | None],
         times: Sequence[float] | None,
+        memory: Mapping[str, Tensor] | None,
         keep: bool,
     ) -> tuple[Frame, list[Frame]]:
         """The last frame and, if they are to be kept, all."""
@@ -268,7 +282,12 @@ class PDLayer(nn.Module):
             check_material(cells, stepper.problems, values)
         call = _Call(self, values, start_times(cells, times))
         self.statuses, self.failed_derivatives = call.statuses, call.failures
-        frame, frames = (positions, velocities), [(positions, velocities)]
+        given_memory = {name: stepper.batched(x) for name, x in sorted((memory or {}).items())}
+        for name, x in given_memory.items():
+            check_nodal(cells, f"memory {name!r}", x)
+        call.names.append(tuple(given_memory))
+        frame: Frame = (positions, velocities, *given_memory.values())
+        frames = [frame]
         repeated = self.mode == "checkpointed" and torch.is_grad_enabled()
         length = math.isqrt(self.steps - 1) + 1 if repeated else self.steps
         for first in range(0, self.steps, length):
@@ -279,9 +298,11 @@ class PDLayer(nn.Module):
                 new = _segment(*inputs)
             frame = new[-1]
             frames.extend(new if keep else [])
+        frames = [f[:2] for f in frames]
         if single:
-            frames = [(p[0], v[0]) for p, v in frames]
-            frame = (frame[0][0], frame[1][0])
+            frames = [tuple(x[0] for x in f) for f in frames]
+            frame = tuple(x[0] for x in frame)
+        self.memory = dict(zip(call.names[-1], frame[2:], strict=True))
         return frame, frames
 
     def _pushes(self, forces: Tensor | None, single: bool) -> list[Tensor | None]:
@@ -313,8 +334,9 @@ def _segment(
     frames: list[Frame] = []
     for k, push in enumerate(pushes, first):
         if call.layer.mode == "detached" and k:
-            frame = (frame[0].detach(), frame[1].detach())
-        frame = _Step.apply(call, k, *frame, push, *material)  # type: ignore[no-untyped-call]
+            frame = tuple(x.detach() for x in frame)
+        inputs = (frame[0], frame[1], push, *material, *frame[2:])
+        frame = _Step.apply(call, k, *inputs)  # type: ignore[no-untyped-call]
         frames = [*frames, frame] if keep else [frame]
     return frames
 
@@ -324,37 +346,53 @@ class _Step(torch.autograd.Function):
 
     @staticmethod
     def forward(  # type: ignore[no-untyped-def]
-        ctx, call, step, positions, velocities, forces, young, poisson, density
+        ctx, call, step, positions, velocities, forces, young, poisson, density, *memory
     ):
         stepper: BatchStepper = call.layer.stepper
+        before = call.before(step, (positions, velocities, *memory))
         with stepper.using(call.material):
-            result = stepper(BatchState(positions, velocities, call.times_before(step)), forces)
+            result = stepper(before, forces)
         inputs = {"positions": positions, "velocities": velocities, "forces": forces}
         call.stepped(step, result.statuses, inputs)
         after = result.state
+        names = tuple(sorted(after.memory))
+        if step + 1 == len(call.names):
+            call.names.append(names)
         modes = result.y[:, stepper.cells.sizes.nodes :].clone()
         ctx.call, ctx.step, ctx.statuses = call, step, result.statuses
-        ctx.save_for_backward(positions, velocities, forces, after.positions, modes)
-        return after.positions, after.velocities
+        ctx.save_for_backward(positions, velocities, forces, after.positions, modes, *memory)
+        kept = [after.memory[name] for name in names]
+        ctx.mark_non_differentiable(
+            *(x for name, x in zip(names, kept, strict=True) if name == _CONSTANT)
+        )
+        return after.positions, after.velocities, *kept
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx, grad_positions, grad_velocities):  # type: ignore[no-untyped-def]
-        positions, velocities, forces, after, modes = ctx.saved_tensors
+    def backward(ctx, grad_positions, grad_velocities, *grad_memory):  # type: ignore[no-untyped-def]
+        positions, velocities, forces, after, modes, *memory = ctx.saved_tensors
         call, stepper = ctx.call, ctx.call.layer.stepper
-        before = BatchState(positions, velocities, call.times_before(ctx.step))
+        before = call.before(ctx.step, (positions, velocities, *memory))
+        grads = dict(zip(call.names[ctx.step + 1], grad_memory, strict=True))
+        grads = {k: g for k, g in grads.items() if k != _CONSTANT and g is not None}
         with stepper.using(call.material):
             y = stepper.staging.solution(before, after, modes)
             gradients = BatchGradients(
                 stepper, before, Solved(y, ctx.statuses), grad_positions, grad_velocities,
-                forces=forces, tolerance=call.layer.tolerance,
+                grad_memory=grads, forces=forces, tolerance=call.layer.tolerance,
             )  # fmt: skip
         call.differentiated(ctx.step, ctx.statuses, gradients.ok.tolist())
         ok = gradients.ok[:, None, None]
-        found = []
-        for name, needed in zip(_INPUTS, ctx.needs_input_grad[2:], strict=True):
-            grad = getattr(gradients, name) if needed else None
-            if grad is not None:
-                grad = torch.where(ok if grad.ndim == 3 else ok[:, 0], grad, 0.0)
-            found.append(grad)
-        return None, None, *found
+        by_memory = gradients.memory
+        found = [
+            getattr(gradients, name) if needed else None
+            for name, needed in zip(_INPUTS, ctx.needs_input_grad[2:], strict=False)
+        ]
+        needed = ctx.needs_input_grad[2 + len(_INPUTS) :]
+        pairs = zip(call.names[ctx.step], needed, strict=True)
+        found += [by_memory[name] if wanted else None for name, wanted in pairs]
+        out = [
+            None if g is None else torch.where(ok if g.ndim == 3 else ok[:, 0], g, 0.0)
+            for g in found
+        ]
+        return None, None, *out

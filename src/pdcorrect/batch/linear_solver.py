@@ -9,8 +9,13 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.gpu import Recorder, as_kernel
-from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement
-from pdcorrect.batch.points import Tangent
+from pdcorrect.batch.objective import (
+    BatchObjective,
+    Tangents,
+    by_scene,
+    dot,
+    largest_displacement,
+)
 
 
 class BatchConjugateGradients:
@@ -45,7 +50,7 @@ class BatchConjugateGradients:
         self._tolerance, self._share, self._settled = rest.new_zeros(3)
         self._busy = torch.zeros((), dtype=torch.bool, device=rest.device)
         self.steps = 0
-        self._tangent: Tangent
+        self._tangent: Tangents
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._next)
 
@@ -103,7 +108,7 @@ class BatchConjugateGradients:
         return self.hessian(x) * self._objective.free
 
     def _set_up(self) -> None:
-        self._tangent = self._objective.cells.linearise(self._y)
+        self._tangent = self._objective.linearise(self._y)
         self._r.copy_(self._b - self._product(self.x))
         z = self._precondition(self._r)
         self._d.copy_(z)

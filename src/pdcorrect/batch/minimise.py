@@ -214,6 +214,7 @@ class BatchMinimiser:
         self.phase, self.iterations, self.evaluations, self._tried = counters
         self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
         self._left = torch.zeros(2, dtype=torch.int64, device=rest.device)
+        self._unmoved = torch.full((), NO_MOTION, dtype=rest.dtype, device=rest.device)
         self._narrows = rest.device.type == "cpu" and scenes >= _FEW
         self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
@@ -223,8 +224,12 @@ class BatchMinimiser:
         self._advance = recorder(self._next)
         self._judge = recorder(self._conclude)
 
-    def run(self, start: Tensor, alive: Tensor) -> None:
-        """Minimise from ``start`` (B, U, 3) the scenes where ``alive`` (B,) holds."""
+    def run(self, start: Tensor, alive: Tensor, unmoved: float = NO_MOTION) -> None:
+        """Minimise from ``start`` (B, U, 3) the scenes where ``alive`` (B,) holds.
+
+        ``unmoved`` is the share of the tolerance within which a start is accepted as it is.
+        """
+        self._unmoved.fill_(unmoved)
         self._start.copy_(start)
         self._alive.copy_(alive)
         self._begin()
@@ -254,6 +259,7 @@ class BatchMinimiser:
         inverse = self._inverse.narrowed(objective.cells, rows)
         history = self._history.narrowed(rows)
         part = BatchMinimiser(objective, inverse, self._tolerance[rows], self._most, history)
+        part._unmoved.copy_(self._unmoved)
         for name in (*_OUTCOME, *_PROGRESS):
             getattr(part, name).copy_(getattr(self, name)[rows])
         part._look()
@@ -261,6 +267,11 @@ class BatchMinimiser:
         for name in _OUTCOME:
             getattr(self, name)[rows] = getattr(part, name)
         self._look()
+
+    @property
+    def start(self) -> Tensor:
+        """Where the last run began, (B, U, 3); the next one overwrites it."""
+        return self._start
 
     def forget(self) -> None:
         """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
@@ -371,7 +382,7 @@ class BatchMinimiser:
         waiting, sure = self.phase == Phase.WAITING, self.linear_solver.converged
         newton = self.linear_solver.x
         estimate = torch.where(sure, largest_displacement(newton), math.inf)
-        limit = torch.where(self.iterations > 0, 1.0, NO_MOTION) * self._tolerance
+        limit = torch.where(self.iterations > 0, 1.0, self._unmoved) * self._tolerance
         done = waiting & (estimate <= limit)
         again = waiting & ~done
         ratio = (0.5 * self._tolerance / estimate).clamp(0.05, 0.5)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from pdcorrect.batch import viscosity
 from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.gpu import as_kernel, small_products
+from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.shared_matrices import with_rows
+from pdcorrect.batch.viscosity import ViscousTangent
+from pdcorrect.scene import Damping
 
 
 class BatchMass:
@@ -43,7 +49,7 @@ class BatchMass:
         rows = self._blocks.sum(dim=-1) * self.density[..., None]
         self.nodal[:, : self._cells.sizes.nodes] = self._cells.summed_numbers(rows)
 
-    def __call__(self, x: Tensor, factor: float = 1.0) -> Tensor:
+    def __call__(self, x: Tensor, factor: Tensor | float = 1.0) -> Tensor:
         """A multiple of M x."""
         if self._diagonal:
             return (factor * self.nodal)[..., None] * x
@@ -71,6 +77,13 @@ class BatchMass:
         return torch.nn.functional.pad(local, (0, 0, 0, missing))
 
 
+class Tangents(NamedTuple):
+    """Of the elastic energy and of viscosity, if there is any, at the same configurations."""
+
+    elastic: Tangent
+    viscous: ViscousTangent | None
+
+
 class BatchObjective:
     """gamma of B steps; what a step depends on is copied into fixed tensors.
 
@@ -78,33 +91,51 @@ class BatchObjective:
 
     Attributes
     ----------
-    inertia, damping : float
-        c and d alpha, 1/s2.
+    factors : (4,)
+        c and d alpha, 1/s2; d beta; the strain rate's factor times the viscosity.
+    damped, stiff, viscous : bool
+        Whether the last three are not zero, now and later.
     free : (B, U, 3)
         1 where a component may move.
     target, origin, forces : (B, U, 3)
         q, o (m) and the external forces (N).
+    tangent : Tangent or None
+        Where damping by stiffness is taken.
+    before : (6, B C, Q)
+        The stretches from which those of viscosity are counted.
     """
 
-    def __init__(self, cells: CellBatch) -> None:
+    def __init__(self, cells: CellBatch, damping: Damping) -> None:
         self.cells = cells
         self.mass = BatchMass(cells)
-        self.inertia = self.damping = 0.0
+        self.factors = cells.rest.new_zeros(4)
+        self.damped, self.stiff = damping.mass > 0.0, damping.stiffness > 0.0
+        self.viscous = damping.viscosity > 0.0
         free = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
         self.free = cells.repeated_configurations(free)
         self.target, self.origin, self.forces = (torch.zeros_like(cells.rest) for _ in range(3))
+        points = cells.volumes.shape[1:]
+        self.tangent: Tangent | None = None
+        if self.stiff:
+            U, V, T = (cells.rest.new_zeros(k, *points) for k in (9, 9, 12))
+            self.tangent = U, V, T
+        self.before = cells.rest.new_zeros(6 if self.viscous else 0, *points)
 
     def narrowed(self, rows: Tensor) -> BatchObjective:
         """Of some scenes, as it is now."""
         cells = self.cells.narrowed(rows)
         mass = self.mass.narrowed(cells, rows)
         names = ("free", "target", "origin", "forces")
-        return with_rows(self, rows, *names, cells=cells, mass=mass)
+        return with_rows(
+            self, rows, *names, cells=cells, mass=mass,
+            tangent=self.tangent and tuple(self.cells.of_scenes(x, rows) for x in self.tangent),
+            before=self.cells.of_scenes(self.before, rows),
+        )  # fmt: skip
 
     @property
-    def factors(self) -> tuple[float, float]:
-        """On mass and on stiffness in the Hessian."""
-        return self.inertia + self.damping, 1.0
+    def inertia(self) -> Tensor:
+        """c, 1/s2."""
+        return self.factors[0]
 
     def __call__(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""
@@ -116,17 +147,54 @@ class BatchObjective:
         )
         kinetic, work = by_node.sum(dim=-1)
         value, scale = energy + kinetic - work, energy + kinetic + work.abs()
-        if self.damping:
+        if self.damped or self.stiff:
             offset = y - self.origin
-            drag = self.mass(offset, self.damping)
+            drag = self.rayleigh(offset)
             loss = 0.5 * dot(offset, drag)
+            value, scale, gradient = value + loss, scale + loss, gradient + drag * self.free
+        if self.viscous:
+            loss, drag = self._viscous(y)
             value, scale, gradient = value + loss, scale + loss, gradient + drag * self.free
         return value, gradient, scale
 
-    def hessian(self, tangent: tuple[Tensor, Tensor, Tensor], x: Tensor) -> Tensor:
-        """H x on all components, for a tangent of the cells."""
-        out = self.cells.apply(tangent, x)
-        return out + self.mass(x, self.inertia + self.damping) if self.inertia else out
+    def rayleigh(self, x: Tensor) -> Tensor:
+        """Rayleigh damping's second derivative times x (B, U, 3)."""
+        out = self.mass(x, self.factors[1]) if self.damped else torch.zeros_like(x)
+        if self.tangent is None:
+            return out
+        return out + self.factors[2] * self.cells.apply(self.tangent, x)
+
+    def viscous_stress(self, S: Tensor) -> Tensor:
+        """See `viscosity.stress`, for stretches S (6, B C, Q)."""
+        return viscosity.stress(S - self.before, self._viscous_weights)
+
+    def _viscous(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        S, frames = viscosity.stretches(self.cells, y)
+        stress = self.viscous_stress(S)
+        energy = viscosity.energies(self.cells, S - self.before, stress)
+        return energy, viscosity.forces(self.cells, frames, stress)
+
+    @property
+    def _viscous_weights(self) -> Tensor:
+        return self.factors[3] * self.cells.point_weights
+
+    def linearise(self, y: Tensor) -> Tangents:
+        """What `hessian` needs at configurations."""
+        if not self.viscous:
+            return Tangents(self.cells.linearise(y), None)
+        S, frames = viscosity.stretches(self.cells, y)
+        viscous = ViscousTangent(frames, self.viscous_stress(S), self._viscous_weights)
+        return Tangents(self.cells.linearise(y), viscous)
+
+    def hessian(self, tangents: Tangents, x: Tensor) -> Tensor:
+        """H x on all components."""
+        out = self.cells.apply(tangents.elastic, x)
+        out = out + self.mass(x, self.factors[0] + self.factors[1])
+        if self.tangent is not None:
+            out = out + self.factors[2] * self.cells.apply(self.tangent, x)
+        if tangents.viscous is not None:
+            out = out + viscosity.apply(self.cells, tangents.viscous, x)
+        return out
 
 
 def largest_displacement(x: Tensor) -> Tensor:

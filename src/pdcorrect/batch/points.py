@@ -40,21 +40,21 @@ class Points:
 
     def stress(self, H: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Psi (C, Q) and P (9, C, Q) for H (9, C, Q) and the weights of both terms (2, C, Q)."""
-        U, s, V = _computed(_decompose, [H], (9, 3, 9))
+        U, s, V = computed(_decompose, [H], (9, 3, 9))
         known = [U, s, V, weights, *self._nearest(s)]
-        density, P = _computed(_stress(self._model), known, (1, 9), cell_by_cell=True)
+        density, P = computed(_stress(self._model), known, (1, 9), cell_by_cell=True)
         return density[0], P
 
-    def tangent(self, H: Tensor, weights: Tensor) -> Tangent:
-        """The derivative of P."""
-        U, s, V = _computed(_decompose, [H], (9, 3, 9))
+    def tangent(self, H: Tensor, weights: Tensor, project: bool = False) -> Tangent:
+        """The derivative of P; ``project`` makes it positive semi-definite."""
+        U, s, V = computed(_decompose, [H], (9, 3, 9))
         known = [s, weights, *self._nearest(s)]
-        (T,) = _computed(_tangent(self._model), known, (12,))
+        (T,) = computed(_tangent(self._model, project), known, (12,))
         return U, V, T
 
     def product(self, tangent: Tangent, D: Tensor) -> Tensor:
         """Tangent times D (9, C, Q)."""
-        (out,) = _computed(_product, [*tangent, D], (9,), cell_by_cell=True)
+        (out,) = computed(_product, [*tangent, D], (9,), cell_by_cell=True)
         return out
 
     def rotations(self, F: Tensor, moved: bool = False) -> Tensor:
@@ -67,12 +67,12 @@ class Points:
             Whether F is the gradient H of a displacement.
         """
         finite = torch.nan_to_num(F)[..., None]
-        (R,) = _computed(_rotation_of_moved if moved else _rotation, [finite], (9,))
+        (R,) = computed(_rotation_of_moved if moved else _rotation, [finite], (9,))
         return R[..., 0]
 
     def volume_ratios(self, H: Tensor) -> Tensor:
         """Det F (C, Q) of H (9, C, Q)."""
-        (out,) = _computed(_volume_ratio, [H], (1,))
+        (out,) = computed(_volume_ratio, [H], (1,))
         return out[0]
 
     def _nearest(self, s: Tensor) -> list[Tensor]:
@@ -84,14 +84,14 @@ class Points:
         if self._model != COROTATED or self._first >= self._points:
             return []
         if not self._first:
-            return _computed(_nearest, [s], (3, 1))
+            return computed(_nearest, [s], (3, 1))
         v, k = torch.ones_like(s), torch.zeros_like(s[:1])
-        found = _computed(_nearest, [s[..., self._first :]], (3, 1))
+        found = computed(_nearest, [s[..., self._first :]], (3, 1))
         v[..., self._first :], k[..., self._first :] = found
         return [v, k]
 
 
-def _computed(
+def computed(
     function: PointFunction, inputs: list[Tensor], sizes: Sequence[int], cell_by_cell: bool = False
 ) -> list[Tensor]:
     """Results (k, C, Q) of ``sizes`` k; in memory (C, k, Q) if ``cell_by_cell``."""
@@ -113,22 +113,22 @@ def _room(x: Tensor, sizes: Sequence[int], cell_by_cell: bool) -> list[Tensor]:
     return [x.new_empty(k, cells, points) for k in sizes]
 
 
-def _moved(H: Components) -> Components:
+def moved(H: Components) -> Components:
     """F = I + H."""
     return [h + 1.0 if i in (0, 4, 8) else h for i, h in enumerate(H)]
 
 
 def _volume_ratio(H: Components) -> list[Components]:
-    a, b, c, d, e, f, g, h, i = _moved(H)
+    a, b, c, d, e, f, g, h, i = moved(H)
     return [[a * (e * i - f * h) + b * (f * g - d * i) + c * (d * h - e * g)]]
 
 
 def _decompose(H: Components) -> tuple[Components, Components, Components]:
-    return signed_svd(_moved(H))
+    return signed_svd(moved(H))
 
 
 def _rotation_of_moved(H: Components) -> list[Components]:
-    return _rotation(_moved(H))
+    return _rotation(moved(H))
 
 
 def _rotation(F: Components) -> list[Components]:
@@ -148,8 +148,8 @@ def _stress(model: int) -> PointFunction:
 
 
 @cache
-def _tangent(model: int) -> PointFunction:
-    return partial(_tangent_of, model)
+def _tangent(model: int, project: bool) -> PointFunction:
+    return partial(_tangent_of, model, project)
 
 
 def _stress_of(
@@ -167,9 +167,10 @@ def _stress_of(
 
 
 def _tangent_of(
-    model: int, s: Components, weights: Components, *nearest: Components
+    model: int, project: bool, s: Components, weights: Components, *nearest: Components
 ) -> list[Components]:
-    return [energies.tangent(model, s, _pair(nearest), *weights)]
+    mu, omega = weights
+    return [energies.tangent(model, s, _pair(nearest), mu, omega, project)]
 
 
 def _pair(nearest: Sequence[Components]) -> energies.Nearest:

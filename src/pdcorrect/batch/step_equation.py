@@ -38,8 +38,12 @@ class BatchStepEquation:
         What the scheme's sums are of, see `Scheme`.
     spans : sequence of (float, float)
         Time intervals over which each scene's loads act, s.
-    target, origin : (B, U, 3)
-        q and o, m; not changed later.
+    target : (B, U, 3)
+        q, m; not changed later.
+    origin, start : (B, N, 3)
+        O and the first iterate, m; the latter prescribed where clamped.
+    strains : list of (float, (B, N, 3))
+        See `Scheme`.
     """
 
     scheme: Scheme
@@ -47,6 +51,8 @@ class BatchStepEquation:
     spans: Spans
     target: Tensor
     origin: Tensor
+    start: Tensor
+    strains: list[tuple[float, Tensor]]
 
 
 class BatchStaging:
@@ -89,7 +95,9 @@ class BatchStaging:
             known,
             [(t + first * h, t + last * h) for t in state.times],
             self.extended(self._split(known, scheme.target, scheme.clamped_target)),
-            self.extended(self._split(known, scheme.origin, scheme.clamped_origin)),
+            self._split(known, scheme.origin, scheme.clamped_origin),
+            self._split(known, scheme.start, scheme.clamped),
+            [(a, x(known)) for a, x in scheme.strains],
         )
 
     def start(self, stage: BatchStepEquation, guess: Tensor | None = None) -> Tensor:
@@ -98,7 +106,7 @@ class BatchStaging:
         Where positions after the step are ``guess`` (B, N, 3), in scenes where it is finite.
         """
         scheme = stage.scheme
-        nodal = self._split(stage.known, scheme.start, scheme.clamped)
+        nodal = stage.start
         if guess is not None:
             y = nodal_solution(scheme, stage.known["positions"], guess)
             usable = torch.isfinite(y).all(dim=2, keepdim=True).all(dim=1, keepdim=True)

@@ -28,18 +28,23 @@ from pdcorrect.batch.checks import (
 )
 from pdcorrect.batch.elimination import alike_cells
 from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
+from pdcorrect.batch.follower import settle
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
+from pdcorrect.batch.modes import relaxed
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
+from pdcorrect.batch.viscosity import stretches
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers import schemes
 from pdcorrect.solvers.implicit import positive, whole
 from pdcorrect.solvers.integrators import integrator as make_integrator
+from pdcorrect.solvers.schemes import Scheme
 from pdcorrect.state import State, Status
 
 Array = NDArray[np.float64]
@@ -124,13 +129,16 @@ class BatchStepper:
         )
         self.time_step = positive("time_step", first.time_step if time_step is None else time_step)
         self.integrator = time.integrator if integrator is None else integrator
-        self.integrate = make_integrator(self.integrator, time.spectral_radius)
+        damping = first.scene.damping
+        self.integrate = make_integrator(
+            self.integrator, time.spectral_radius, damping.viscosity > 0.0
+        )
         self.first_hessian = chosen(first_hessian, self.problems)
         self._storage, self._recover = storage, recover
         self._most = whole("max_iterations", max_iterations, 1)
         self.cells = CellBatch(self.problems, usable_device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
-        self.objective = BatchObjective(self.cells)
+        self.objective = BatchObjective(self.cells, damping)
         self._own = self._material = own_material(self.cells)
         self._write(self._own)
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
@@ -292,6 +300,10 @@ class BatchStepper:
         values = (m[i, :count].to("cpu", torch.float64).numpy() for m in self.material)
         return problem.with_material(*values)
 
+    def initial_state(self) -> BatchState:
+        """All scenes at time zero with their initial velocities."""
+        return self.state([p.initial_state() for p in self.problems])
+
     # --- a step ---------------------------------------------------------------------------
 
     def __call__(
@@ -322,10 +334,15 @@ class BatchStepper:
         start = self.staging.start(stage, guess)
         alive = torch.isfinite(start).all(dim=2).all(dim=1) & self._material.sound
         minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
-        y = minimiser.y.clone()  # the next step overwrites it
+        m = minimiser
+        found = m.y.clone(), m.phase, m.iterations, m.evaluations, m.estimate  # y is overwritten
+        if self.loads.follow:
+            nodes = self.cells.sizes.nodes
+            found = settle(m, alive, lambda y: self._push(stage, forces, y[:, :nodes]))
+        y, phase, iterations, evaluations, estimate = found
         after = self.staging.finish(stage, y, state)
         ratios = self.cells.smallest_volume_ratios(after.positions).to("cpu", torch.float64).numpy()
-        statuses = [_STATUSES[Phase(p)] for p in minimiser.phase.tolist()]
+        statuses = [_STATUSES[Phase(p)] for p in phase.tolist()]
         return BatchResult(
             y,
             [
@@ -333,38 +350,72 @@ class BatchStepper:
                 for s, ratio in zip(statuses, ratios, strict=True)
             ],
             after,
-            minimiser.iterations.cpu().numpy().copy(),
-            minimiser.evaluations.cpu().numpy().copy(),
-            minimiser.estimate.to("cpu", torch.float64).numpy() * stage.scheme.gain,
+            iterations.cpu().numpy().copy(),
+            evaluations.cpu().numpy().copy(),
+            estimate.to("cpu", torch.float64).numpy() * stage.scheme.gain,
             ratios,
         )
 
-    def prepare(self, state: BatchState, forces: Tensor | None = None) -> BatchStepEquation:
-        """Set up the step's objective and first Hessian."""
+    def prepare(
+        self, state: BatchState, forces: Tensor | None = None, y: Tensor | None = None
+    ) -> BatchStepEquation:
+        """Set up the step's objective and first Hessian.
+
+        Loads that follow the body are sampled at ``y`` (B, U, 3), or where the step is expected
+        to lead.
+        """
         check_state(self.cells, state)
         if forces is not None:
             check_nodal(self.cells, "forces", forces)
         stage, objective = self.staging(state), self.objective
-        scheme = stage.scheme
-        factors = (objective.inertia, objective.damping)
-        objective.inertia = scheme.inertia
-        objective.damping = scheme.rate * self.problems[0].scene.damping.mass
+        objective.factors.copy_(self.cells.tensor(np.array(self._factors(stage.scheme))))
         objective.target.copy_(stage.target)
-        if objective.damping:
-            objective.origin.copy_(stage.origin)
-        total = self.loads(stage.spans, state.positions)
-        objective.forces.copy_(total if forces is None else total + self.staging.extended(forces))
-        if self._minimiser is None or factors != (objective.inertia, objective.damping):
-            self._make_minimiser(scheme.gain)
+        self._damp(stage)
+        self._push(stage, forces, stage.start if y is None else y[:, : self.cells.sizes.nodes])
+        if self._minimiser is None:
+            self._make_minimiser()
         return stage
 
-    def _make_minimiser(self, gain: float) -> None:
-        self._minimiser = self._inverse = None  # whose memory is needed
+    def _factors(self, scheme: Scheme) -> tuple[float, float, float, float]:
+        """See `BatchObjective`."""
+        damping = self.problems[0].scene.damping
+        return (
+            scheme.inertia,
+            scheme.rate * damping.mass,
+            scheme.rate * damping.stiffness,
+            scheme.strain_rate * damping.viscosity,
+        )
+
+    def _push(self, stage: BatchStepEquation, forces: Tensor | None, positions: Tensor) -> None:
+        total = self.loads(stage.spans, positions)
+        extra = 0.0 if forces is None else self.staging.extended(forces)
+        self.objective.forces.copy_(total + extra)
+
+    def _damp(self, stage: BatchStepEquation) -> None:
+        objective, cells = self.objective, self.cells
+        if objective.tangent is not None:
+            tangent = cells.linearise(relaxed(cells, stage.start), project=True)
+            for kept, new in zip(objective.tangent, tangent, strict=True):
+                kept.copy_(new)
+            objective.origin.copy_(relaxed(cells, stage.origin))
+        elif objective.damped:
+            objective.origin.copy_(self.staging.extended(stage.origin))
+        if objective.viscous:
+            objective.before.zero_()
+            for a, place in stage.strains:
+                objective.before.add_(stretches(cells, relaxed(cells, place))[0], alpha=a)
+
+    def _make_minimiser(self) -> None:
+        """With the first Hessian of a step that goes on, which serves a run's first steps too."""
+        scheme = self.integrate.scheme_of(self.time_step, schemes.WHOLE_MEMORY)
+        inertia, drag, stiffness, viscosity = self._factors(scheme)
+        factors = inertia + drag, 1.0 + stiffness + viscosity
         self._inverse = FirstHessian(
-            self.cells, self.problems, self.objective.factors, self.first_hessian, self._storage
+            self.cells, self.problems, factors, self.first_hessian, self._storage
         )
         pairs = zip(self.tolerances, self.problems, strict=True)
-        sizes = np.array([tolerance * p.cell_size / gain for tolerance, p in pairs])
+        half = 0.5 if self.loads.follow else 1.0  # the rest is for loads, see `settle`
+        sizes = np.array([half * tolerance * p.cell_size / scheme.gain for tolerance, p in pairs])
         self._minimiser = BatchMinimiser(
             self.objective, self._inverse, self.cells.tensor(sizes), self._most
         )

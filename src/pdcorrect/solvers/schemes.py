@@ -174,6 +174,8 @@ HISTORY = {
     "strained", "strained_before",
 }  # fmt: skip
 """Entries of a memory that are of use only to a step as long as the last one."""
+WHOLE_MEMORY = frozenset(HISTORY | {"accelerations"})
+"""All entries that any scheme uses."""
 _TIME = Linear(time=1.0)
 
 

@@ -1,0 +1,165 @@
+"""What damping adds to a batch's derivatives: `pdcorrect.solvers.adjoint_terms` for B scenes."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch import viscosity
+from pdcorrect.batch.modes import Following, relaxed
+from pdcorrect.batch.objective import dot
+from pdcorrect.batch.step_equation import BatchStepEquation
+from pdcorrect.batch.stepper import BatchStepper
+
+_STEP = {torch.float64: 1e-4, torch.float32: 1e-2}
+"""Of a deformation gradient's entry, for differences of fourth order of projected tangents."""
+_PLACES, _FACTORS = (1, -1, 2, -2), (8.0, -8.0, -1.0, 1.0)
+
+
+class DampingTerms:
+    """- x . (damping force at y) of the step that was prepared last, by what it starts from.
+
+    Parameters
+    ----------
+    stepper : BatchStepper
+    stage : BatchStepEquation
+    y, x : (B, U, 3)
+        The solution and the adjoint state.
+    """
+
+    def __init__(
+        self, stepper: BatchStepper, stage: BatchStepEquation, y: Tensor, x: Tensor
+    ) -> None:
+        objective = stepper.objective
+        self._stepper, self._cells, self._x = stepper, stepper.cells, x
+        self._stiff, self._viscous = objective.stiff, objective.viscous
+        self.has_rayleigh = objective.damped or objective.stiff
+        _, _, self._stiffness, self._rate = objective.factors.clone()
+        if self.has_rayleigh:
+            self._origin = objective.origin.clone()
+            self._offset = y - self._origin
+            self._by_origin = objective.rayleigh(x)
+        if objective.tangent is not None:
+            self._at = relaxed(self._cells, stage.start)
+            self._along = self._cells.apply(objective.tangent, self._offset)
+        if self._viscous:
+            S, frames = viscosity.stretches(self._cells, y)
+            self._change = S - objective.before
+            self._rates = viscosity.rates(self._cells, frames, x)
+            weights = self._rate * self._cells.point_weights
+            self._stress = viscosity.stress(self._rates, weights)
+            self._strains = [(a, relaxed(self._cells, place)) for a, place in stage.strains]
+
+    @cached_property
+    def origin(self) -> Tensor:
+        """By o, with its modes in equilibrium, (B, N, 3)."""
+        if not self._stiff:
+            return self._by_origin[:, : self._cells.sizes.nodes]
+        return Following(self._cells, self._origin).reduced(self._by_origin)
+
+    @cached_property
+    def place(self) -> Tensor:
+        """By where the stiffness is taken, with its modes in equilibrium, (B, N, 3)."""
+        if not self._stiff:
+            return torch.zeros_like(self._x[:, : self._cells.sizes.nodes])
+        return Following(self._cells, self._at).reduced(self._by_place)
+
+    @cached_property
+    def places(self) -> list[Tensor]:
+        """By each of the earlier positions that stretches are of, (B, N, 3)."""
+        if not self._viscous:
+            return []
+        return [
+            Following(self._cells, place).reduced(slope)
+            for (_, place), slope in zip(self._strains, self._by_strains, strict=True)
+        ]
+
+    @cached_property
+    def weights(self) -> tuple[Tensor, Tensor]:
+        """By mu and omega, each (B, C)."""
+        nothing = self._x.new_zeros(self._cells.sizes.scenes, self._cells.sizes.cells)
+        total = [nothing, nothing]
+        if self._viscous:
+            slopes = viscosity.stress_slopes(self._cells, self._change, self._rates)
+            total = [-self._rate * slope for slope in slopes]
+            for (_, place), slope in zip(self._strains, self._by_strains, strict=True):
+                total = self._with_modes(total, place, slope)
+        if self._stiff:
+            by_weights = self._tangent_slopes[1:]
+            total = [a - self._stiffness * b for a, b in zip(total, by_weights, strict=True)]
+            total = self._with_modes(total, self._at, self._by_place)
+            total = self._with_modes(total, self._origin, self._by_origin)
+        return total[0], total[1]
+
+    def _with_modes(self, total: list[Tensor], y: Tensor, slope: Tensor) -> list[Tensor]:
+        """Plus what the modes at y, which depend on the material, add."""
+        modes = Following(self._cells, y).response(slope)
+        more = self._cells.weight_slopes(y, -modes)
+        return [a + b for a, b in zip(total, more, strict=True)]
+
+    @property
+    def by_viscosity(self) -> Tensor:
+        """By the strain rate's factor times the viscosity, (B,)."""
+        if not self._viscous:
+            return self._x.new_zeros(len(self._x))
+        return -2.0 / self._rate * viscosity.energies(self._cells, self._change, self._stress)
+
+    @property
+    def by_mass(self) -> Tensor:
+        """By d alpha, (B,)."""
+        if not self.has_rayleigh:
+            return self._x.new_zeros(len(self._x))
+        return -dot(self._x, self._stepper.objective.mass(self._offset))
+
+    @property
+    def by_stiffness(self) -> Tensor:
+        """By d beta, (B,)."""
+        if not self._stiff:
+            return self._x.new_zeros(len(self._x))
+        return -dot(self._x, self._along)
+
+    @cached_property
+    def _by_strains(self) -> list[Tensor]:
+        """By the configurations there."""
+        found = []
+        for a, place in self._strains:
+            _, frames = viscosity.stretches(self._cells, place)
+            found.append(a * viscosity.forces(self._cells, frames, self._stress))
+        return found
+
+    @cached_property
+    def _by_place(self) -> Tensor:
+        return -self._stiffness * self._tangent_slopes[0]
+
+    @cached_property
+    def _tangent_slopes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Derivatives of x . K (y - o) by the configuration (B, U, 3), mu and omega (B, C)."""
+        cells = self._cells
+        H = cells.gradients(self._at - cells.rest)
+        D, E = cells.gradients(self._x), cells.gradients(self._offset)
+
+        def product(H: Tensor, weights: Tensor) -> Tensor:
+            tangent = cells.points.tangent(H, weights, project=True)
+            return (D * cells.points.product(tangent, E)).sum(dim=0)
+
+        step, slope = _STEP[H.dtype], torch.empty_like(H)
+        for i in range(9):
+            unit = torch.zeros_like(H)
+            unit[i] = step
+            slope[i] = self._difference(lambda t, e=unit: product(H + t * e, cells.point_weights))
+        n, found = cells.sizes, []
+        for term in (0, 1):
+            unit = torch.zeros_like(cells.point_weights)
+            unit[term] = step * (cells.point_weights[term] + cells.volumes[term])
+            change = self._difference(lambda t, e=unit: product(H, cells.point_weights + t * e))
+            share = torch.where(unit[term] > 0.0, cells.volumes[term] / unit[term], 0.0)
+            found.append((change * share).reshape(n.scenes, n.cells, n.points).sum(dim=2))
+        return cells.gathered(slope / step), found[0], found[1]
+
+    @staticmethod
+    def _difference(function) -> Tensor:  # type: ignore[no-untyped-def]
+        """Derivative at 0 of a function of t by central differences of fourth order."""
+        terms = [c * function(t) for t, c in zip(_PLACES, _FACTORS, strict=True)]
+        return torch.stack(terms).sum(dim=0) / 12.0
