@@ -1,11 +1,15 @@
 """What every element must satisfy, on cells that no grid gives."""
 
+import warnings
+
 import numpy as np
 import pytest
+import scipy.sparse.linalg as spla
 
 import pdcorrect as pc
 from block_meshes import o_grid, spokes, warped
 from conftest import (
+    CLAMPED,
     ELEMENTS,
     GRAVITY,
     beam,
@@ -16,7 +20,7 @@ from conftest import (
     problem_on,
     rotation,
 )
-from pdcorrect.errors import SceneError
+from pdcorrect.errors import PdcorrectWarning, SceneError
 
 WITH_MODES = ("hex8-bubble", "hex8-bubble-mean", "hex8-enhanced")
 every_element = pytest.mark.parametrize("element", ELEMENTS)
@@ -201,6 +205,112 @@ def test_one_mode_a_cell_is_stiff_in_volume(element):
         values = np.linalg.eigvalsh(problem.stiffness(problem.positions).toarray())
         stiff[kind] = int((values > 30 * problem.materials.mu[0] * problem.cell_size).sum())
     assert stiff == {"hex8": 7, element: 1}
+
+
+# --- bending and volume of the best element --------------------------------------------------
+
+FEET = [
+    {"region": {"plane": "x", "at": "min"}, "components": ["x"]},
+    {"region": {"nodes": [0]}, "components": ["y", "z"]},
+]
+"""A section that may contract, held against sliding; in `standing` against turning too."""
+
+
+def standing(across, poisson, plane, element):
+    """A beam of cubic cells, ten times as long as thick; ``plane``: in plane strain."""
+    wide = 1 if plane else across
+    corner = {"region": {"box": [[0, wide, 0], [0, wide, 0]]}, "components": ["z"]}
+    strip = {"region": {"box": [[0, 0, 0], [99, 99, 99]]}, "components": ["y"]}
+    clamps = [*FEET, strip if plane else corner]
+    body = {"cells": [10 * across, wide, across], "cell_size": 1.0}
+    return pc.discretise(beam(poisson=poisson, body=body, clamps=clamps), element=element)
+
+
+def deflection(problem):
+    """Of the end under the beam's own weight in small strain, m."""
+    free = np.flatnonzero(problem.free)
+    K = problem.stiffness(problem.positions)[free][:, free].tocsc()
+    u = np.zeros(problem.free.size)
+    u[free] = spla.spsolve(K, problem.external_forces(0.0).ravel()[free])
+    x = problem.positions[:, 0]
+    return -u.reshape(-1, 3)[x == x.max(), 2].mean()
+
+
+def timoshenko(across, poisson, plane):
+    """The same by beam theory, with Cowper's shear coefficient; plane strain's modulus."""
+    young, length, h = 1e6, 10.0 * across, float(across)
+    shear, k = young / (2 * (1 + poisson)), 10 * (1 + poisson) / (12 + 11 * poisson)
+    if plane:
+        young, k = young / (1 - poisson**2), 5 / 6
+    return 9810 * (12 * length**4 / (8 * young * h**2) + length**2 / (2 * k * shear))
+
+
+@pytest.mark.parametrize("plane", [False, True], ids=["beam", "plane strain"])
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.49, 0.4999])
+@pytest.mark.parametrize("across", [1, 2, 3])
+def test_the_best_element_bends_as_beam_theory_says_and_does_not_lock(across, poisson, plane):
+    found = deflection(standing(across, poisson, plane, "hex8-enhanced"))
+    assert found == pytest.approx(timoshenko(across, poisson, plane), rel=0.02)
+
+
+def test_the_volume_term_of_the_best_element_is_of_second_order_in_small_strain():
+    """Its points have the moments of the cell's own linear functions, on distorted cells too."""
+    problem = problem_on(MESHES["random"](), "hex8-enhanced")
+    q = problem.quadrature
+    first, volume = q.first_volume, q.weights.sum(axis=1)
+    gauss = problem.space._basis.quadrature[0].T
+    linear = np.concatenate([np.ones((8, 1)), gauss], axis=1)  # (Q, 4)
+    w, v = q.weights[:, :first], q.volume_weights[:, first:]
+    shares = problem.space.volume_shares()
+    at = np.einsum("cq,cqp,qi->cpi", w, shares, linear) / v[..., None]
+    mine = np.einsum("cp,cpi,cpj->cij", v, at, at)
+    cell = np.einsum("cq,qi,qj->cij", w, linear, linear)
+    np.testing.assert_allclose(mine, cell, atol=1e-13 * volume.max())
+
+
+def test_large_bending_of_one_layer_of_cells_is_that_of_many():
+    """A cantilever bent far by its own weight."""
+    weight = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
+    material, time = {"young": 5e4, "poisson": 0.4}, {"integrator": "quasi-static", "frames": 1}
+    scene = beam((16, 1, 1), 0.05, material=material, time=time, loads=weight)
+    tips = {}
+    for element, refine in (("hex8-enhanced", 1), ("hex27", 2)):
+        problem = pc.discretise(scene, refine, element=element)
+        run = pc.rollout(pc.Newton(problem), 1)
+        end = problem.positions[:, 0] > 0.8 - 1e-9
+        tips[element] = (run.positions[-1] - problem.positions)[end].mean(axis=0)
+    assert -tips["hex27"][2] > 0.4
+    distance = np.linalg.norm(tips["hex8-enhanced"] - tips["hex27"])
+    assert distance < 0.02 * np.linalg.norm(tips["hex27"])
+
+
+# --- a word about locking ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex8-mean"])
+@pytest.mark.parametrize(
+    ("cells", "times"), [((4, 1, 2), 1), ((4, 2, 1), 1), ((4, 2, 2), 0), ((1, 1, 1), 0)]
+)
+def test_cells_that_bend_alone_are_warned_of(element, cells, times):
+    scene = beam(cells)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        pc.discretise(scene, element=element)
+        pc.discretise(scene, refine=2, element=element)
+        pc.discretise(scene, element="hex8-enhanced")
+    told = [w for w in caught if issubclass(w.category, PdcorrectWarning)]
+    assert len(told) == times
+    for warning in told:
+        assert element in str(warning.message)
+        assert warning.filename == __file__
+
+
+def test_a_strip_that_cannot_bend_out_of_its_plane_is_not_warned_of():
+    strip = {"region": {"box": [[-9] * 3, [9] * 3]}, "components": ["y"]}
+    scene = beam((6, 1, 2), clamps=[*CLAMPED, strip])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", PdcorrectWarning)
+        pc.discretise(scene)
 
 
 # --- solvers ---------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 import pdcorrect as pc
 from conftest import beam, cross
 from pdcorrect.errors import SceneError
+from pdcorrect.scene import trained_coarse
 
 TEXT = """
 name = "gravity beam"
@@ -259,8 +260,14 @@ def test_any_text_gives_a_scene_or_a_scene_error(text):
 def test_best_coarse_changes_element_and_mass_only():
     scene = cross(solver={"tolerance": 1e-3})
     best = pc.best_coarse(scene)
-    assert (best.solver.element, best.solver.mass) == ("hex8-bubble-mean", "averaged")
+    assert (best.solver.element, best.solver.mass) == ("hex8-enhanced", "averaged")
     assert best.with_changes(solver=scene.solver.model_dump()) == scene
     assert pc.best_coarse(best) == best
     assert (scene.solver.element, scene.solver.mass) == ("hex8", "lumped")
-    assert pc.best_coarse(beam([6, 2, 1])).solver.element == "hex8-bubble"  # one cell thick
+
+
+def test_what_correctors_were_trained_on_keeps_its_elements():
+    for cells, element in (([6, 2, 2], "hex8-bubble-mean"), ([6, 2, 1], "hex8-bubble")):
+        solver = trained_coarse(beam(cells)).solver
+        assert (solver.element, solver.mass) == (element, "averaged")
+        assert pc.coarse_model(beam(cells), "best").element == element

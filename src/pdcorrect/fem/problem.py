@@ -23,6 +23,7 @@ from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, lumped, mass_matrix
+from pdcorrect.fem.thin_cells import warn_of_thin_cells
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
@@ -279,7 +280,9 @@ def discretise(
     selector = Selector(refined, space.positions, cell_size)
     materials = Materials.from_scene(scene, selector, len(refined.cells))
     body = ElasticBody(refined, space, space.quadrature(), materials, cell_size)
-    return problem_from_body(scene, refine, body)
+    problem = problem_from_body(scene, refine, body)
+    warn_of_thin_cells(scene.solver.element, refined, problem.free)
+    return problem
 
 
 def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
