@@ -99,7 +99,7 @@ def test_clamps_win_and_it_is_told():
 
 
 def test_the_program_tells_it_once(program, tmp_path):
-    scene = beam((2, 1, 1), initial={"velocity": [0.0, 0.1, 0.0]}, time={"frames": 1})
+    scene = beam((2, 2, 2), initial={"velocity": [0.0, 0.1, 0.0]}, time={"frames": 1})
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     out = tmp_path / "report"
     status, _, err = program("compare", tmp_path / "scene.toml", "-o", out, "--no-figures")

@@ -270,6 +270,10 @@ def test_a_run_is_the_same_run_whatever_its_number_of_frames_but_not_on_another_
     assert differences(longer, run) == []
     moved = dataclasses.replace(run, points=run.points + 1e-15)
     assert "nodes" in "; ".join(differences(stepper, moved))
+    lines = run.scene_toml.splitlines()
+    (unwritten,) = (line for line in lines if line.startswith("spectral_radius"))
+    older = "\n".join(line for line in lines if line != unwritten)  # when that key did not exist
+    assert differences(stepper, dataclasses.replace(run, scene_toml=older)) == []
     foreign = dataclasses.replace(run, scene_toml="= no TOML")
     assert "unreadable" in "; ".join(differences(stepper, foreign))
 

@@ -105,15 +105,13 @@ def _make_stepper(
 
 
 def _told_of_model(stepper: Stepper) -> str:
-    """Which model corrects, and whether it knows the scene's integrator; empty without one."""
+    """Which model corrects; empty without one."""
     about = getattr(stepper, "origin", None)
     if not about:
         return ""
-    trained, now = about["trained_integrator"], stepper.problem.scene.time.integrator
-    other = "" if trained == now else f"; the scene has {now}, for which it may be of no use"
     return (
         f"model {about['model']} on the base {about['base']}, trained on {about['dataset']} with "
-        f"{trained}{other}"
+        f"{about['trained_integrator']}"
     )
 
 

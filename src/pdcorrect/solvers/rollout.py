@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from pdcorrect._config import parse_toml
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
+from pdcorrect.scene import Scene
 from pdcorrect.solvers.implicit import whole
 from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
@@ -300,7 +302,12 @@ def differences(stepper: Stepper, run: Trajectory) -> list[str]:
 
 
 def _settings(scene_toml: str) -> dict[str, str]:
-    """A scene's keys, dotted, and values as text, without the number of frames."""
+    """A scene's keys, dotted, and values as text, without the number of frames.
+
+    With the defaults of keys that it was written without, if it can be read.
+    """
+    with contextlib.suppress(InputError):
+        scene_toml = Scene.from_toml(scene_toml).to_toml()
     try:
         scene = parse_toml(scene_toml)
     except ValueError:
