@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit
+from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit, MotionRange
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN
@@ -23,10 +23,12 @@ _LOADS = {
     "torsion": "a constant torsional field",
     "impulse": "a force during {duration:g} s",
     "stretch": "a force that rises in {duration:g} s and stays",
+    "body-force": "an acceleration of the whole body that rises in {duration:g} s and stays",
 }
 _SETTINGS = {
     "as-published": "the thesis's setting: coarse meshes are too heavy, forces act on coarse nodes",
     "exact": "right masses and moduli, loads integrated, reference by the best coarse model",
+    "converged": "as exact, with the best element, and a reference at a quarter of the step",
 }
 
 
@@ -91,19 +93,19 @@ def card_text(
 
 
 def _what(config: DatasetConfig) -> Iterable[str]:
-    motion, material = config.motion, config.material
+    material = config.material
     nodes = config.coarse_nodes or PUBLISHED[config.family].coarse
-    unit = "m/s" if motion.kind == "impulse" else "m/s²"
+    integrator = "generalised-α" if config.setting == "converged" else "backward Euler"
     yield (
-        "**Equation**: elastodynamics, corotated energy with a volume term, backward Euler, "
+        f"**Equation**: elastodynamics, corotated energy with a volume term, {integrator}, "
         f"{config.frames} frames of {config.step:g} s from rest."
     )
     yield (
         f"**Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
         f"{config.cell_size:g} m."
     )
-    loads = _LOADS[motion.kind].format(duration=motion.duration)
-    yield f"**Loads**: {loads}, {_range(motion.strength)} {unit}."
+    several = "one or two of these a simulation: " if config.mixed else ""
+    yield f"**Loads**: {several}{'; '.join(map(_load, config.motions))}."
     yield (
         f"**Material**: E {_range(material.young)} Pa, ν {_range(material.poisson)}, "
         f"ρ {_range(material.density)} kg/m³."
@@ -113,6 +115,12 @@ def _what(config: DatasetConfig) -> Iterable[str]:
         f"**Setting** `{config.setting}`: {_SETTINGS[config.setting]}. "
         f"**Reference**: {config.reference.solver.upper()} on cells cut {refine}."
     )
+
+
+def _load(motion: MotionRange) -> str:
+    unit = "m/s" if motion.kind == "impulse" else "m/s²"
+    told = _LOADS[motion.kind].format(duration=motion.duration)
+    return f"{told}, {_range(motion.strength)} {unit}"
 
 
 _SPLIT_HEADS = (

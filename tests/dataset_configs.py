@@ -7,7 +7,10 @@ STRENGTHS = {"torsion": [5.0, 15.0], "impulse": [0.2, 0.6], "stretch": [3.0, 8.0
 
 
 def small(motion="torsion", setting="exact", **changes):
-    """A data set of two training meshes and one for evaluation, of a few frames."""
+    """A data set of two training meshes and one for evaluation, of a few frames.
+
+    Of one motion, or with ``mixed`` of several.
+    """
     family = changes.pop("family", FAMILIES[motion])
     values = {
         "name": f"small-{motion}",
@@ -23,4 +26,6 @@ def small(motion="torsion", setting="exact", **changes):
         "evaluation": {"meshes": 1, "simulations": 1},
         "validation_share": 0.0,
     }
+    if "mixed" in changes:
+        del values["motion"]
     return DatasetConfig(**{**values, **changes})

@@ -29,6 +29,8 @@ class Batched:
         Of the coarse cell size.
     most : int
         Single steps that are taken together: those of several frames of each problem.
+    adds_up : bool
+        See `OneByOne`.
 
     Notes
     -----
@@ -37,8 +39,11 @@ class Batched:
 
     solver = "pd"
 
-    def __init__(self, device: str, tolerance: float, most: int = 1024) -> None:
+    def __init__(
+        self, device: str, tolerance: float, most: int = 1024, adds_up: bool = False
+    ) -> None:
         self._device, self._tolerance, self._most = device, tolerance, most
+        self._adds_up = adds_up
 
     def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
         """See `Engine`."""
@@ -48,7 +53,7 @@ class Batched:
         started = time.perf_counter()
         stepper = self._stepper([job.problem for job in jobs], divisor)
         rest, log = stepper.rest_state(), _BatchLog(stepper, jobs)
-        state = rest
+        state = stepper.initial_state()
         for _ in range(steps):
             for _ in range(divisor):
                 result = stepper(state)
@@ -87,7 +92,7 @@ class Batched:
             torch.cuda.empty_cache()  # of the last stepper, since others may share the GPU
         return BatchStepper(
             problems,
-            self._tolerance,
+            self._tolerance / (divisor**2 if self._adds_up else 1),
             device=self._device,
             time_step=problems[0].time_step / divisor,
             max_iterations=MOST_ITERATIONS,
@@ -143,7 +148,7 @@ class _BatchLog:
             torch.where(failed, rest.positions, state.positions),
             torch.where(failed, rest.velocities, state.velocities),
             state.times,
-            state.memory,
+            {name: torch.where(failed, 0.0, x) for name, x in state.memory.items()},
         )
 
     def frame(self, state: BatchState) -> None:

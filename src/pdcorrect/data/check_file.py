@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,8 +13,10 @@ from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import MeshPlan, draw_scene
 from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.data.simulate import lacking
+from pdcorrect.errors import SceneError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.problem import discretise
+from pdcorrect.scene import Scene
 
 _SLACK = 1e-6
 """Relative, for tolerances of numbers that are stored as float32."""
@@ -68,6 +69,8 @@ def _run_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
         away = _distance(run.positions[:1], shard.points)
         if away > _rounding(run.positions, shard.points, cell):
             yield f"frame 0 is {away:.3g} m off the rest shape"
+    if run.velocities is not None:
+        yield from _speed_faults(run.velocities, shard.free)
     for name in ("positions", "predictions"):
         values = getattr(run, name)
         if values is None or shard.free.all():
@@ -75,6 +78,15 @@ def _run_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
         away = _distance(values, shard.points, ~shard.free)
         if away > _rounding(values, shard.points, cell):
             yield f"held nodes are up to {away:.3g} m off their place in its {name}"
+
+
+def _speed_faults(velocities: Array, free: Array) -> Iterator[str]:
+    """Velocities (m/s) at the start, and of what is held."""
+    if velocities[0].any():
+        yield f"its velocities are up to {np.abs(velocities[0]).max():.3g} m/s in frame 0"
+    held = np.abs(velocities[:, ~free])
+    if held.any():
+        yield f"held nodes have velocities of up to {held.max():.3g} m/s"
 
 
 def _distance(values: Array, points: Array, where: Array | None = None) -> float:
@@ -123,7 +135,7 @@ def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator
         if simulation.steps != plan.frames:
             yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
         scene = draw_scene(config, plan, k, simulation.attempt)
-        if not same_scene(simulation.scene_toml, scene.to_toml()):
+        if not same_scene(simulation.scene_toml, scene):
             yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
         if alike and simulation.steps == plan.frames:
             for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
@@ -131,14 +143,20 @@ def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator
         single = {n for n, run in simulation.runs.items() if run.predictions is not None}
         for what in lacking(config, plan, k, simulation.runs, single)[:1]:
             yield f"simulation {k:04d} has no {what}"
+        reference = simulation.runs.get(REFERENCE)
+        if config.setting == "converged" and reference and reference.velocities is None:
+            yield f"simulation {k:04d} has no velocities of run {REFERENCE!r}"
     yield from model_faults(config, plan, shard)
 
 
-def same_scene(found: str, wanted: str) -> bool:
-    """Whether two scenes in TOML are equal but for the last digits of their numbers."""
+def same_scene(found: str, wanted: Scene) -> bool:
+    """Whether a scene in TOML is another one but for the last digits of its numbers.
+
+    Keys that it lacks, as those of earlier versions may, have their defaults.
+    """
     try:
-        return _same(tomllib.loads(found), tomllib.loads(wanted))
-    except tomllib.TOMLDecodeError:
+        return _same(Scene.from_toml(found).model_dump(), wanted.model_dump())
+    except SceneError:
         return False
 
 
@@ -147,7 +165,7 @@ def _same(found: Any, wanted: Any) -> bool:
         return False
     if isinstance(wanted, dict):
         return found.keys() == wanted.keys() and all(_same(found[k], wanted[k]) for k in wanted)
-    if isinstance(wanted, list):
+    if isinstance(wanted, (list, tuple)):
         return len(found) == len(wanted) and all(map(_same, found, wanted))
     if isinstance(wanted, float):
         return math.isclose(found, wanted, rel_tol=_LAST_DIGITS)

@@ -22,7 +22,7 @@ from pdcorrect._config import (
 )
 
 FamilyName = Literal["beam", "cross", "weight"]
-MotionName = Literal["torsion", "impulse", "stretch"]
+MotionName = Literal["torsion", "impulse", "stretch", "body-force"]
 
 
 def _pair(ends: Any) -> Any:
@@ -51,6 +51,8 @@ NodeCounts = Annotated[tuple[PositiveCount, PositiveCount], _PAIR, _ORDERED]
 Share = Annotated[float, Field(strict=True, ge=0, lt=1)]
 Name = Annotated[str, Field(max_length=80), AfterValidator(_plain)]
 
+CONVERGED_DIVISOR = 4
+"""Steps of the setting "converged"'s reference in one of its coarse models."""
 TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
 """The splits that every data set has."""
 
@@ -83,9 +85,11 @@ class MotionRange(Strict):
         time.  "impulse": a force on the body's inflated part (or free end) during the first
         ``duration`` seconds.  "stretch": a force on that part along the axis away from the
         clamps, with a transverse share, that rises during ``duration`` seconds and stays.
+        "body-force": an acceleration of the whole body in a random direction that rises so, too.
     strength
         Uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over
-        the mass of the loaded part, m/s2.  Impulse: momentum over that mass, m/s.
+        the mass of the loaded part, m/s2.  Impulse: momentum over that mass, m/s.  Body force:
+        m/s2.
     duration
         s; not used by torsion.
     attraction
@@ -166,7 +170,9 @@ class DatasetConfig(TomlConfig):
         "as-published": nodal masses rho times cell volume, the published volume weight,
         forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
         sum to rho V, the volume weight of the material asked for, loads integrated on each
-        mesh, the best coarse model beside the plain one, its element in the reference.
+        mesh, `pdcorrect.scene.trained_coarse` beside the plain model, its element in the
+        reference.  Both step by backward Euler.  "converged": as exact, with generalised-alpha,
+        `pdcorrect.best_coarse`, and a reference at a quarter of the step; no single steps.
     coarse_nodes
         Fewest and most nodes of a coarse mesh; the family's own by default.
     cell_size, step
@@ -175,6 +181,8 @@ class DatasetConfig(TomlConfig):
         Of each time step, of the coarse cell size.
     dtype
         In which positions and forces are stored.
+    motion, mixed
+        One of them.  Of a list of motions each simulation draws one or two.
     validation_share
         Of the training meshes.
     converged_steps
@@ -188,7 +196,7 @@ class DatasetConfig(TomlConfig):
     name: Name
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]
     family: FamilyName
-    setting: Literal["as-published", "exact"]
+    setting: Literal["as-published", "exact", "converged"]
     coarse_nodes: NodeCounts | None = None
     cell_size: Positive = 0.05
     step: Positive = 0.01
@@ -196,7 +204,8 @@ class DatasetConfig(TomlConfig):
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
     dtype: Literal["float32", "float64"] = "float32"
     material: MaterialRange
-    motion: MotionRange
+    motion: MotionRange | None = None
+    mixed: tuple[MotionRange, ...] | None = None
     reference: Reference = Reference()
     converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
     finest_meshes: Count = 0
@@ -204,6 +213,31 @@ class DatasetConfig(TomlConfig):
     evaluation: Split
     validation_share: Share = 0.1
     extra: tuple[ExtraSplit, ...] = ()
+
+    @property
+    def motions(self) -> tuple[MotionRange, ...]:
+        """All from which loads are drawn."""
+        return self.mixed or (() if self.motion is None else (self.motion,))
+
+    @model_validator(mode="after")
+    def _one_kind_of_motion(self) -> DatasetConfig:
+        if (self.motion is None) == (self.mixed is None):
+            raise ValueError("expected either motion or mixed")
+        kinds = [motion.kind for motion in self.mixed or ()]
+        if self.mixed is not None and (len(kinds) < 2 or len(set(kinds)) < len(kinds)):
+            raise ValueError(
+                f"mixed has kinds {as_toml(kinds)}: expected two or more, each of them once"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _converges(self) -> DatasetConfig:
+        if self.setting == "converged" and 0 < self.converged_steps <= CONVERGED_DIVISOR:
+            raise ValueError(
+                f"converged_steps = {self.converged_steps}: expected 0 or more than "
+                f"{CONVERGED_DIVISOR}, by which the reference divides the step already"
+            )
+        return self
 
     @model_validator(mode="after")
     def _names(self) -> DatasetConfig:
@@ -227,6 +261,8 @@ class DatasetConfig(TomlConfig):
     def hash(self) -> str:
         """SHA-256 of the configuration's content."""
         content: Any = self.model_dump(mode="json")
+        if self.mixed is None:  # as before there was such a key
+            del content["mixed"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 

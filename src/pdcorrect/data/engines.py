@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State, StepResult
@@ -86,10 +87,13 @@ class OneByOne:
         "pd" without fallbacks and with at most `MOST_ITERATIONS`.
     tolerance : float
         Of the coarse cell size.
+    adds_up : bool
+        Whether it falls with the square of a rollout's ``divisor``, since errors of more steps
+        add up.
     """
 
-    def __init__(self, solver: SolverName, tolerance: float) -> None:
-        self._solver, self._tolerance = solver, tolerance
+    def __init__(self, solver: SolverName, tolerance: float, adds_up: bool = False) -> None:
+        self._solver, self._tolerance, self._adds_up = solver, tolerance, adds_up
 
     def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
         """See `Engine`."""
@@ -104,7 +108,7 @@ class OneByOne:
                 worst = log.begin()
                 with log.timed():
                     for _ in range(divisor):
-                        result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                        result = stepper(state, step_forces(stepper, job.problem, state))
                         worst = worst.with_result(result)
                         state = result.state
                 log.add(worst, state)
@@ -123,7 +127,7 @@ class OneByOne:
                 stepper = self._stepper(steppers, job.problem, 1)
             for state in starts:
                 with log.timed():
-                    result = stepper(state, _forces(job.problem, state, stepper.time_step))
+                    result = stepper(state, step_forces(stepper, job.problem, state))
                 log.add(log.begin().with_result(result), result.state)
                 if log.failure:
                     break
@@ -139,18 +143,22 @@ class OneByOne:
         key = id(problem.space)
         if key not in known:
             unloaded, step = problem.with_loads([]), problem.time_step / divisor
+            tolerance = self._tolerance / (divisor**2 if self._adds_up else 1)
             if self._solver == "newton":
-                known[key] = Newton(unloaded, self._tolerance, time_step=step)
+                known[key] = Newton(unloaded, tolerance, time_step=step)
             else:
                 known[key] = ProjectiveDynamics(
-                    unloaded, self._tolerance, time_step=step, max_iterations=MOST_ITERATIONS,
+                    unloaded, tolerance, time_step=step, max_iterations=MOST_ITERATIONS,
                     recover=False,
                 )  # fmt: skip
         return known[key]
 
 
-def _forces(problem: Problem, state: State, step: float) -> Array:
-    return problem.external_forces(state.time, state.time + step, state.positions)
+def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Array:
+    """A problem's loads over the time that its integrator averages them, (N, 3), N."""
+    shares = stepper.integrate.scheme(state, stepper.time_step).loads_over
+    first, last = (state.time + share * stepper.time_step for share in shares)
+    return problem.external_forces(first, last, state.positions)
 
 
 @dataclass(frozen=True)

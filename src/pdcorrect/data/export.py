@@ -130,7 +130,8 @@ def export_meshgraphnet(
     ``mesh_pos``      (F, N, 3)     rest positions, m
     ``world_pos``     (F, N, 3)     the reference, m
     ``base_pos``      (F, N, 3)     one step of the base model from this frame of the
-                                    reference, m; in the last frame ``world_pos``
+                                    reference, m; in the last frame ``world_pos``; not of sets
+                                    of the setting "converged", which have no single steps
     ``forces``        (F, N, 3)     of the step from this frame, N; in the last frame 0
     ``young``, …      (F, N, 1)     and ``poisson``, ``density``: means over a node's cells
     ================  ============  =======================================================
@@ -277,7 +278,8 @@ def _simulations(folder: str | Path, split: str) -> Iterator[tuple[str, Shard, S
 
 def _fields(where: str, shard: Shard, simulation: Simulation, base: str) -> dict[str, Array]:
     run = simulation.runs.get(base)
-    if run is None or run.predictions is None:
+    single = shard.attributes["setting"] != "converged"
+    if run is None or (single and run.predictions is None):
         names = [name for name, each in simulation.runs.items() if each.predictions is not None]
         raise InputError(f"{where}: no predictions of run {base!r}: {_expected(names)}.")
     world, nodes = _positions(simulation, REFERENCE), len(shard.points)
@@ -290,7 +292,7 @@ def _fields(where: str, shard: Shard, simulation: Simulation, base: str) -> dict
         "free": shard.free,
         "mesh_pos": shard.points,
         "world_pos": world,
-        "base_pos": np.concatenate([run.predictions, world[-1:]]),
+        **({"base_pos": np.concatenate([run.predictions, world[-1:]])} if single else {}),
         "forces": np.concatenate([simulation.forces, np.zeros_like(simulation.forces[:1])]),
         **{name: node_means(x, shard.cells, nodes)[:, None] for name, x in moduli.items()},
     }
@@ -358,8 +360,10 @@ def _write_series(
     )
     forces = np.concatenate([np.zeros((1, *shard.points.shape)), simulation.forces])
     times: NDArray[np.float64] = np.arange(len(positions), dtype=np.float64) * step
+    stored = simulation.runs[name].velocities
     trajectory = Trajectory(
-        positions, velocities(positions, step), times, {},
+        positions,
+        velocities(positions, step) if stored is None else stored.astype(np.float64), times, {},
         shard.points, shard.cells.astype(np.int64),
     )  # fmt: skip
 

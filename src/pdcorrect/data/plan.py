@@ -22,6 +22,7 @@ from pdcorrect.data.configuration import (
     ExtraSplit,
     FamilyName,
     MaterialRange,
+    MotionRange,
     Split,
 )
 from pdcorrect.data.families import PUBLISHED, Box, Design, count_bodies, draw, extreme
@@ -213,9 +214,14 @@ def draw_scene(config: DatasetConfig, mesh: MeshPlan, simulation: int, attempt: 
             "young": mesh.young, "poisson": mesh.poisson, "density": mesh.density,
             "volume_weight": "published" if published else "lame",
         },
-        time={"step": mesh.step, "frames": mesh.frames},
+        time={
+            "step": mesh.step, "frames": mesh.frames,
+            "integrator": (
+                "generalised-alpha" if config.setting == "converged" else "backward-euler"
+            ),
+        },
         clamps=[{"region": _region(box, cell)} for box in mesh.design.clamps],
-        loads=[_LOADS[config.motion.kind](config, mesh, rng)],
+        loads=[_LOADS[m.kind](config, m, mesh, rng) for m in _drawn_motions(config, rng)],
         solver={
             "mass": "per-node" if published else "lumped", "element": "hex8",
             "tolerance": config.tolerance,
@@ -227,18 +233,33 @@ def _region(box: Box, cell: float) -> dict[str, Any]:
     return {"box": [[cell * c for c in corner] for corner in box]}
 
 
-def _strength(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> float:
-    return mesh.strength_factor * float(rng.uniform(*config.motion.strength))
+def _drawn_motions(config: DatasetConfig, rng: np.random.Generator) -> Sequence[MotionRange]:
+    """The only motion of a data set, or one or two of those that are mixed."""
+    if config.mixed is None:
+        return config.motions
+    chosen = rng.choice(len(config.mixed), int(rng.integers(1, 3)), replace=False)
+    return [config.mixed[k] for k in sorted(chosen)]
 
 
-def _torsion(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+def _strength(motion: MotionRange, mesh: MeshPlan, rng: np.random.Generator) -> float:
+    return mesh.strength_factor * float(rng.uniform(*motion.strength))
+
+
+def _direction(rng: np.random.Generator) -> np.ndarray:
+    found: np.ndarray = rng.normal(size=3)
+    return found / np.linalg.norm(found)
+
+
+def _torsion(
+    config: DatasetConfig, motion: MotionRange, mesh: MeshPlan, rng: np.random.Generator
+) -> dict[str, Any]:
     """Eq. 6-1 to 6-3 about the central beam's axis.
 
     Published: sigma is a force on each coarse node.  Exact: a force density, that force over
     a cell's volume.  The torque about the axis is then about a third of the published one.
     """
-    motion, cell = config.motion, config.cell_size
-    density = mesh.density * _strength(config, mesh, rng)
+    cell = config.cell_size
+    density = mesh.density * _strength(motion, mesh, rng)
     published = config.setting == "as-published"
     attraction, stretch = rng.uniform(*motion.attraction), rng.uniform(*motion.stretch)
     turn = 1.0 if rng.random() < 0.5 else -1.0
@@ -252,33 +273,45 @@ def _torsion(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) ->
     }
 
 
-def _impulse(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+def _impulse(
+    config: DatasetConfig, motion: MotionRange, mesh: MeshPlan, rng: np.random.Generator
+) -> dict[str, Any]:
     """A force on the loaded part in a random direction, for a short time."""
-    motion = config.motion
-    direction = rng.normal(size=3)
-    direction /= np.linalg.norm(direction)
-    force = _part_mass(config, mesh) * _strength(config, mesh, rng) / motion.duration
+    direction = _direction(rng)
+    force = _part_mass(config, mesh) * _strength(motion, mesh, rng) / motion.duration
     return {
         **_part_load(config, mesh.design.loaded, force * direction),
         "window": [0.0, motion.duration],
     }
 
 
-def _stretch(config: DatasetConfig, mesh: MeshPlan, rng: np.random.Generator) -> dict[str, Any]:
+def _stretch(
+    config: DatasetConfig, motion: MotionRange, mesh: MeshPlan, rng: np.random.Generator
+) -> dict[str, Any]:
     """A force on the loaded part, mostly along its axis, that rises and stays."""
-    motion = config.motion
     axis = np.array(mesh.design.axis)
     across = rng.normal(size=3)
     across -= axis * (across @ axis)
     across *= rng.uniform(*motion.transverse) / np.linalg.norm(across)
-    force = _part_mass(config, mesh) * _strength(config, mesh, rng)
+    force = _part_mass(config, mesh) * _strength(motion, mesh, rng)
     return {
         **_part_load(config, mesh.design.loaded, force * (axis + across)),
         "ramp": motion.duration,
     }
 
 
-_LOADS = {"torsion": _torsion, "impulse": _impulse, "stretch": _stretch}
+def _body_force(
+    config: DatasetConfig, motion: MotionRange, mesh: MeshPlan, rng: np.random.Generator
+) -> dict[str, Any]:
+    """An acceleration of the whole body in a random direction that rises and stays."""
+    direction = _direction(rng)
+    acceleration = _strength(motion, mesh, rng) * direction
+    return {"kind": "gravity", "acceleration": acceleration.tolist(), "ramp": motion.duration}
+
+
+_LOADS = {
+    "torsion": _torsion, "impulse": _impulse, "stretch": _stretch, "body-force": _body_force,
+}  # fmt: skip
 
 
 def _part_mass(config: DatasetConfig, mesh: MeshPlan) -> float:

@@ -16,6 +16,7 @@ The layout of the HDF5 file, version 1 (``docs/datasets.md``), after its seal
       forces              (T, N, 3)        nodal forces of the plain coarse model, N, step by step
       runs/NAME/          attributes: what the run is (solver, refine, element, mass, ...)
         positions         (T+1, N, 3)      on the coarse nodes, m; frame 0 is the rest shape
+        velocities        (T+1, N, 3)      m/s, of references in the setting "converged"
         predictions       (T, N, 3)        one step from each frame of the reference, m
         iterations, error_estimates (m), smallest_volume_ratios   (T,)
     provenance/           attributes: code version, hardware, date; not part of the hash
@@ -74,12 +75,15 @@ class Run:
         ``error_estimates`` (m) and ``smallest_volume_ratios`` (det F at quadrature points).
     attributes : mapping of str to str, int or float
         Solver, refine, element, mass, time_step, ...
+    velocities : (T+1, N, 3) or None
+        Of the rollout, m/s, where they are not the differences of its positions.
     """
 
     positions: Array | None = None
     predictions: Array | None = None
     statistics: Mapping[str, Array] = field(default_factory=dict)
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    velocities: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +236,7 @@ def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
 
 def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
     group.attrs.update(dict(run.attributes))
-    for name in ("positions", "predictions"):
+    for name in ("positions", "velocities", "predictions"):
         if getattr(run, name) is not None:
             _array(group, name, getattr(run, name), dtype)
     for name, values in run.statistics.items():

@@ -188,9 +188,14 @@ def _motion(
     group: h5py.Group, time_step: float, predictions: Sequence[str], rollouts: Sequence[str]
 ) -> MotionArrays:
     positions = _of_run(group, REFERENCE, "positions")
+    stored = group["runs"][REFERENCE].get("velocities")
     return MotionArrays(
         positions=positions,
-        velocities=velocities(positions[:-1], time_step),
+        velocities=(
+            velocities(positions[:-1], time_step)
+            if stored is None
+            else np.asarray(stored[:-1], dtype=np.float64)
+        ),
         forces=group["forces"][()],
         predictions={name: _of_run(group, name, "predictions") for name in predictions},
         rollouts={name: _of_run(group, name, "positions") for name in rollouts},

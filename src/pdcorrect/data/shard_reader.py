@@ -47,6 +47,7 @@ _RESERVED = frozenset({"format", "version", HASH})
 _FLOATS = (np.dtype("<f4"), np.dtype("<f8"))
 _RUN = {
     "positions": (_FLOATS, ("T+1", "N", 3)),
+    "velocities": (_FLOATS, ("T+1", "N", 3)),
     "predictions": (_FLOATS, ("T", "N", 3)),
     **{name: ((np.dtype(kind),), ("T",)) for name, kind in STATISTICS.items()},
 }
@@ -286,6 +287,7 @@ class _Reader:
             predictions=arrays.get("predictions"),
             statistics={k: arrays[k] for k in STATISTICS if k in arrays},
             attributes=self._noted(group, place),
+            velocities=arrays.get("velocities"),
         )
 
     def _group(self, parent: h5py.Group, place: str, name: str) -> h5py.Group:

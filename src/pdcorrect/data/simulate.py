@@ -10,7 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION, DatasetConfig
+from pdcorrect.data.configuration import (
+    CONVERGED_DIVISOR,
+    EVALUATION,
+    TRAINING,
+    VALIDATION,
+    DatasetConfig,
+)
 from pdcorrect.data.engines import Engine, Job, Steps
 from pdcorrect.data.importing import discretise_stored
 from pdcorrect.data.plan import MeshPlan, draw_scene
@@ -26,7 +32,7 @@ from pdcorrect.data.schema import (
 )
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import BASES, Problem, discretise
-from pdcorrect.scene import Scene, trained_coarse
+from pdcorrect.scene import Scene, best_coarse, trained_coarse
 from pdcorrect.state import State
 
 
@@ -38,7 +44,7 @@ class Model:
     ----------
     refine : int
     best : bool
-        `pdcorrect.scene.trained_coarse`'s element and mass.
+        With the setting's better element and mass, see `_better`.
     predict : bool
         Whether to take single steps from the reference, too.
     divisor : int
@@ -62,13 +68,14 @@ class Model:
 
 def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     """The runs of a mesh by name, the reference first."""
-    exact = config.setting == "exact"
+    best, converged = config.setting != "as-published", config.setting == "converged"
+    divisor = CONVERGED_DIVISOR if converged else 1
     found = {
-        REFERENCE: Model(mesh.refine, best=exact, truth=True),
-        PLAIN: Model(1, predict=True),
+        REFERENCE: Model(mesh.refine, best=best, divisor=divisor, truth=True),
+        PLAIN: Model(1, predict=not converged),
     }
-    if exact:
-        found[BEST] = Model(1, best=True, predict=True)
+    if best:
+        found[BEST] = Model(1, best=True, predict=not converged)
     else:
         found[TOTAL_MASS] = Model(1, heavy=True, predict=True)
     if mesh.split in (TRAINING, VALIDATION):
@@ -78,11 +85,18 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     if mesh.split == EVALUATION:
         if config.converged_steps:
             found[CONVERGED] = Model(
-                mesh.refine, best=exact, divisor=config.converged_steps, truth=True
+                mesh.refine, best=best, divisor=config.converged_steps, truth=True
             )
         if mesh.number < config.finest_meshes:
-            found["finest"] = Model(2 * mesh.refine, best=exact, sample=True, truth=True)
+            found["finest"] = Model(
+                2 * mesh.refine, best=best, divisor=divisor, sample=True, truth=True
+            )
     return found
+
+
+def _better(scene: Scene, setting: str) -> Scene:
+    """A setting's best coarse model of a scene; "exact" keeps that of the released models."""
+    return best_coarse(scene) if setting == "converged" else trained_coarse(scene)
 
 
 def lacking(
@@ -155,7 +169,7 @@ class _Meshed:
             key = (model.refine, model.best)
             if key not in known:
                 known[key] = discretise(
-                    trained_coarse(scene) if model.best else scene, model.refine
+                    _better(scene, config.setting) if model.best else scene, model.refine
                 )
             problems[name] = known[key]
             if model.heavy:
@@ -329,17 +343,22 @@ def _shard(
         young=plain.materials.young,
         poisson=plain.materials.poisson,
         density=plain.materials.density,
-        simulations=tuple(_simulation(draft, engines) for draft in drafts),
+        simulations=tuple(
+            _simulation(draft, engines, config.setting == "converged") for draft in drafts
+        ),
     )
 
 
-def _simulation(draft: _Draft, engines: Engines) -> Simulation:
+def _simulation(draft: _Draft, engines: Engines, velocities: bool) -> Simulation:
     plan, plain = draft.meshed.plan, draft.job(PLAIN).problem
     times = plan.step * np.arange(plan.frames + 1)
     every = [*draft.steps.items(), *((n + " steps", s) for n, s in draft.predictions.items())]
     return Simulation(
         forces=np.stack([plain.external_forces(*span) for span in pairwise(times)]),
-        runs={name: _run(draft, name, engines) for name in draft.steps},
+        runs={
+            name: _run(draft, name, engines, velocities and name == REFERENCE)
+            for name in draft.steps
+        },
         scene_toml=draft.scene.to_toml(),
         attempt=draft.attempt,
         rejected=draft.rejected,
@@ -347,7 +366,7 @@ def _simulation(draft: _Draft, engines: Engines) -> Simulation:
     )
 
 
-def _run(draft: _Draft, name: str, engines: Engines) -> Run:
+def _run(draft: _Draft, name: str, engines: Engines, velocities: bool) -> Run:
     steps, predictions = draft.steps[name], draft.predictions.get(name)
     problem, model = draft.meshed.problems[name], draft.meshed.models[name]
     rest = problem.positions[problem.mesh.coarse_nodes]
@@ -368,6 +387,9 @@ def _run(draft: _Draft, name: str, engines: Engines) -> Run:
             "total_mass": float(problem.mass.sum()),
             "time_step": draft.meshed.plan.step / model.divisor,
         },
+        velocities=(
+            np.concatenate([np.zeros_like(rest)[None], steps.velocities]) if velocities else None
+        ),
     )
 
 
@@ -410,9 +432,10 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     if run == TOTAL_MASS:
         problem = plain.with_total_mass(float(stored.attributes["total_mass"]))
     elif run != PLAIN:
-        exact = run == BEST or shard.attributes["setting"] == "exact"
+        setting = str(shard.attributes["setting"])
+        better = run == BEST or setting in ("exact", "converged")
         refine = int(stored.attributes.get("refine", 1))
-        scene = trained_coarse(scenes[0]) if exact else scenes[0]
+        scene = _better(scenes[0], setting) if better else scenes[0]
         problem = discretise_stored(scene, shard.points, shard.cells, refine)
     return [_under(problem, scene) for scene in scenes]
 

@@ -59,15 +59,16 @@ def make_engines(config: DatasetConfig, device: str) -> Engines:
     Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, of which a batch might
     not fit, step one problem after the other on the CPU.
     """
-    alone = OneByOne("pd", config.tolerance)
+    adds_up = config.setting == "converged"
+    alone = OneByOne("pd", config.tolerance, adds_up)
     newton = config.reference.solver == "newton"
-    truth = OneByOne("newton", config.tolerance) if newton else None
+    truth = OneByOne("newton", config.tolerance, adds_up) if newton else None
     if device == "cpu":
         return Engines(alone, truth or alone, truth or alone)
     require_extra("torch", "learn")
     from pdcorrect.data.batch_engine import Batched
 
-    batched = Batched(device, config.tolerance)
+    batched = Batched(device, config.tolerance, adds_up=adds_up)
     return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
 
 
