@@ -37,7 +37,7 @@ def scene(seed: int, shape: tuple[int, int], shared: bool) -> pc.Scene:
             "arm_start": 5, "arm_width": 2, "arm_length": shape[1],
         },
         material={"young": young, "poisson": 0.35, "density": 1e3},
-        time={"step": 0.01, "frames": 10},
+        time={"step": 0.01, "frames": 10, "integrator": "backward-euler"},
         clamps=[{"region": {"plane": "x", "at": 0.0}}],
         loads=[{"kind": "gravity", "acceleration": rng.uniform(-15, 15, 3).tolist()}],
     )  # fmt: skip

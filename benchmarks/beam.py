@@ -34,7 +34,7 @@ def beam(length: int, rules: str, frames: int = 10) -> pc.Scene:
             "density": 1e3,
             "volume_weight": "published" if diffpd else "lame",
         },
-        time={"step": 0.01, "frames": frames},
+        time={"step": 0.01, "frames": frames, "integrator": "backward-euler"},
         clamps=[{"region": {"plane": "x", "at": 0.0}}],
         loads=[{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}],
         solver={"mass": "per-node" if diffpd else "lumped"},

@@ -170,7 +170,7 @@ def example_beam(motion: str, poisson: float, cells: tuple[int, int, int] = (12,
     return pc.Scene(
         body={"shape": "beam", "cells": cells, "cell_size": 0.02},
         material={"young": 1e6, "poisson": poisson, "density": 1e3},
-        time={"step": 0.01, "frames": 8},
+        time={"step": 0.01, "frames": 8, "integrator": "backward-euler"},
         clamps=[] if motion == "flight" else [{"region": {"plane": "x", "at": 0.0}}],
         loads=loads[motion],
     )

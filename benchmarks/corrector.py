@@ -55,7 +55,7 @@ def scene_of(body: dict[str, Any]) -> pc.Scene:
     return pc.Scene(
         body=body,
         material={"young": 2e5, "poisson": 0.35, "density": 1e3},
-        time={"step": 0.01, "frames": 1},
+        time={"step": 0.01, "frames": 1, "integrator": "backward-euler"},
         clamps=[{"region": {"plane": "x", "at": 0.0}}],
     )
 

@@ -30,7 +30,7 @@ def scene(young: float) -> pc.Scene:
         material={"young": young, "poisson": 0.49, "density": 1e3},
         clamps=[{"region": {"plane": "x", "at": "min"}}],
         loads=[{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}],
-        time={"step": 0.1, "frames": 3},
+        time={"step": 0.1, "frames": 3, "integrator": "backward-euler"},
     )
 
 

@@ -47,8 +47,9 @@ class Watched(Corrector):
 
 
 def soft_beam(cells=(3, 1, 1), **changes):
-    """Small, and it moves a good part of its cells."""
-    return beam(cells, material={"young": 5e4}, **changes)
+    """Small, moves a good part of its cells, and steps as correctors learn: backward Euler."""
+    time = {"integrator": "backward-euler", **changes.pop("time", {})}
+    return beam(cells, material={"young": 5e4}, time=time, **changes)
 
 
 def problems(*cells):

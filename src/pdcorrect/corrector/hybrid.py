@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +28,7 @@ from pdcorrect.corrector.gate import PAUSE, Gate, check_gate, steps_left
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.single_step import SingleCoarseStep
-from pdcorrect.errors import InputError
+from pdcorrect.errors import InputError, PdcorrectWarning
 from pdcorrect.fem.problem import BASES, Problem, coarse_model
 from pdcorrect.scene import Scene, check_scene, trained_coarse
 from pdcorrect.solvers.implicit import ImplicitStepper
@@ -246,8 +247,8 @@ def hybrid_of(
     Parameters
     ----------
     scene : Scene
-        Another time integrator than that of the model's training is let pass, unless it is
-        quasi-static.
+        Another time integrator than that of the model's training is warned of, and refused
+        where it is quasi-static.
     model : str, path or LoadedModel
         Name or folder, see `load_model`, or one that is loaded.
     gate : bool, Gate or None
@@ -296,12 +297,16 @@ def about_model(model: str | Path) -> dict[str, str]:
 
 
 def _check_integrator(found: str, trained: str, name: str) -> None:
-    if found == "quasi-static" != trained:
+    if found == trained:
+        return
+    told = f"{name}: trained on steps by {trained}, and the scene's time.integrator is {found!r}"
+    if found == "quasi-static":
         raise InputError(
-            f"{name}: trained on steps by {trained}, and the scene's time.integrator is "
-            f"{found!r}, whose steps have no inertia: expected {trained!r}; set it in the scene, "
-            "or leave the model out."
+            f"{told}, whose steps have no inertia: expected {trained!r}; set it in the scene, or "
+            "leave the model out."
         )
+    change = f'set integrator = "{trained}" in [time], or leave the model out'
+    warnings.warn(f"{told}: it may be of no use; {change}", PdcorrectWarning, stacklevel=3)
 
 
 def _check_problem(problem: Problem, scene: Scene, base: str, name: str) -> None:

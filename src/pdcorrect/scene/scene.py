@@ -25,16 +25,16 @@ class Time(Strict):
     Attributes
     ----------
     integrator
-        "backward-euler" (the thesis's; first order, strongly damping), "bdf2",
-        "midpoint" and "generalised-alpha" (second order), or "quasi-static" (no
-        inertia; time only moves loads and clamps).
+        "generalised-alpha" (second order, damps what the step is too long for), "bdf2"
+        and "midpoint" (second order), "backward-euler" (the thesis's; first order,
+        strongly damping), or "quasi-static" (no inertia; time only moves loads and clamps).
     spectral_radius
         Of generalised-alpha at infinite frequency, 0 (damps most) to 1.
     """
 
     step: Positive
     frames: PositiveCount
-    integrator: Integrator = "backward-euler"
+    integrator: Integrator = "generalised-alpha"
     spectral_radius: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.8
 
 
