@@ -26,6 +26,7 @@ ELEMENT_STYLES = {
     "hex8-mean": ("#e69f00", "s"),
     "hex8-bubble": ("#0072b2", "D"),
     "hex8-bubble-mean": ("#d55e00", "^"),
+    "hex8-enhanced": ("#cc79a7", "P"),
     "hex27": ("#009e73", "v"),
 }
 """Colour and mark of each element in pictures."""

@@ -39,12 +39,15 @@ def bending_alone(mesh: HexMesh, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     outer = np.zeros(6 * len(mesh.cells), dtype=bool)
     outer[order[starts[counts == 1]]] = True
     sides = outer.reshape(-1, 3, 2)  # the faces on both ends of each axis
-    alone = sides.all(axis=2) & ~outer.reshape(-1, 6).all(axis=1)[:, None]
+    free_standing = outer.reshape(-1, 6).all(axis=1, keepdims=True)
+    alone = np.logical_and(sides.all(axis=2), ~free_standing)
     thin = np.flatnonzero(alone.any(axis=1))
     signs = 2.0 * VTK_CORNERS - 1.0
     axes = np.abs(np.einsum("cki,km->cmi", mesh.positions[mesh.cells[thin]], signs))
     along = axes > 0.5 * axes.max(axis=2, keepdims=True)  # (c, axis, component)
     free_corners = free[mesh.cells[thin]].any(axis=1)  # (c, component)
     moves = (free_corners[:, None] & along).any(axis=2)
-    bends = np.asarray((alone[thin] & moves).any(axis=1))
-    return np.isin(np.arange(len(mesh.cells)), thin[bends])
+    bends = np.logical_and(alone[thin], moves)
+    found = np.zeros(len(mesh.cells), dtype=bool)
+    found[thin] = bends.any(axis=1)
+    return found
