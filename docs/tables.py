@@ -32,27 +32,33 @@ _SKIPPED = {".git", ".venv", "node_modules", "_build"}
 
 
 def comparison(name: str) -> Rows:
-    """A run of ``pdcorrect compare`` with the model torsion-exact."""
+    """A run of ``pdcorrect compare`` with the model torsion-exact.
+
+    Of one with ``--converged``: first the error to the converged motion, then the time.
+    """
     record = read(RECORDS / f"{name}.json")
-    labels = (
-        "coarse PD",
-        "best coarse PD",
-        "hybrid torsion-exact",
-        "intermediate PD",
-        "fine best PD",
-    )
-    runs = {row["label"]: row for row in record["rows"]}
-    rows = [
-        [
-            label,
-            str(runs[label]["nodes"]),
-            _millimetres(runs[label]["rms_error"], label == record["reference"]),
-            _millimetres(runs[label]["largest_error"], label == record["reference"]),
-            number(runs[label]["seconds_a_frame"] * 1e3),
+    runs = [row for row in record["rows"] if row["label"] != "coarse Newton"]
+    if not record.get("converged"):
+        return ("solver", "nodes", "RMS, mm", "worst, mm", "ms a frame"), [
+            [
+                row["label"],
+                str(row["nodes"]),
+                _millimetres(row["rms_error"], row["label"] == record["reference"]),
+                _millimetres(row["largest_error"], row["label"] == record["reference"]),
+                number(row["seconds_a_frame"] * 1e3),
+            ]
+            for row in runs
         ]
-        for label in labels
+    return ("solver", "error, %", "ms a frame", "RMS, mm", "nodes"), [
+        [
+            row["label"],
+            number(100 * row["relative_error"]),
+            number(row["seconds_a_frame"] * 1e3),
+            _millimetres(row["rms_error"], row["label"] == record["reference"]),
+            str(row["nodes"]),
+        ]
+        for row in runs
     ]
-    return ("solver", "nodes", "RMS, mm", "worst, mm", "ms a frame"), rows
 
 
 def _millimetres(metres: float | None, reference: bool) -> str:

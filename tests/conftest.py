@@ -106,6 +106,14 @@ def rotation(seed=3):
     return q * np.sign(np.linalg.det(q))
 
 
+@pytest.fixture(autouse=True, scope="session")
+def own_cache(tmp_path_factory):
+    """No test reads or fills the user's cache of converged motions."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PDCORRECT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture
 def rng():
     return np.random.default_rng(12345)
