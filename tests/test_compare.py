@@ -35,7 +35,7 @@ def thick():
 @pytest.fixture
 def scene_file(tmp_path):
     path = tmp_path / "scene.toml"
-    path.write_text(beam((4, 2, 1), time={"frames": 4}).to_toml(), encoding="utf-8")
+    path.write_text(beam((4, 2, 2), time={"frames": 4}).to_toml(), encoding="utf-8")
     return path
 
 
