@@ -15,9 +15,15 @@ from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError, MeshError
+from pdcorrect.scene import trained_coarse
 from pdcorrect.solvers.rollout import restrict
 
 # --- arrays ----------------------------------------------------------------------------
+
+
+def stepped(frames):
+    """A scene's time; what is imported has to be of backward Euler."""
+    return {"step": 0.01, "frames": frames, "integrator": "backward-euler"}
 
 
 def arguments(**changes):
@@ -217,8 +223,8 @@ def test_numbers_of_other_types_or_nearly_the_scenes_mean_the_same():
 
 def scene_arguments(**changes):
     """A scene and what another solver would give on its mesh."""
-    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 3}, **changes)
-    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 3}))
+    scene = beam(cells=(3, 1, 1), time=stepped(3), **changes)
+    problem = pc.discretise(beam(cells=(3, 1, 1), time=stepped(3)))
     materials = problem.materials
     reference = pc.rollout(pc.ProjectiveDynamics(problem)).positions
     return {
@@ -237,7 +243,8 @@ MOVING = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]
         ({"body": {"cells": [2, 1, 1]}}, "mesh"),
         ({"material": {"young": 2e6}}, "young"),
         ({"clamps": []}, "free"),
-        ({"time": {"step": 0.01, "frames": 3, "integrator": "bdf2"}}, "'bdf2'"),
+        ({"time": {"integrator": "bdf2"}}, "'bdf2'"),
+        ({"time": {"integrator": "generalised-alpha"}}, "'generalised-alpha'"),
         ({"solver": {"element": "hex27"}}, "'hex27'"),
         (
             {"clamps": [{"region": {"plane": "x", "at": 0.0}, "motion": MOVING}]},
@@ -370,7 +377,7 @@ def test_data_sets_neither_take_imports_nor_are_imported(tmp_path):
 @pytest.fixture(scope="module")
 def runs():
     """A fine and a coarse run of a beam."""
-    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4})
+    scene = beam(cells=(3, 1, 1), time=stepped(4))
     found = [
         pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine=refine))) for refine in (2, 1)
     ]
@@ -380,7 +387,7 @@ def runs():
 def test_runs_of_simulate_become_a_file_with_predictions(runs):
     fine, coarse = runs
     shard = shard_from_trajectories(fine, coarse)
-    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}))
+    problem = pc.discretise(beam(cells=(3, 1, 1), time=stepped(4)))
     truth = restrict(fine, problem)
     (found,) = shard.simulations
     np.testing.assert_array_equal(found.runs["reference"].positions, truth.positions)
@@ -456,17 +463,17 @@ def test_a_reference_that_its_scene_does_not_describe_is_refused(runs, change, w
 
 
 def quadratic_run(refine):
-    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}, solver={"element": "hex27"})
+    scene = beam(cells=(3, 1, 1), time=stepped(4), solver={"element": "hex27"})
     return pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene, refine=refine)))
 
 
 def test_runs_that_do_not_belong_together_are_refused(runs):
     fine, coarse = runs
     quadratic = quadratic_run(1)
-    softer = beam(cells=(3, 1, 1), material={"young": 9e5}).to_toml()
+    softer = beam(cells=(3, 1, 1), material={"young": 9e5}, time=stepped(4)).to_toml()
     motion = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]}
     clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": motion}]
-    scene = beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 2}, clamps=clamps)
+    scene = beam(cells=(3, 1, 1), time=stepped(2), clamps=clamps)
     moving = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
     for references, rollouts, words in (
         ([fine, fine], [coarse], "2 references and 1 "),
@@ -486,7 +493,7 @@ def test_runs_that_do_not_belong_together_are_refused(runs):
 def test_a_reference_may_have_nodes_between_the_corners(runs, refine):
     reference, coarse = quadratic_run(refine), runs[1]
     (found,) = shard_from_trajectories(reference, coarse).simulations
-    problem = pc.discretise(beam(cells=(3, 1, 1), time={"step": 0.01, "frames": 4}))
+    problem = pc.discretise(beam(cells=(3, 1, 1), time=stepped(4)))
     positions = found.runs["reference"].positions
     np.testing.assert_array_equal(positions, restrict(reference, problem).positions)
     np.testing.assert_array_equal(positions[0], problem.positions)
@@ -506,7 +513,7 @@ def test_the_coarse_and_the_best_coarse_model_are_those_of_the_scene(runs):
     fine, coarse = runs
     shard = shard_from_trajectories(fine, coarse, best=True)
     (found,) = shard.simulations
-    scene = pc.best_coarse(pc.Scene.from_toml(coarse.scene_toml))
+    scene = trained_coarse(pc.Scene.from_toml(coarse.scene_toml))
     stepper = pc.ProjectiveDynamics(pc.discretise(scene))
     run = found.runs["best"]
     np.testing.assert_allclose(run.positions, pc.rollout(stepper).positions, atol=1e-12)
