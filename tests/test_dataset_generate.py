@@ -25,6 +25,7 @@ from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.data.workers import Workers, local_scheduler, make_engines
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
+from pdcorrect.scene import trained_coarse
 
 distributed = pytest.importorskip("distributed")
 psutil = pytest.importorskip("psutil")
@@ -59,7 +60,7 @@ def test_a_generated_data_set_passes_its_check_and_its_runs_are_what_a_user_gets
     scene = pc.Scene.from_toml(simulation.scene_toml)
     assert scene == draw_scene(config, plan, 1, simulation.attempt)
     coarse = pc.discretise(scene)
-    best = pc.best_coarse(scene)
+    best = trained_coarse(scene)
     for name, problem in (
         ("plain", coarse), ("best", pc.discretise(best)), ("reference", pc.discretise(best, 2)),
     ):  # fmt: skip
@@ -77,7 +78,7 @@ def test_predictions_are_single_steps_from_the_reference(generated, name):
     simulation = read_shard(folder / "training/mesh-0001.h5").simulations[0]
     scene = pc.Scene.from_toml(simulation.scene_toml)
     stepper = pc.ProjectiveDynamics(
-        pc.discretise(pc.best_coarse(scene) if name == "best" else scene)
+        pc.discretise(trained_coarse(scene) if name == "best" else scene)
     )
     truth = simulation.runs["reference"].positions.astype(float)
     before = np.concatenate([truth[:1], truth])[:-1]

@@ -305,8 +305,9 @@ def test_cells_that_bend_alone_are_warned_of(element, cells, times):
         assert warning.filename == __file__
 
 
-def test_a_strip_that_cannot_bend_out_of_its_plane_is_not_warned_of():
-    strip = {"region": {"box": [[-9] * 3, [9] * 3]}, "components": ["y"]}
+@pytest.mark.parametrize("low", [-9, 0.01], ids=["all", "one face"])
+def test_a_strip_that_cannot_bend_out_of_its_plane_is_not_warned_of(low):
+    strip = {"region": {"box": [[-9, low, -9], [9, 9, 9]]}, "components": ["y"]}
     scene = beam((6, 1, 2), clamps=[*CLAMPED, strip])
     with warnings.catch_warnings():
         warnings.simplefilter("error", PdcorrectWarning)

@@ -11,6 +11,7 @@ import pytest
 import pdcorrect as pc
 from conftest import beam
 from pdcorrect.cli.common import BAD_INPUT
+from pdcorrect.scene import trained_coarse
 
 weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
 
@@ -169,7 +170,7 @@ def test_a_problem_in_place_of_the_models_own_is_checked(learned):
     assert pc.hybrid_of(scene, model, problem=pc.coarse_model(scene, "best")).origin == {}
     for problem, told in (
         (pc.discretise(scene), "hex8 and mass lumped"),
-        (pc.discretise(pc.best_coarse(scene), 2), "refined 2"),
+        (pc.discretise(trained_coarse(scene), 2), "refined 2"),
     ):
         with pytest.raises(pc.errors.InputError, match=told):
             pc.hybrid_of(scene, model, problem=problem)

@@ -12,6 +12,7 @@ from conftest import rotation
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import make_plan
+from pdcorrect.scene import trained_coarse
 
 VALIDATION = Path(__file__).parents[1] / "validation"
 sys.path.insert(0, str(VALIDATION))
@@ -192,7 +193,7 @@ def test_the_cross_is_drawn_as_those_of_training_and_none_of_them():
 def test_the_model_knows_the_cross_at_rest_and_not_with_its_far_end_held():
     found = pc.load_model("torsion-exact")
     for name, known in (("cross ordinary", True), ("cross plane", True), ("cross turned", False)):
-        problem = pc.discretise(pc.best_coarse(SCENES[name].scene))
+        problem = pc.discretise(trained_coarse(SCENES[name].scene))
         coarse = pc.ProjectiveDynamics(problem)
         stepper = pc.HybridStepper(coarse, found.corrector, gate=pc.Gate())
         refused = stepper(problem.rest_state()).stats["gate"] == Reason.BODY

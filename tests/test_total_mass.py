@@ -10,6 +10,7 @@ import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.compare import cases_with
+from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]
 PER_NODE = {"mass": "per-node"}
@@ -60,7 +61,7 @@ def test_where_masses_are_of_volumes_the_total_mass_changes_nothing(rule):
 
 
 def test_coarse_models_are_known_by_name():
-    assert pc.coarse_model(cross(), "best").element == pc.best_coarse(cross()).solver.element
+    assert pc.coarse_model(cross(), "best").element == trained_coarse(cross()).solver.element
     assert pc.coarse_model(cross()).element == "hex8"
     with pytest.raises(InputError, match="finest"):
         pc.coarse_model(cross(), "finest")

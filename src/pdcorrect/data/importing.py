@@ -70,7 +70,7 @@ SETTING = "imported"
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
 
-ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean")
+ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced")
 """Of coarse models: those whose nodes are the corners of the cells, as a data set's."""
 
 

@@ -32,22 +32,21 @@ def warn_of_thin_cells(element: str, mesh: HexMesh, free: NDArray[np.bool_]) -> 
 def bending_alone(mesh: HexMesh, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which cells (C,) can bend and have no neighbour on either side along some axis of theirs.
 
-    To bend, a cell has neighbours along another axis and corners that may move along this one;
-    ``free`` (N, 3) tells.
+    To bend, a cell has neighbours along another axis, and on both of its faces across this one
+    corners that may move along it; ``free`` (N, 3) tells.
     """
     _, order, starts, counts = face_groups(mesh.cells)
     outer = np.zeros(6 * len(mesh.cells), dtype=bool)
     outer[order[starts[counts == 1]]] = True
     sides = outer.reshape(-1, 3, 2)  # the faces on both ends of each axis
-    free_standing = outer.reshape(-1, 6).all(axis=1, keepdims=True)
-    alone = np.logical_and(sides.all(axis=2), ~free_standing)
+    neighbours = 6 - outer.reshape(-1, 6).sum(axis=1)
+    alone = (sides.sum(axis=2) == 2) * (neighbours > 0)[:, None]  # (C, axis)
     thin = np.flatnonzero(alone.any(axis=1))
-    signs = 2.0 * VTK_CORNERS - 1.0
-    axes = np.abs(np.einsum("cki,km->cmi", mesh.positions[mesh.cells[thin]], signs))
+    corners = mesh.cells[thin]
+    axes = np.abs(np.einsum("cki,km->cmi", mesh.positions[corners], 2.0 * VTK_CORNERS - 1.0))
     along = axes > 0.5 * axes.max(axis=2, keepdims=True)  # (c, axis, component)
-    free_corners = free[mesh.cells[thin]].any(axis=1)  # (c, component)
-    moves = (free_corners[:, None] & along).any(axis=2)
-    bends = np.logical_and(alone[thin], moves)
+    may = np.einsum("cki,cmi->ckm", free[corners].astype(int), along.astype(int)) > 0
+    low, high = (((VTK_CORNERS == end) * may).any(axis=1) for end in (0, 1))
     found = np.zeros(len(mesh.cells), dtype=bool)
-    found[thin] = bends.any(axis=1)
+    found[thin] = (alone[thin] * low * high).any(axis=1)
     return found
