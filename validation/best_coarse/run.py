@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,6 @@ import numpy as np
 
 import pdcorrect as pc
 from pdcorrect.fem.loads import Amplitude, NodalLoad, torsion_field
-from pdcorrect.fem.operators import Space
-from pdcorrect.fem.quadrature import Quadrature
 from pdcorrect.scene import Torsion
 
 Array = np.ndarray
@@ -107,15 +105,13 @@ class Model:
     """A discretisation.
 
     ``lumped`` is the share of the lumped mass, the rest is consistent; force densities are
-    ``integrated`` with the shape functions, or their values at nodes times the nodes' volumes;
-    ``modes`` names further internal modes in `MODES`.
+    ``integrated`` with the shape functions, or their values at nodes times the nodes' volumes.
     """
 
     element: str
     lumped: float = 1.0
     integrated: bool = False
     refine: int = 1
-    modes: str = ""
 
     @property
     def label(self) -> str:
@@ -123,9 +119,8 @@ class Model:
         names = {0.0: "consistent", 0.5: "averaged", 1.0: "lumped"}
         mass = names.get(self.lumped, f"{self.lumped:g} lumped")
         cells = "" if self.refine == 1 else f" {self.refine}x"
-        modes = f" + {self.modes}" if self.modes else ""
         loads = "integrated" if self.integrated else "nodal"
-        return f"{self.element}{modes}{cells}, {mass}, {loads}"
+        return f"{self.element}{cells}, {mass}, {loads}"
 
 
 PLAIN = Model("hex8")
@@ -136,72 +131,13 @@ BEST = Model("hex8-enhanced", 0.5, True)
 """What `pdcorrect.best_coarse` chooses."""
 MODELS = (
     Model("hex8", refine=2), DEFAULT, Model("hex8", 0.5, True), Model("hex8-mean", 0.5, True),
-    Model("hex8-bubble", 0.5, True), Model("hex8-bubble", 0.5, True, modes="3 warping"),
-    Model("hex8-bubble-mean", 0.5, True),
+    Model("hex8-bubble", 0.5, True), Model("hex8-bubble-mean", 0.5, True),
     *(Model("hex8-enhanced", a, True) for a in (1.0, 0.5, 0.0)), Model("hex27", 0.5, True),
 )  # fmt: skip
 THIN_MODELS = tuple(
     Model(e, 0.5, True) for e in ("hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex27")
 )
-VARIED_MODELS = tuple(Model("hex8-bubble", a, True) for a in (0.5, 0.0))
-
-
-# --- further internal modes ----------------------------------------------------------------
-
-
-def _quadratic(points: Array, pairs: Iterable[tuple[int, int]]) -> Array:
-    """Gradients of s_n (1/3 - s_m^2), (Q, modes, 3), on the cell [-1, 1]^3 for pairs (m, n)."""
-    s = 2.0 * points - 1.0
-    out = []
-    for m, n in pairs:
-        gradient = np.zeros_like(s)
-        gradient[:, n] = 1.0 / 3.0 - s[:, m] ** 2
-        gradient[:, m] = -2.0 * s[:, m] * s[:, n]
-        out.append(2.0 * gradient)
-    return np.stack(out, axis=1)
-
-
-def _antisymmetric(points: Array) -> Array:
-    """Warping of a quarter of a square section: s_n (1/3 - s_m^2) - s_m (1/3 - s_n^2)."""
-    pairs = [(0, 1), (1, 2), (2, 0)]
-    return _quadratic(points, pairs) - _quadratic(points, [(n, m) for m, n in pairs])
-
-
-def _all(points: Array) -> Array:
-    """All six products of a bubble and another coordinate."""
-    return _quadratic(points, [(m, n) for m in range(3) for n in range(3) if m != n])
-
-
-MODES: dict[str, Callable[[Array], Array]] = {"3 warping": _antisymmetric, "6 products": _all}
-"""Gradients (Q, modes, 3) on the unit cell; their mean over the Gauss points is zero."""
-
-
-class EnrichedSpace(Space):
-    """A space with more internal modes, on cells that are cubes."""
-
-    def __init__(self, plain: Space, gradients: Callable[[Array], Array], size: float) -> None:
-        self.__dict__.update(plain.__dict__)
-        points = self._basis.quadrature[0].T
-        self._more = gradients(points) / size
-        cells, count = len(self.cells), self._more.shape[1]
-        modes = len(self.positions) + self.internal + np.arange(cells * count)
-        self.local = np.concatenate([self.local, modes.reshape(cells, count)], axis=1)
-        self.internal += cells * count
-
-    def quadrature(self) -> Quadrature:
-        """Gradients and volumes at the quadrature points."""
-        plain = super().quadrature()
-        more = np.broadcast_to(self._more, (len(self.cells), *self._more.shape))
-        lanes = np.concatenate([plain.lanes, np.moveaxis(more, 1, 3)], axis=1)
-        return replace(plain, lanes=lanes)
-
-
-def enriched(problem: pc.Problem, modes: str) -> pc.Problem:
-    """The problem with the further internal modes of a name."""
-    if not modes:
-        return problem
-    space = EnrichedSpace(problem.space, MODES[modes], problem.cell_size / problem.refine)
-    return replace(problem, space=space, quadrature=space.quadrature())
+VARIED_MODELS = tuple(Model("hex8-enhanced", a, True) for a in (0.5, 0.0))
 
 
 # --- problems ------------------------------------------------------------------------------
@@ -224,7 +160,6 @@ def discretised(motion: str, model: Model) -> pc.Problem:
     """A motion's problem."""
     keys, told = ALL[motion], scene(motion)
     problem = pc.discretise(told, model.refine, "consistent", model.element)
-    problem = enriched(problem, model.modes)
     share = model.lumped
     lumped = pc.discretise(told, model.refine, "lumped", model.element).mass_matrix
     matrix = lumped if share == 1.0 else share * lumped + (1.0 - share) * problem.mass_matrix
@@ -292,16 +227,6 @@ def reference_error(motion: str) -> common.Figures:
     return figures
 
 
-def zero_modes(modes: str) -> int:
-    """Motions of one free cell, internal modes included, that cost no energy."""
-    body = {"shape": "beam", "cells": [1, 1, 1], "cell_size": CELL}
-    told = pc.Scene(body=body, material=MATERIAL, time={"step": 1.0, "frames": 1})
-    problem = enriched(pc.discretise(told, element="hex8-bubble"), modes)
-    tangent = problem.linearise(problem.extended(problem.positions)).assemble().toarray()
-    values = np.linalg.eigvalsh(0.5 * (tangent + tangent.T))
-    return int((values < 1e-10 * values[-1]).sum())
-
-
 def summary(figures: common.Figures) -> common.Figures:
     """Over all motions: Omega of the summed squared errors, mean and least Omega.
 
@@ -335,8 +260,6 @@ def compute() -> common.Figures:
     for motion in CHECKS:
         figures |= shares(motion, (BEST,))
         figures |= reference_error(motion)
-    for modes in MODES:
-        figures[f"zero modes, {modes}"] = zero_modes(modes)
     return figures | summary(figures)
 
 
@@ -385,5 +308,4 @@ def case(quick: bool) -> common.Outcome:
     """The case's outcome."""
     if not quick:
         return common.Outcome(compute())
-    figures = shares("short beam, bend", (BEST,))
-    return common.Outcome(figures | {f"zero modes, {m}": zero_modes(m) for m in MODES})
+    return common.Outcome(shares("short beam, bend", (BEST,)))

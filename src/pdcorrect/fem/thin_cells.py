@@ -46,7 +46,7 @@ def bending_alone(mesh: HexMesh, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
     axes = np.abs(np.einsum("cki,km->cmi", mesh.positions[corners], 2.0 * VTK_CORNERS - 1.0))
     along = axes > 0.5 * axes.max(axis=2, keepdims=True)  # (c, axis, component)
     may = np.einsum("cki,cmi->ckm", free[corners].astype(int), along.astype(int)) > 0
-    low, high = (((VTK_CORNERS == end) * may).any(axis=1) for end in (0, 1))
+    low, high = (((end == VTK_CORNERS) * may).any(axis=1) for end in (0, 1))
     found = np.zeros(len(mesh.cells), dtype=bool)
     found[thin] = (alone[thin] * low * high).any(axis=1)
     return found
