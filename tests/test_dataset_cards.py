@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from dataset_samples import sample_shard, with_simulation, write_dataset
+from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.summary import dataset_info
@@ -24,6 +25,13 @@ def card(monkeypatch):
 def test_the_card_of_the_tiny_set_is_that_of_its_files(card):
     info = dataset_info(TINY)
     assert card.dataset_card(TINY, info) == (TINY / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("path", sorted(DATASETS.glob("*/README.md")), ids=lambda p: p.parent.name)
+def test_every_card_says_what_its_configuration_asks_for(card, path):
+    own = set(path.read_text(encoding="utf-8").splitlines())
+    config = DatasetConfig.load(path.with_name("config.toml"))
+    assert {f"- {line}" for line in card._what(config)} <= own
 
 
 def test_rejected_loads_are_counted_by_split_run_and_reason(card, program, tmp_path):
