@@ -7,7 +7,8 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
     python docs/tables.py --check   # exit 1 if a page would change
 
 A table is a function without arguments that returns the header's cells and the rows' cells; those
-of models are in `model_tables`, those of pages in `page_tables`, and what all use in `records`.
+of models are in `model_tables`, those of pages in `page_tables`, those of cases about time in
+`time_tables`, and what all use in `records`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pathlib import Path
 import benchmark_tables
 import model_tables
 import page_tables
+import time_tables
 from records import RECORDS, ROOT, Rows, number, read
 
 _BLOCK = re.compile(r"(<!-- table: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -71,6 +73,7 @@ TABLES: dict[str, Callable[[], Rows]] = {
     **dict(model_tables.tables()),
     **dict(benchmark_tables.tables()),
     **dict(page_tables.tables()),
+    **dict(time_tables.tables()),
 }
 
 

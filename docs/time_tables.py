@@ -1,0 +1,71 @@
+"""Tables of the validation cases about time and of the published benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from statistics import fmean
+from typing import Any
+
+from records import RECORDS, Rows, number, percent, read
+
+INTEGRATORS = ("backward-euler", "bdf2", "midpoint", "generalised-alpha")
+
+
+def table_of(case: str, name: str) -> tuple[Sequence[str], list[list[Any]]]:
+    """Headings and rows of a case's table."""
+    record = read(RECORDS / f"{case}.json")
+    found = next(table for table in record["tables"] if table["name"] == name)
+    return found["headings"], found["rows"]
+
+
+def as_measured(case: str, name: str, digits: int = 3, columns: slice = slice(None)) -> Rows:
+    """A table of a record as it is."""
+    heads, rows = table_of(case, name)
+    cells = [
+        [cell if isinstance(cell, str) else number(cell, digits) for cell in row[columns]]
+        for row in rows
+    ]
+    return heads[columns], cells
+
+
+def orders() -> Rows:
+    """Orders of positions in time by load and damping."""
+    _, rows = table_of("time_orders", "Orders in time")
+    found = {tuple(row[:3]): row[3] for row in rows}
+    pairs = dict.fromkeys((row[0], row[1]) for row in rows)
+    cells = [[*pair, *(percent(found[*pair, name], 2) for name in INTEGRATORS)] for pair in pairs]
+    return ("load", "damping", *INTEGRATORS), cells
+
+
+def errors() -> Rows:
+    """Mean and worst errors of the time step by motion and damping."""
+    heads, rows = table_of("time_error", "Errors, % of the RMS displacement")
+    cells = []
+    for kind, damping in dict.fromkeys((row[0], row[1]) for row in rows):
+        columns = zip(*(row[4:] for row in rows if row[:2] == [kind, damping]), strict=True)
+        shares = [f"{number(fmean(x), 2)} ({number(max(x), 2)})" for x in columns]
+        cells.append([kind, damping, *shares])
+    return (*heads[:2], *heads[4:]), cells
+
+
+def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
+    """By name."""
+    yield "time-orders", orders
+    yield "time-errors", errors
+    yield "energy-long", partial(as_measured, "energy", "Energy over that of the start")
+    for which, start in (("twist", "Stiff body let go twisted"), ("weight", "Stiff body under")):
+        yield f"energy-{which}", partial(starting, "energy", start)
+    yield "energy-errors", partial(as_measured, "energy", "Errors, % of the RMS displacement")
+    yield "turek-hron-rest", partial(as_measured, "turek_hron", "CSM1", 4)
+    yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
+    yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
+    yield "columns", partial(as_measured, "columns", "Columns")
+    yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
+
+
+def starting(case: str, start: str) -> Rows:
+    """The table whose name begins so."""
+    record = read(RECORDS / f"{case}.json")
+    name = next(t["name"] for t in record["tables"] if t["name"].startswith(start))
+    return as_measured(case, name, 2)
