@@ -31,7 +31,8 @@ def scene(motion: str, mass: str, density: float = 1e3) -> pc.Scene:
         name=motion, body=BODY, loads=[LOADS[motion]],
         material={"young": 3e5, "poisson": 0.4, "density": density},
         clamps=[{"region": {"plane": "x", "at": "min"}}],
-        time={"step": 0.01, "frames": FRAMES}, solver={"mass": mass, "tolerance": 1e-5},
+        time={"step": 0.01, "frames": FRAMES, "integrator": "backward-euler"},
+        solver={"mass": mass, "tolerance": 1e-5},
     )  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def scene(motion: str, share: float = 1.0, split: int = 1, **sections: Any) -> p
         "body": {"shape": "beam", "cells": [6, 2, 2], "cell_size": CELL},
         "material": {"young": 3e5, "poisson": 0.4, "density": 1e3},
         "clamps": [{"region": {"plane": "x", "at": "min"}}], "loads": [load],
-        "time": {"step": STEP / split, "frames": FRAMES * split},
+        "time": {"step": STEP / split, "frames": FRAMES * split, "integrator": "backward-euler"},
     }  # fmt: skip
     for name, change in sections.items():
         settings[name] = {**settings.get(name, {}), **change}

@@ -65,7 +65,8 @@ def beam(
     material = {"young": 1e6, "poisson": 0.4, "density": 1e3, **sections.pop("material", {})}
     settings = {
         "body": {"shape": "beam", "cells": cells, "cell_size": CELL},
-        "clamps": [HELD], "time": {"step": step, "frames": frames},
+        "clamps": [HELD],
+        "time": {"step": step, "frames": frames, "integrator": "backward-euler"},
     }  # fmt: skip
     return pc.Scene(**{**settings, "material": material, **sections})
 
