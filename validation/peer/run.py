@@ -45,8 +45,11 @@ def scene(
         },
         clamps=[{"region": {"plane": "x", "at": 0.0}}],
         loads=[{"kind": "gravity", "acceleration": data["gravity"]}],
-        time={"step": float(data["time_step"]), "frames": len(data["positions"]) - 1,
-              "integrator": "backward-euler"},
+        time={
+            "step": float(data["time_step"]),
+            "frames": len(data["positions"]) - 1,
+            "integrator": "backward-euler",
+        },
         solver={"mass": mass, "tolerance": tolerance},
     )
 
