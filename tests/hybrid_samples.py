@@ -16,6 +16,8 @@ from pdcorrect.corrector.normaliser import RunningMoments
 
 PLACEMENTS = ("state", "force", "guess")
 TORSION = {"kind": "torsion", "strength": 3e3, "stretch": 0.01}
+EULER = {"integrator": "backward-euler"}
+"""By which correctors learn, and forces and energies of a correction are known in advance."""
 CELL = 0.02
 """Of all bodies here, m."""
 TINY = {
@@ -47,9 +49,10 @@ class Watched(Corrector):
 
 
 def soft_beam(cells=(3, 1, 1), **changes):
-    """Small, moves a good part of its cells, and steps as correctors learn: backward Euler."""
-    time = {"integrator": "backward-euler", **changes.pop("time", {})}
-    return beam(cells, material={"young": 5e4}, time=time, **changes)
+    """Small, moves a good part of its cells, and steps as correctors learn."""
+    return beam(
+        cells, material={"young": 5e4}, time={**EULER, **changes.pop("time", {})}, **changes
+    )
 
 
 def problems(*cells):
@@ -173,7 +176,7 @@ def wild(problem):
 
 def flying(speed=0.5):
     """A free body in uniform motion along x, and its state."""
-    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2))
+    problem = problem_on(box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2), time=EULER)
     velocities = np.zeros_like(problem.positions)
     velocities[:, 0] = speed
     return problem, pc.State(problem.positions, velocities)

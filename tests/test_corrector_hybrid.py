@@ -10,6 +10,7 @@ import pdcorrect as pc
 from conftest import box_mesh, held, problem_on, rotation
 from hybrid_samples import (
     CELL,
+    EULER,
     PLACEMENTS,
     TINY,
     TORSION,
@@ -172,7 +173,7 @@ def test_a_force_moves_a_free_body_by_the_correction(mass):
     """In a step of backward Euler, by which the force is defined."""
     problem = problem_on(
         box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2), solver={"mass": mass},
-        time={"integrator": "backward-euler"},
+        time=EULER,
     )  # fmt: skip
     shift = np.broadcast_to([1e-3, 2e-3, -3e-3], problem.positions.shape)
     corrector = prescribed(problem, shift, placement="force")
