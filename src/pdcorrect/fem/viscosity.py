@@ -30,7 +30,7 @@ from pdcorrect.fem.kernels import CHUNK, PARALLEL, deformation, gather_nodes, no
 
 Array = NDArray[np.float64]
 
-_KINK = 1e-9
+KINK = 1e-9
 """Of the largest stretch: s_i + s_j up to which an entry counts as one of a kink."""
 
 
@@ -146,7 +146,7 @@ def _decompose(u, cells, gradients, left, right, values, tensor):  # type: ignor
 
 @njit(**OPTIONS)
 def _inverse(sum_of_two, s, q):  # type: ignore[no-untyped-def]
-    return 1.0 / sum_of_two if abs(sum_of_two) > _KINK * s[0, q] else 0.0
+    return 1.0 / sum_of_two if abs(sum_of_two) > KINK * s[0, q] else 0.0
 
 
 @njit(**OPTIONS)
