@@ -94,13 +94,13 @@ def main(name, mesh_file=""):
     from pdcorrect.solvers import step
 
     counts = Counter(dict.fromkeys([*COUNTED, "volume lanes", "damping"], 0))
-    build = step.StepDamping.__init__
+    build = step.Rayleigh.__init__
 
     def damped(self, *arguments):
         counts["damping"] += 1
         build(self, *arguments)
 
-    step.StepDamping.__init__ = damped
+    step.Rayleigh.__init__ = damped
     if os.environ.get("NUMBA_DISABLE_JIT") == "1":
         count_calls(counts)
     body = {"body": {"shape": "file", "path": mesh_file}} if mesh_file else {}

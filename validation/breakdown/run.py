@@ -12,7 +12,7 @@ import numpy as np
 import pdcorrect as pc
 
 SCENE = pc.Scene.load(Path(__file__).parents[2] / "examples" / "unseen_cross.toml")
-FRAMES, QUICK_FRAMES = 120, 80
+FRAMES, QUICK_FRAMES = 120, 76
 MESHES = {
     "hex8": SCENE,
     "best coarse": pc.best_coarse(SCENE),
