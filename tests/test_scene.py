@@ -46,6 +46,7 @@ def test_the_documented_scene_is_read():
     scene = pc.Scene.from_toml(TEXT)
     assert scene.body.cells == (24, 2, 2)
     assert scene.time.step == 0.01
+    assert (scene.time.integrator, scene.time.spectral_radius) == ("generalised-alpha", 0.8)
     assert scene.loads[0].acceleration == (0, 0, -9.81)
     assert scene.clamps[0].components == ("x", "y", "z")
     assert scene.solver.mass == "lumped"

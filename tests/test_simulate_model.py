@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,23 @@ def test_a_hybrid_in_one_call_has_the_gate_that_it_is_given():
     for given in (1, "strict", {"corners": 0.0}):
         with pytest.raises(pc.errors.InputError, match="gate"):
             pc.hybrid_of(scene, MODEL, gate=given)
+
+
+@pytest.mark.parametrize("integrator", ["generalised-alpha", "midpoint", "backward-euler"])
+def test_another_integrator_than_the_training_s_is_warned_of_in_one_line(learned, integrator):
+    scene = pc.Scene.load(SCENE).with_changes(time={"integrator": integrator})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        pc.hybrid_of(scene, MODEL)
+    told = [str(w.message) for w in caught if w.category is pc.errors.PdcorrectWarning]
+    if integrator == "backward-euler":
+        assert not told
+        return
+    (line,) = told
+    assert "\n" not in line
+    assert f"{MODEL}: " in line
+    assert repr(integrator) in line
+    assert 'integrator = "backward-euler"' in line
 
 
 def test_a_quasi_static_scene_is_refused_unless_the_model_was_trained_on_such(
