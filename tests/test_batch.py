@@ -25,7 +25,7 @@ from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
 
-VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean"]
+VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced"]
 DEVICES = [
     "cpu",
     pytest.param(
@@ -373,12 +373,9 @@ def test_batches_that_cannot_be_are_refused_by_name():
     radii = ({"integrator": "generalised-alpha", "spectral_radius": r} for r in (0.5, 0.8))
     with pytest.raises(InputError, match=r"time\.spectral_radius"):
         batch(*(unlike(i, time=time) for i, time in enumerate(radii)))
-    shift = {"times": [0.0, 1.0], "displacement": [[0, 0, 0], [0.1, 0, 0]]}
-    moved = [{"region": {"plane": "x", "at": 0.0}, "motion": shift}]
-    with pytest.raises(InputError, match="clamps.*midpoint"):
-        batch(unlike(0, clamps=moved), integrator="midpoint")
-    with pytest.raises(InputError, match=r"damping\.stiffness"):
-        batch(unlike(0, damping={"stiffness": 0.1}))
+    for name in ("viscosity", "stiffness", "mass"):
+        with pytest.raises(InputError, match=rf"damping\.{name}"):
+            batch(unlike(0), unlike(1, damping={name: 0.1}))
     adrift = batch(beam((2, 1, 1), clamps=[], loads=[]), integrator="quasi-static")
     with pytest.raises(ConvergenceError, match="scene 'scene'"):
         adrift(adrift.rest_state())
@@ -851,7 +848,7 @@ def test_points_do_not_depend_on_how_their_numbers_lie_in_memory(element):
     apart = H.transpose(0, 1).contiguous().transpose(0, 1)  # as on a GPU
     assert H.stride() != apart.stride()
     for a, b in zip(
-        cells._points.stress(H, cells._weights), cells._points.stress(apart, cells._weights),
+        cells.points.stress(H, cells.point_weights), cells.points.stress(apart, cells.point_weights),
         strict=True,
     ):  # fmt: skip
         assert torch.equal(a, b)

@@ -288,8 +288,6 @@ def test_wrong_input_is_refused_by_name():
         layer(p, v.float())
     with pytest.raises(InputError, match="forces: "):
         layer(p, v, f[:1])
-    with pytest.raises(InputError, match="needs a memory"):
-        pc.PDLayer(small_batch(integrator="bdf2"))
 
 
 @pytest.mark.parametrize(
@@ -397,9 +395,10 @@ def test_calls_one_after_the_other_see_the_loads_of_their_time():
     start = stepper.rest_state()
     p, v = start.positions, start.velocities
     expected, _ = pc.PDLayer(stepper, 4)(p, v)
-    layer, found, still = pc.PDLayer(stepper), (p, v), (p, v)
+    layer, found, still, memory = pc.PDLayer(stepper), (p, v), (p, v), {}
     for k in range(4):
-        found = layer(*found, times=[k * stepper.time_step])
+        found = layer(*found, times=[k * stepper.time_step], memory=memory)
+        memory = layer.memory
         still = layer(*still)
     torch.testing.assert_close(found[0], expected, rtol=0, atol=1e-12)
     assert not torch.allclose(still[0], expected, rtol=0, atol=1e-6)

@@ -267,7 +267,7 @@ class BatchGradients:
         damping = self._damping
         if damping.has_rayleigh:
             self._pull(scheme.origin, scheme.clamped_origin, damping.origin)
-            self._pull(scheme.start, scheme.clamped, damping.place)
+            self._pull(scheme.foreseen or scheme.start, scheme.clamped, damping.place)
         pairs = zip(scheme.strains, damping.places, strict=False)
         for (_, place), slope in pairs:
             place.transpose(slope, self._sums)

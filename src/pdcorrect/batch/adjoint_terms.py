@@ -42,7 +42,7 @@ class DampingTerms:
             self._offset = y - self._origin
             self._by_origin = objective.rayleigh(x)
         if objective.tangent is not None:
-            self._at = relaxed(self._cells, stage.start)
+            self._at = relaxed(self._cells, stage.foreseen)
             self._along = self._cells.apply(objective.tangent, self._offset)
         if self._viscous:
             S, frames = viscosity.stretches(self._cells, y)

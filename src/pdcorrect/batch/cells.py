@@ -300,7 +300,7 @@ class CellBatch:
 
     def _by_scene(self, x: Tensor) -> Tensor:
         """(k, B C, Q) as (k, B, C, Q)."""
-        return x.reshape(len(x), self.sizes.scenes, self.sizes.cells, -1)
+        return x.reshape(len(x), self.sizes.scenes, self.sizes.cells, x.shape[-1])
 
     @property
     def _rows(self) -> tuple[int, ...]:

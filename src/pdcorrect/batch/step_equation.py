@@ -40,8 +40,8 @@ class BatchStepEquation:
         Time intervals over which each scene's loads act, s.
     target : (B, U, 3)
         q, m; not changed later.
-    origin, start : (B, N, 3)
-        O and the first iterate, m; the latter prescribed where clamped.
+    origin, start, foreseen : (B, N, 3)
+        See `Scheme`, m; the last two prescribed where clamped.
     strains : list of (float, (B, N, 3))
         See `Scheme`.
     """
@@ -52,6 +52,7 @@ class BatchStepEquation:
     target: Tensor
     origin: Tensor
     start: Tensor
+    foreseen: Tensor
     strains: list[tuple[float, Tensor]]
 
 
@@ -97,6 +98,7 @@ class BatchStaging:
             self.extended(self._split(known, scheme.target, scheme.clamped_target)),
             self._split(known, scheme.origin, scheme.clamped_origin),
             self._split(known, scheme.start, scheme.clamped),
+            self._split(known, scheme.foreseen or scheme.start, scheme.clamped),
             [(a, x(known)) for a, x in scheme.strains],
         )
 

@@ -394,7 +394,7 @@ class BatchStepper:
     def _damp(self, stage: BatchStepEquation) -> None:
         objective, cells = self.objective, self.cells
         if objective.tangent is not None:
-            tangent = cells.linearise(relaxed(cells, stage.start), project=True)
+            tangent = cells.linearise(relaxed(cells, stage.foreseen), project=True)
             for kept, new in zip(objective.tangent, tangent, strict=True):
                 kept.copy_(new)
             objective.origin.copy_(relaxed(cells, stage.origin))

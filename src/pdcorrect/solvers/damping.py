@@ -25,8 +25,8 @@ class Rayleigh:
         o, with the internal modes in equilibrium there: their velocity at y, like the
         nodes', is d times the change since.
     at : (N + B, 3), tangent : Linearisation
-        The first iterate of the step, which is y to second order, and K there, projected;
-        only if ``stiffness`` is not zero.
+        Where y is foreseen, to second order, and K there, projected; only if
+        ``stiffness`` is not zero.
     """
 
     def __init__(self, problem: Problem, stage: StepEquation) -> None:
@@ -37,7 +37,7 @@ class Rayleigh:
         if not self.stiffness:
             self.origin = problem.extended(stage.origin)
             return
-        self.at = problem.relaxed(stage.start)
+        self.at = problem.relaxed(stage.foreseen)
         self.tangent = problem.linearise(self.at, project=True)
         self.origin = problem.relaxed(stage.origin)
 

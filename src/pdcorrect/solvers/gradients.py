@@ -290,7 +290,7 @@ class Gradients:
             self._pull(scheme.target, scheme.clamped_target, by_target)
         if self._rayleigh is not None:
             self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
-            self._pull(scheme.start, scheme.clamped, self._rayleigh.place)
+            self._pull(scheme.foreseen or scheme.start, scheme.clamped, self._rayleigh.place)
         if self._viscous is not None:
             pairs = zip(scheme.strains, self._viscous.places, strict=True)
             for (_, place), slope in pairs:

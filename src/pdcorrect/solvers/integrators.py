@@ -36,8 +36,8 @@ class StepEquation:
         See `Scheme`.
     target, origin : (N, 3)
         q and o, m.
-    start : (N, 3)
-        First iterate, m; prescribed values where clamped.
+    start, foreseen : (N, 3)
+        See `Scheme`, m; prescribed values where clamped.
     loads_over : tuple of float
         Loads are averaged over this time interval (s), or taken at its ends if
         these are equal.
@@ -53,6 +53,7 @@ class StepEquation:
     rate: float
     origin: Array
     start: Array
+    foreseen: Array
     loads_over: tuple[float, float]
     finish: Callable[[Array], State]
     strain_rate: float = 0.0
@@ -127,6 +128,7 @@ class Integrator:
             scheme.rate,
             split(scheme.origin, scheme.clamped_origin),
             split(scheme.start, scheme.clamped),
+            split(scheme.foreseen or scheme.start, scheme.clamped),
             (first, last),
             finish,
             scheme.strain_rate,
@@ -184,7 +186,7 @@ def integrator(name: str, spectral_radius: float = 0.8, viscous: bool = False) -
     InputError
     """
     if name == "generalised-alpha":
-        return Integrator(schemes.generalised_alpha(spectral_radius, viscous))
+        return Integrator(schemes.GeneralisedAlpha(spectral_radius, viscous))
     if name == "midpoint" and viscous:
         return Integrator(partial(schemes.midpoint, viscous=True))
     if name not in INTEGRATORS:

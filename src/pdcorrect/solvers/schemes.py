@@ -126,8 +126,8 @@ class Scheme:
         d, 1/s.
     target, origin : Linear
         q and o, m.
-    start : Linear
-        First iterate, m: y to second order (backward Euler's to its own).
+    start, foreseen : Linear
+        First iterate, and y as far as it is known, m; the first where there is no second.
     positions, velocities : Linear
         After the step.
     clamped : Linear
@@ -158,6 +158,7 @@ class Scheme:
     clamped_target: Linear | None = None
     clamped_origin: Linear | None = None
     clamped_velocities: Linear | None = None
+    foreseen: Linear | None = None
     at: float = 1.0
     loads_over: tuple[float, float] = (0.0, 1.0)
     strain_rate: float = 0.0
@@ -202,9 +203,10 @@ def bdf2(h: float, known: frozenset[str]) -> Scheme:
     origin = _backward(_P, "previous_positions") if started else _P
     drift = _backward(_V, "previous_velocities") if started else _V
     target = origin + drift / rate
+    foreseen = _P + h * (1.5 * _V - Linear(previous_velocities=0.5)) if started else None
     kept = {"previous_positions": _P, "previous_velocities": _V, "previous_times": _TIME}
     return Scheme(
-        rate**2, rate, target, origin, target, _Y, rate * (_Y - origin),
+        rate**2, rate, target, origin, target, _Y, rate * (_Y - origin), foreseen=foreseen,
         loads_over=(0.5 if started else 0.0, 1.5), strain_rate=rate, strains=strains,
         memory={name: (row, row) for name, row in kept.items()},
     )  # fmt: skip
@@ -253,26 +255,39 @@ def _between(
     return 1.5 / h, ((4.0 / 3.0, last), (-1.0 / 3.0, before)), memory
 
 
-def generalised_alpha(spectral_radius: float, viscous: bool = False) -> SchemeOf:
+@dataclass(frozen=True)
+class GeneralisedAlpha:
     """Chung and Hulbert (1993): second order, with chosen damping of high frequencies.
 
     A step from a state without accelerations takes its own for the one at its start too,
     which, at the start only, does not lower the order.
 
-    Parameters
+    Attributes
     ----------
     spectral_radius : float
         At infinite frequency, 0 to 1.
     viscous : bool
         Whether the steps need the rate of stretch.
-    """
-    r = spectral_radius
-    if not 0.0 <= r <= 1.0:
-        raise InputError(f"spectral_radius = {r!r}: expected a number from 0 to 1.")
-    alpha_f = r / (r + 1.0)
 
-    def scheme(h: float, known: frozenset[str]) -> Scheme:
-        started = "accelerations" in known
+    Raises
+    ------
+    InputError
+        If the spectral radius is outside.
+    """
+
+    spectral_radius: float
+    viscous: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.spectral_radius <= 1.0:
+            raise InputError(
+                f"spectral_radius = {self.spectral_radius!r}: expected a number from 0 to 1."
+            )
+
+    def __call__(self, h: float, known: frozenset[str]) -> Scheme:
+        """The scheme of a step of h seconds."""
+        r, started = self.spectral_radius, "accelerations" in known
+        alpha_f = r / (r + 1.0)
         alpha_m = (2.0 * r - 1.0) / (r + 1.0) if started else 0.0
         gamma = 0.5 - alpha_m + alpha_f if started else 1.0
         beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2 if started else 0.5
@@ -291,13 +306,15 @@ def generalised_alpha(spectral_radius: float, viscous: bool = False) -> SchemeOf
         acceleration = (_CLAMP_VELOCITY - _V) / h
         if started:
             acceleration += Linear(clamp_jump=1.0)
-        strain_rate, strains, memory = _between(h, 1.0 - alpha_f, known, viscous)
+        start = _P + (1.0 - alpha_f) * h * _V
+        strain_rate, strains, memory = _between(h, 1.0 - alpha_f, known, self.viscous)
         return Scheme(
             inertia,
             rate,
             target=_P - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale,
             origin=_P - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * _V) / rate,
-            start=_P + (1.0 - alpha_f) * h * _V,
+            start=start,
+            foreseen=start + 0.5 * ((1.0 - alpha_f) * h) ** 2 * a,
             positions=_P + (_Y - _P) / (1.0 - alpha_f),
             velocities=ahead(new),
             clamped=clamped,
@@ -311,8 +328,6 @@ def generalised_alpha(spectral_radius: float, viscous: bool = False) -> SchemeOf
             gain=1.0 / (1.0 - alpha_f),
             memory={"accelerations": (new, Linear()), **memory},
         )
-
-    return scheme
 
 
 def quasi_static(h: float, known: frozenset[str] = frozenset()) -> Scheme:
