@@ -848,7 +848,8 @@ def test_points_do_not_depend_on_how_their_numbers_lie_in_memory(element):
     apart = H.transpose(0, 1).contiguous().transpose(0, 1)  # as on a GPU
     assert H.stride() != apart.stride()
     for a, b in zip(
-        cells.points.stress(H, cells.point_weights), cells.points.stress(apart, cells.point_weights),
+        cells.points.stress(H, cells.point_weights),
+        cells.points.stress(apart, cells.point_weights),
         strict=True,
     ):  # fmt: skip
         assert torch.equal(a, b)

@@ -1,5 +1,7 @@
 """Loads over a step: momentum of an impulse, order in time, and loads that follow the body."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -93,7 +95,7 @@ def test_loads_that_follow_keep_the_order_in_time(name, integrator):
         run = pc.rollout(stepper, steps)
         assert set(run.stats["status"]) == {"CONVERGED"}
         ends.append(run.positions[-1])
-    changes = [np.linalg.norm(b - a) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    changes = [np.linalg.norm(b - a) for a, b in pairwise(ends)]
     order = np.log2(changes[-2] / changes[-1])
     least, most = (0.5, 1.5) if integrator == "backward-euler" else (1.6, 2.6)
     assert least < order < most

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model, discretise
-from pdcorrect.scene import Scene, best_coarse, trained_coarse
+from pdcorrect.scene import Scene, best_coarse, check_scene, trained_coarse
 
 
 @dataclass(frozen=True)
@@ -183,6 +183,7 @@ def without_best(scene: Scene) -> str | None:
 
     Where the scene itself cannot be discretised the reason is that of the scene.
     """
+    check_scene(scene)
     if _is_best(scene):
         return "the scene's own element and mass are those of the best coarse model"
     return _impossible(scene, best_coarse(scene))
