@@ -111,6 +111,28 @@ def step(
     return rows
 
 
+def integrator(
+    length: str, refine: str, scheme: str, frames: str = "30", viscosity: str = "0"
+) -> dict[str, Any]:
+    """Milliseconds a step by an integrator at the default tolerance, and peak memory."""
+    scene = beam(int(length), "ours", int(frames)).with_changes(
+        time={"integrator": scheme}, damping={"viscosity": float(viscosity)}
+    )
+    problem = pc.discretise(pc.best_coarse(scene), refine=int(refine))
+    run = pc.rollout(pc.ProjectiveDynamics(problem).prepare())
+    seconds = run.stats["seconds"][2:]  # steps that begin are others
+    return {
+        "nodes": len(problem.positions),
+        "integrator": scheme,
+        "viscosity": float(viscosity),
+        "median_step_ms": 1e3 * float(np.median(seconds)),
+        "mean_step_ms": 1e3 * float(np.mean(seconds)),
+        "iterations": float(np.mean(run.stats["iterations"][2:])),
+        "peak_mb": peak(),
+        "statuses": sorted(set(run.stats["status"].tolist())),
+    }
+
+
 def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[str, Any]:
     """Milliseconds of one iteration of L-BFGS with a full history, without the error estimate."""
     from pdcorrect.solvers.first_hessian import TrueHessian

@@ -178,9 +178,29 @@ def _iterations(problem: pc.Problem, motion: str, start: str) -> float:
     return cases.mean_iterations(problem, motion, hessian.solver, options, guess)
 
 
+def integrators() -> list[dict[str, Any]]:
+    """A step by each integrator, two threads, the best of three processes."""
+    rows = []
+    for length, refine in SIZES[:3]:
+        frames = 30 if refine < 4 else 12
+        for name in ("backward-euler", "bdf2", "midpoint", "generalised-alpha"):
+            for viscosity in (0.0, 2e-3) if name == "generalised-alpha" else (0.0,):
+                found = [
+                    measure(
+                        2, "integrator", length=length, refine=refine, scheme=name, frames=frames,
+                        viscosity=viscosity,
+                    )
+                    for _ in range(3)
+                ]  # fmt: skip
+                best = min(found, key=lambda row: row["median_step_ms"])
+                rows.append({"threads": 2, "tolerance": 1e-5, **best})
+    return rows
+
+
 CASES: dict[str, Callable[[], Any]] = {
     "kernel": kernel,
     "beam_steps": beam_steps,
+    "integrators": integrators,
     "iteration": iteration,
     "newton": newton,
     "memory": memory,

@@ -16,9 +16,9 @@ class _Load(Strict):
 
     The load's value is multiplied by an amplitude: 1 inside ``window`` (s) and
     0 outside, rising linearly during the first ``ramp`` seconds of the window;
-    or given by ``table`` = [[time, amplitude], ...], piecewise linear.  A time
-    step uses the mean amplitude over the step, so an impulse does not depend on
-    the step size.
+    or given by ``table`` = [[time, amplitude], ...], piecewise linear.  Each time
+    step uses the mean amplitude over an interval of its length, so the momentum of an
+    impulse does not depend on the step size.
     """
 
     window: tuple[Number, Number] | None = None
@@ -83,8 +83,8 @@ class Traction(_Load):
 class Pressure(_Load):
     """Pressure (Pa, positive pushes inwards) on the boundary faces of a region.
 
-    ``follower = true`` uses the faces' current area and normal at the start of
-    each step; otherwise those at rest.
+    ``follower = true`` uses the faces' current area and normal, where the step's
+    equation is; otherwise those at rest.
     """
 
     kind: Literal["pressure"]
@@ -101,8 +101,8 @@ class Torsion(_Load):
 
     ``distribution = "consistent"``: strength is a force density, N/m3,
     integrated with Gauss points.  ``"nodal"``: strength is the force on each
-    coarse node, N.  ``follower = true`` samples the field at the positions at
-    the start of each step instead of at rest.
+    coarse node, N.  ``follower = true`` samples the field at the positions where
+    the step's equation is instead of at rest.
     """
 
     kind: Literal["torsion"]
