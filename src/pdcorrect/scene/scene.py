@@ -192,9 +192,9 @@ def check_scene(scene: object) -> None:
 def best_coarse(scene: Scene) -> Scene:
     """The scene with the most accurate discretisation that a coarse mesh affords.
 
-    Element "hex8-enhanced" and averaged mass: of the elements with 8 nodes they remove
-    most of the plain coarse mesh's error (see `validation/best_coarse`), however many cells
-    a body is thick.
+    Element "hex8-enhanced" and averaged mass: of the elements with 8 nodes the one that bends
+    as beam theory says, however many cells a body is thick (`validation/cantilever`).  What is
+    left of the plain coarse mesh's error is in `validation/best_coarse`.
 
     Loads stay as they are.  "consistent" ones are already integrated with the shape
     functions; "nodal" ones are concentrated forces, so to spread them would be another
