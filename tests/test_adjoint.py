@@ -275,7 +275,8 @@ def test_so_they_are_by_a_poisson_ratio_of_zero(energy, stiffness):
 )
 def test_a_term_that_the_energy_lacks_has_no_derivative(energy, without):
     material = {"young": 2e5, "poisson": 0.3, "energy": energy}
-    found = Case(pc.discretise(scene(material=material))).found
+    time = {"step": 0.003, "frames": 2}
+    found = Case(pc.discretise(scene(material=material, time=time))).found
     for name in ("mu", "lam"):
         assert getattr(found, name).any() == (name != without)
 
@@ -362,7 +363,8 @@ def test_projective_dynamics_and_newton_have_the_same_gradients(element):
 
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
 def test_all_solvers_agree(element):
-    problem = pc.discretise(scene(element, time={"step": 0.003, "frames": 2}))
+    time = {"step": 0.003, "frames": 2}
+    problem = pc.discretise(scene(element, time=time, loads=[GRAVITY]))
     cases = {
         name: Case(problem, solver=name, tolerance=1e-10)
         for name in ("cg", "direct", "fixed-point", "auto")
@@ -436,9 +438,11 @@ class LinearisedStep:
         problem, stepper = case.problem, case.stepper
         self.case, self.h = case, stepper.time_step
         self.stage = stepper.integrate(problem, case.state, self.h)
+        self.loads = problem.external_forces(*self.stage.loads_over, problem.positions)
         scheme = stepper.integrate.scheme(case.state, self.h)
         share = scheme.positions.coefficients["y"]
-        rest = self.stage.finish(np.zeros_like(problem.positions)).positions
+        nothing = np.zeros_like(problem.positions)
+        rest = self.stage.finish(nothing, nothing).positions
         self.y = (case.result.state.positions - rest) / share
         K = problem.stiffness(self.y).toarray()  # with internal modes that follow
         M = np.kron(problem.mass_matrix.toarray(), np.eye(3))
@@ -456,11 +460,15 @@ class LinearisedStep:
         )
         stage = case.stepper.integrate(problem, moved, self.h)
         free = problem.free.ravel()
-        right = self.stage.inertia * problem.mass_times(stage.target - self.stage.target) + forces
+        before = self.stage.load_factor * self.loads + self.stage.held
+        after = stage.load_factor * (self.loads + forces) + stage.held
+        right = self.stage.inertia * problem.mass_times(stage.target - self.stage.target)
+        right += after - before
         change = np.where(problem.free, 0.0, stage.start - self.stage.start).ravel()
         right = right.ravel() - self.H @ change
         change[free] = np.linalg.solve(self.H[free][:, free], right[free])
-        before, after = self.stage.finish(self.y), stage.finish(self.y + change.reshape(-1, 3))
+        before = self.stage.finish(self.y, before)
+        after = stage.finish(self.y + change.reshape(-1, 3), after)
         changes = {name: after.memory[name] - before.memory[name] for name in case.memory}
         changes["positions"] = after.positions - before.positions
         changes["velocities"] = after.velocities - before.velocities
@@ -622,7 +630,9 @@ def test_names_that_the_memory_does_not_have_are_refused():
     problem = pc.discretise(scene(time=timed("generalised-alpha")))
     stepper, state = pc.Newton(problem), problem.rest_state()
     result, g = stepper(state), np.ones_like(state.positions)
-    with pytest.raises(InputError, match=r"grad_memory has acceleration: .*\(accelerations\)"):
+    with pytest.raises(
+        InputError, match=r"grad_memory has acceleration: .*\(accelerations, internal_forces\)"
+    ):
         pc.adjoint(stepper, state, result, grad_memory={"acceleration": g})
     with pytest.raises(InputError, match="grad_memory has positions"):
         pc.adjoint(stepper, state, result, g, grad_memory={"positions": g})

@@ -251,7 +251,7 @@ def test_steps_are_those_of_single_scenes(element):
 
 
 def test_it_takes_fewer_iterations_than_g():
-    """And at most twice as many as with the exact inverse of the same Hessian."""
+    """And at most two and a half times as many as with the exact inverse of the same Hessian."""
     problem = pc.discretise(beam((4, 1, 1), 0.05), 2)
     found = {}
     for kind in ("multigrid", "rest", "G-scaled"):
@@ -263,7 +263,7 @@ def test_it_takes_fewer_iterations_than_g():
             state, count = result.state, count + int(result.iterations[0])
         found[kind] = count
     assert found["multigrid"] < 0.5 * found["G-scaled"]
-    assert found["multigrid"] <= 2 * found["rest"]
+    assert found["multigrid"] <= 2.5 * found["rest"]
 
 
 def test_derivatives_are_those_with_the_exact_inverse():

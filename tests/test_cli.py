@@ -18,7 +18,7 @@ from pdcorrect.evaluation.report import inverted_frames
 @pytest.fixture
 def scene_file(tmp_path):
     path = tmp_path / "scene.toml"
-    path.write_text(beam((4, 2, 1), time={"frames": 4}).to_toml(), encoding="utf-8")
+    path.write_text(beam((4, 2, 2), time={"frames": 4}).to_toml(), encoding="utf-8")
     return path
 
 
@@ -42,7 +42,7 @@ def test_simulate_refines_and_takes_either_solver(program, scene_file, tmp_path,
     status, _, _ = program("simulate", scene_file, "-o", output, *arguments)
     assert status == 0
     loaded = pc.load_trajectory(output)
-    assert loaded.positions.shape == (3, 9 * 5 * 3, 3)
+    assert loaded.positions.shape == (3, 9 * 5 * 5, 3)
     method = {"pd": "projective dynamics (lbfgs)", "newton": "Newton"}[solver]
     assert loaded.attributes["solver"] == method
     assert len(list((tmp_path / "vtu").glob("*.vtu"))) == 3

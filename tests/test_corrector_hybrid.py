@@ -160,7 +160,7 @@ def test_every_integrator_goes_on_as_if_it_had_found_the_corrected_positions(int
         r = problem.scene.time.spectral_radius
         alpha_m, alpha_f = (2 * r - 1) / (r + 1), r / (r + 1)
         gamma, beta = 0.5 - alpha_m + alpha_f, 0.25 * (1 - alpha_m + alpha_f) ** 2
-        a, b = before.memory["accelerations"], after.memory["accelerations"]
+        a, b = (state.memory["accelerations"] for state in (before, after))
         expected = v + h * ((1 - gamma) * a + gamma * b)
         way = p + h * v + h**2 * ((0.5 - beta) * a + beta * b)
         assert np.allclose(q, way, rtol=0, atol=1e-9 * CELL)

@@ -90,7 +90,7 @@ def interpreted(monkeypatch):
         point_kernel.at_points(function, inputs, out)
         return out
 
-    monkeypatch.setattr(points, "_computed", computed)
+    monkeypatch.setattr(points, "computed", computed)
 
 
 def gradients(dtype, cells=41, in_a_cell=8, device="cpu"):

@@ -200,7 +200,7 @@ def test_what_is_recorded_stays_where_it_is(device, made):
         kept += [getattr(answers._snapshot, name) for name in ("positions", "correction")]
         measures, stepper = motion.parts.measures, motion.stepper
         kept += [measures._positions, measures._velocities, measures._y]
-        kept += [measures._stored, measures._ratios, stepper.cells._weights]
+        kept += [measures._stored, measures._ratios, stepper.cells.point_weights]
         kept += [stepper.objective.mass.nodal, stepper.objective.mass.density]
         return [x.data_ptr() for x in kept]
 

@@ -63,50 +63,47 @@ def predicted(integrator: str, kind: str, omega: float, damping: float, h: float
         return complex(max(np.roots([1.5 - s * h, -2.0, 0.5]), key=abs))
     if integrator == "midpoint" and kind != "viscosity":
         return complex((1.0 + 0.5 * s * h) / (1.0 - 0.5 * s * h))
-    matrix = midpoint if integrator == "midpoint" else generalised_alpha
+    matrix = midpoint_with_viscosity if integrator == "midpoint" else generalised_alpha
     roots = np.linalg.eigvals(matrix(omega * h, damping * h, kind == "viscosity"))
     return complex(min(roots, key=lambda root: abs(root - np.exp(s * h))))
 
 
-def midpoint(omega: float, damping: float, viscous: bool) -> np.ndarray:
-    """Its matrix for (q, h v, y before, y before that), with the rates of `between`."""
-    new = np.zeros((5, 5))  # of q, h v, y, y before, y before that
-    old = np.zeros((5, 5))
+RATE = np.array([1.5, -2.0, 0.5])
+"""Steps times the rate at a configuration, from it and those of the two steps before."""
+
+
+def midpoint_with_viscosity(omega: float, damping: float, _: bool) -> np.ndarray:
+    """Its matrix for (q, h v, y, y before, y before that): rates are of y."""
+    new, old = np.zeros((5, 5)), np.zeros((5, 5))
     new[0, :2], old[0, :2] = [1.0, -0.5], [1.0, 0.5]
-    new[1, 1], new[1, 2:], old[1, 1] = 1.0, damping * between(viscous), 1.0
+    new[1, 1], new[1, 2:], old[1, 1] = 1.0, damping * RATE, 1.0
     new[1, 2] += omega**2
     new[2, [0, 2]], old[2, 0] = [-0.5, 1.0], 0.5
     return _shifted(new, old)
 
 
 def generalised_alpha(omega: float, damping: float, viscous: bool) -> np.ndarray:
-    """Its matrix for (q, h v, h^2 a), with omega h and damping h (Chung and Hulbert 1993).
+    """Its matrix for (h v, h^2 a, h^2 A, q, q before, q before that).
 
-    With viscosity for y before and before that too, see `between`.
+    With omega h and damping h (Chung and Hulbert 1993, Arnold and Bruls 2007).
     """
     r = SPECTRAL_RADIUS
     m, f = (2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0)
     gamma, beta = 0.5 - m + f, 0.25 * (1.0 - m + f) ** 2
-    new, old = np.zeros((6, 6)), np.zeros((6, 6))  # of q, h v, h^2 a, y, ...
-    new[0, [0, 2]], old[0, :3] = [1.0, -beta], [1.0, 1.0, 0.5 - beta]
-    new[1, [1, 2]], old[1, [1, 2]] = [1.0, -gamma], [1.0, 1.0 - gamma]
-    new[2, 2], old[2, 2] = 1.0 - m, -m
+    new, old = np.zeros((6, 6)), np.zeros((6, 6))
+    new[0, :2], old[0, :2] = [1.0, -gamma], [1.0, 1.0 - gamma]
+    new[1, 1:3], old[1, 1:3] = [1.0 - m, f - 1.0], [-m, f]
+    new[2, [2, 3]] = 1.0, omega**2
     if viscous:
-        new[2, 3:] = damping * between(viscous)
+        new[2, 3:] += damping * RATE
     else:
-        new[2, 1], old[2, 1] = (1.0 - f) * damping, -f * damping
-    new[2, 3] += omega**2
-    new[3, [0, 3]], old[3, 0] = [f - 1.0, 1.0], f
+        new[2, 0] = damping
+    new[3, [1, 3]], old[3, [0, 1, 3]] = [-beta, 1.0], [1.0, 0.5 - beta, 1.0]
     return _shifted(new, old)
 
 
-def between(viscous: bool) -> np.ndarray:
-    """Steps times the rate at y, of y, y before and y before that: the stretch is known there."""
-    return np.array([1.5, -2.0, 0.5]) if viscous else np.zeros(3)
-
-
 def _shifted(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """A step's matrix, whose last three entries are y, y before and y before that."""
+    """A step's matrix, whose last three entries are a quantity, before and before that."""
     for row in (-2, -1):
         new[row, row], old[row, row - 1] = 1.0, 1.0
     return np.linalg.solve(new, old)

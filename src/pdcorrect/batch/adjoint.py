@@ -84,9 +84,14 @@ class BatchGradients:
             self._material = stepper.present
             self._factors = stepper.objective.factors.clone()
             by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
+            kept = self._sums.pop("internal_forces_after", None)
+            if kept is not None:
+                kept = stepper.staging.extended(kept)
+                by_y = by_y + self._factors[0] * stepper.objective.mass(kept)[:, : self._nodes]
+                by_y = by_y - self._load_slopes("y", kept)
             fine = torch.tensor(in_one(result.statuses), device=by_y.device)
             solver = self._solve(by_y, fine, tolerance)
-            self._nodal = self.x[:, : self._nodes]
+            self._push = self.x if kept is None else self.x - kept
             self._damping = DampingTerms(stepper, self._stage, self._y, self.x)
             self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
 
@@ -103,7 +108,7 @@ class BatchGradients:
             left = self.ok
             for _ in range(MOST):
                 x = mixed(x, image, left)
-                more = stepper.staging.extended(self._load_slopes(x))
+                more = stepper.staging.extended(self._load_slopes("y", x))
                 solver = stepper.solve_adjoint(self._y, g + more, fine, share * tolerance)
                 image, self.iterations = solver.x.clone(), self.iterations + solver.steps
                 change = largest_displacement(image - x)
@@ -114,10 +119,14 @@ class BatchGradients:
         self.x = torch.where(self.ok[:, None, None], x, 0.0)
         return solver
 
-    def _load_slopes(self, x: Tensor) -> Tensor:
-        """Derivatives (B, N, 3) of x . (loads that follow the body) by y."""
-        nodes = self._nodes
-        return self._stepper.loads.pulled(self._stage.spans, self._y[:, :nodes], x[:, :nodes])
+    def _load_slopes(self, name: str, x: Tensor) -> Tensor:
+        """Derivatives of x . (loads in the equation) by y or positions they are sampled at."""
+        nodes, stage, loads = self._nodes, self._stage, self._stepper.loads
+        share = stage.scheme.sampled.coefficients.get(name, 0.0)
+        if not share or not loads.follow:
+            return torch.zeros_like(x[:, :nodes])
+        slope = loads.pulled(stage.spans, stage.sampled(self._y[:, :nodes]), x[:, :nodes])
+        return share * stage.scheme.load_factor * slope
 
     def _pull_end(
         self, positions: Tensor | None, velocities: Tensor | None, memory: Mapping[str, Tensor]
@@ -162,7 +171,7 @@ class BatchGradients:
     @property
     def forces(self) -> Tensor:
         """By nodal forces during the step, (B, N, 3), 1/N."""
-        return self._nodal
+        return self._stage.scheme.load_factor * self._push[:, : self._nodes]
 
     @property
     def clamped_positions(self) -> Tensor:
@@ -202,8 +211,9 @@ class BatchGradients:
         stage, mass = self._stage, self._stepper.objective.mass
         with self._stepper.alone():
             fall = self._stepper.loads.acceleration(stage.spans)
-            out = mass.row_slopes((self.x * fall).sum(dim=-1))
-            out = out - self._factors[0] * mass.slopes(self.x, self._y - stage.target)
+            push = stage.scheme.load_factor * self._push
+            out = mass.row_slopes((push * fall).sum(dim=-1))
+            out = out - self._factors[0] * mass.slopes(self._push, self._y - stage.target)
             if self._stepper.objective.damped:
                 origin = self._stepper.staging.extended(stage.origin)
                 out = out - self._factors[1] * mass.slopes(self.x, self._y - origin)
@@ -261,7 +271,10 @@ class BatchGradients:
     def _pull_stage(self, by_y: Tensor, image: Tensor) -> None:
         stage, stepper = self._stage, self._stepper
         scheme = stage.scheme
-        momentum = stepper.objective.mass(self.x)[:, : self._nodes]
+        momentum = stepper.objective.mass(self._push)[:, : self._nodes]
+        scheme.held.transpose(self._push[:, : self._nodes], self._sums)
+        sampled = self._load_slopes("positions", self._push)
+        Linear(positions=1.0).transpose(sampled, self._sums)
         if scheme.inertia:
             self._pull(scheme.target, scheme.clamped_target, self._factors[0] * momentum)
         damping = self._damping
@@ -273,5 +286,5 @@ class BatchGradients:
             place.transpose(slope, self._sums)
         back = torch.where(self._free, 0.0, by_y - image)
         if stepper.loads.follow:
-            back = back + torch.where(self._free, 0.0, self._load_slopes(self.x))
+            back = back + torch.where(self._free, 0.0, self._load_slopes("y", self.x))
         scheme.clamped.transpose(back, self._sums)

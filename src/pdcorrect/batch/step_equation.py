@@ -42,6 +42,8 @@ class BatchStepEquation:
         q, m; not changed later.
     origin, start, foreseen : (B, N, 3)
         See `Scheme`, m; the last two prescribed where clamped.
+    held : (B, N, 3) or 0
+        See `Scheme`, N.
     strains : list of (float, (B, N, 3))
         See `Scheme`.
     """
@@ -53,7 +55,13 @@ class BatchStepEquation:
     origin: Tensor
     start: Tensor
     foreseen: Tensor
+    held: Tensor | float
     strains: list[tuple[float, Tensor]]
+
+    def sampled(self, y: Tensor) -> Tensor:
+        """Where loads that follow the body are sampled, for nodal y, (B, N, 3)."""
+        place: Tensor = self.scheme.sampled({**self.known, "y": y})
+        return place
 
 
 class BatchStaging:
@@ -88,7 +96,7 @@ class BatchStaging:
     def __call__(self, state: BatchState) -> BatchStepEquation:
         """The step from a state."""
         scheme = self._scheme(state)
-        known = self._known(scheme, state)
+        known = self._known(state)
         first, last = scheme.loads_over
         h = self._h
         return BatchStepEquation(
@@ -99,6 +107,7 @@ class BatchStaging:
             self._split(known, scheme.origin, scheme.clamped_origin),
             self._split(known, scheme.start, scheme.clamped),
             self._split(known, scheme.foreseen or scheme.start, scheme.clamped),
+            scheme.held(known),
             [(a, x(known)) for a, x in scheme.strains],
         )
 
@@ -115,12 +124,17 @@ class BatchStaging:
             nodal = torch.where(usable & self.free, y, nodal)
         return self.extended(nodal)
 
-    def finish(self, stage: BatchStepEquation, y: Tensor, state: BatchState) -> BatchState:
+    def finish(
+        self, stage: BatchStepEquation, y: Tensor, state: BatchState, internal: Tensor | None
+    ) -> BatchState:
         """The state after the step from ``state`` with solution y (B, U, 3).
 
-        Its tensors share no memory with others.
+        ``internal`` (B, N, 3) are the forces that the equation gives the bodies, see `Scheme`,
+        where it needs them.  The state's tensors share no memory with others.
         """
         known = {**stage.known, "y": y[:, : self._cells.sizes.nodes]}
+        if internal is not None:
+            known["internal_forces_after"] = internal
         scheme = stage.scheme
         return BatchState(
             self._split(known, scheme.positions, None),
@@ -154,7 +168,7 @@ class BatchStaging:
             )
         return all(started)
 
-    def _known(self, scheme: Scheme, state: BatchState) -> dict[str, Any]:
+    def _known(self, state: BatchState) -> dict[str, Any]:
         known: dict[str, Any] = {
             "positions": state.positions,
             "velocities": state.velocities,
@@ -162,16 +176,16 @@ class BatchStaging:
             "time": torch.zeros_like(state.positions)
             + by_scene(_on_device(state.times, state.positions)),
             **state.memory,
-            **self._clamp_rates(scheme, state.times),
+            **self._clamp_rates(state.times),
         }
         return known
 
-    def _clamp_rates(self, scheme: Scheme, times: Sequence[float]) -> dict[str, Any]:
+    def _clamp_rates(self, times: Sequence[float]) -> dict[str, Any]:
         """See `integrators.clamp_rates`, (B, N, 3) each."""
         pairs = list(zip(self._problems, times, strict=True))
         if not self._moving:
-            return clamp_rates(*pairs[0], self._h, scheme.at)
-        rates = [clamp_rates(problem, t, self._h, scheme.at) for problem, t in pairs]
+            return clamp_rates(*pairs[0], self._h)
+        rates = [clamp_rates(problem, t, self._h) for problem, t in pairs]
         still = [np.zeros_like(problem.positions) for problem in self._problems]
         return {
             name: self._nodal([a[name] + zero for a, zero in zip(rates, still, strict=True)])

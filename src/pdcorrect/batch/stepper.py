@@ -340,7 +340,7 @@ class BatchStepper:
             nodes = self.cells.sizes.nodes
             found = settle(m, alive, lambda y: self._push(stage, forces, y[:, :nodes]))
         y, phase, iterations, evaluations, estimate = found
-        after = self.staging.finish(stage, y, state)
+        after = self.staging.finish(stage, y, state, self._internal(stage, y))
         ratios = self.cells.smallest_volume_ratios(after.positions).to("cpu", torch.float64).numpy()
         statuses = [_STATUSES[Phase(p)] for p in phase.tolist()]
         return BatchResult(
@@ -386,10 +386,22 @@ class BatchStepper:
             scheme.strain_rate * damping.viscosity,
         )
 
-    def _push(self, stage: BatchStepEquation, forces: Tensor | None, positions: Tensor) -> None:
-        total = self.loads(stage.spans, positions)
-        extra = 0.0 if forces is None else self.staging.extended(forces)
-        self.objective.forces.copy_(total + extra)
+    def _push(self, stage: BatchStepEquation, forces: Tensor | None, y: Tensor) -> None:
+        total = self.loads(stage.spans, stage.sampled(y))
+        if forces is not None:
+            total = total + self.staging.extended(forces)
+        total = stage.scheme.load_factor * total
+        if isinstance(stage.held, Tensor):
+            total = total + self.staging.extended(stage.held)
+        self.objective.forces.copy_(total)
+
+    def _internal(self, stage: BatchStepEquation, y: Tensor) -> Tensor | None:
+        """See `BatchStaging.finish`."""
+        if "internal_forces" not in stage.scheme.memory:
+            return None
+        moved = self.objective.mass(y - stage.target)
+        out = stage.scheme.inertia * moved - self.objective.forces
+        return out[:, : self.cells.sizes.nodes]
 
     def _damp(self, stage: BatchStepEquation) -> None:
         objective, cells = self.objective, self.cells

@@ -109,12 +109,16 @@ class Gradients:
             if name in after:
                 self._pull(*rows, after[name])
         by_y = self._sums.pop("y")
+        kept = self._sums.pop("internal_forces_after", np.zeros_like(by_y))
+        if kept.any():
+            by_y = by_y + self._scheme.inertia * self._problem.mass_times(kept)
+            by_y -= self._by_sampled("y", y, kept)
         self._H = AdjointOperator(self._objective.hessian_operator(y), self._load_slopes(y))
         g = self._problem.extended(by_y) * self._objective.free
         found = step.solve(self._H, y, g, step.solver, step.tolerance)
         self.x, self.solver, self.iterations = found.x, found.solver, found.iterations
         self.residual = found.residual
-        self._nodal = self.x[: len(by_y)]
+        self._nodal = self.x[: len(by_y)] - kept
         objective, problem = self._objective, self._problem
         self._rayleigh = self._viscous = None
         if objective.rayleigh is not None:
@@ -144,7 +148,7 @@ class Gradients:
     @cached_property
     def forces(self) -> Array:
         """By nodal forces during the step, (N, 3), 1/N."""
-        return self._nodal
+        return self._objective.stage.load_factor * self._nodal
 
     @cached_property
     def clamped_positions(self) -> Array:
@@ -205,7 +209,7 @@ class Gradients:
         """By each cell's density, (C,), m3/kg; gravity included."""
         stage, problem, x = self._objective.stage, self._problem, self._nodal
         offset = self._y[: len(x)] - stage.target
-        out = gravity_slope(problem, x, *stage.loads_over)
+        out = gravity_slope(problem, stage.load_factor * x, *stage.loads_over)
         out -= stage.inertia * mass_slope(problem, x, offset)
         return out if self._rayleigh is None else out + self._rayleigh.density
 
@@ -269,10 +273,18 @@ class Gradients:
 
     def _load_slopes(self, y: Array) -> Callable[[Array], Array] | None:
         """What loads that follow the body add to the operator at y."""
-        problem, positions = self._problem, y[: len(self._problem.positions)]
-        if not problem.has_followers:
+        if not self._problem.has_followers:
             return None
-        return lambda x: follower_slope(problem, x, positions, *self._objective.stage.loads_over)
+        return lambda x: self._by_sampled("y", y, x)
+
+    def _by_sampled(self, name: str, y: Array, x: Array) -> Array:
+        """Derivatives of x . (loads in the equation) by y or positions that they are sampled at."""
+        stage, share = self._objective.stage, self._scheme.sampled.coefficients.get(name, 0.0)
+        if not share or not self._problem.has_followers:
+            return np.zeros_like(x)
+        place = stage.sampled(y[: len(x)])
+        slope = follower_slope(self._problem, x, place, *stage.loads_over)
+        return share * stage.load_factor * slope
 
     def _pull(self, on_free: Linear, on_clamped: Linear | None, g: Array) -> None:
         """Add g's share to the derivatives by what a linear combination is made of."""
@@ -288,6 +300,8 @@ class Gradients:
         if scheme.inertia:
             by_target = scheme.inertia * problem.mass_times(x)
             self._pull(scheme.target, scheme.clamped_target, by_target)
+        scheme.held.transpose(x, self._sums)
+        Linear(positions=1.0).transpose(self._by_sampled("positions", self._y, x), self._sums)
         if self._rayleigh is not None:
             self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
             self._pull(scheme.foreseen or scheme.start, scheme.clamped, self._rayleigh.place)
@@ -327,7 +341,7 @@ class Gradients:
         y = np.where(objective.free, self._y, self._problem.extended(stage.start))
         objective.follow(y)
         _, residual = objective.balance(y)
-        end = stage.finish(y[:count])
+        end = stage.finish(y[:count], objective.forces[:count])
         value = np.vdot(self._after["positions"], end.positions)
         value += np.vdot(self._after["velocities"], end.velocities)
         for name in self._scheme.memory:

@@ -19,6 +19,7 @@ from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
+from pdcorrect.solvers.reactions import internal_forces
 from pdcorrect.solvers.step import (
     GlobalSolver,
     StepObjective,
@@ -355,18 +356,22 @@ def _outcome(
     problem: Problem, state: State, objective: StepObjective, minimum: Minimum, h: float
 ) -> _Outcome:
     y, nodes = minimum.positions, len(state.positions)
-    after = objective.stage.finish(y[:nodes])
+    stage = objective.stage
+    after = stage.finish(y[:nodes], objective.forces[:nodes])
     moved = after.positions - state.positions
     clamp_work = 0.0
     if problem.clamps.moving:
-        clamp_work = float(np.vdot(objective.balance(y)[1][:nodes] * ~problem.free, moved))
-    ends_at_y = objective.stage.gain == 1.0  # otherwise the modes at the end are other ones
+        reaction = objective.balance(y)[1][:nodes]
+        if stage.load_factor != 1.0:
+            reaction -= (stage.load_factor - 1.0) * internal_forces(problem, state)
+        clamp_work = float(np.vdot(reaction * ~problem.free, moved)) / stage.load_factor
+    ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
     return _Outcome(
         after,
         minimum,
         elastic_energy=problem.energy_and_forces(end)[0],
-        external_work=float(np.vdot(objective.forces[:nodes], moved)),
+        external_work=float(np.vdot(objective.loads, moved)),
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, h),
         modes=end[nodes:] if problem.space.internal else None,

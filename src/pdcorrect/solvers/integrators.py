@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -41,11 +42,16 @@ class StepEquation:
     loads_over : tuple of float
         Loads are averaged over this time interval (s), or taken at its ends if
         these are equal.
+    load_factor : float
+    held : (N, 3)
+        See `Scheme`, N.
+    sampled : callable
+        y -> where loads that follow the body are sampled, (N, 3).
     strain_rate : float
     strains : tuple of (float, (N, 3))
         See `Scheme`; none in scenes without viscosity.
     finish : callable
-        y -> the state after the step.
+        y and all forces (N, 3) of the equation -> the state after the step.
     """
 
     inertia: float
@@ -55,7 +61,10 @@ class StepEquation:
     start: Array
     foreseen: Array
     loads_over: tuple[float, float]
-    finish: Callable[[Array], State]
+    finish: Callable[[Array, Array], State]
+    sampled: Callable[[Array], Array]
+    held: Array | float = 0.0
+    load_factor: float = 1.0
     strain_rate: float = 0.0
     strains: tuple[tuple[float, Array], ...] = ()
     gain: float = 1.0
@@ -96,16 +105,14 @@ class Integrator:
 
     def known(self, problem: Problem, state: State, h: float) -> dict[str, Any]:
         """What the linear combinations of a scheme combine, by name."""
-        scheme, end = self.scheme(state, h), state.time + h
-        known: dict[str, Any] = {
+        return {
             "positions": state.positions,
             "velocities": state.velocities,
-            "prescribed": problem.clamped_positions(end),
+            "prescribed": problem.clamped_positions(state.time + h),
             "time": np.full_like(state.positions, state.time),
             **state.memory,
-            **clamp_rates(problem, state.time, h, scheme.at),
+            **clamp_rates(problem, state.time, h),
         }
-        return known
 
     def __call__(self, problem: Problem, state: State, h: float) -> StepEquation:
         scheme, free = self.scheme(state, h), problem.free
@@ -114,8 +121,13 @@ class Integrator:
         def split(on_free: Linear, on_clamped: Linear | None) -> Array:
             return np.asarray(by_component(np, free, known, on_free, on_clamped))
 
-        def finish(y: Array) -> State:
+        target = split(scheme.target, scheme.clamped_target)
+
+        def finish(y: Array, forces: Array) -> State:
             known["y"] = y
+            if "internal_forces" in scheme.memory:
+                moved = problem.mass_times(y - target)
+                known["internal_forces_after"] = scheme.inertia * moved - forces
             memory = {name: split(*rows) for name, rows in scheme.memory.items()}
             velocities = split(scheme.velocities, scheme.clamped_velocities)
             return State(scheme.positions(known), velocities, state.time + h, memory)
@@ -124,33 +136,35 @@ class Integrator:
         viscous = bool(problem.scene.damping.viscosity)
         return StepEquation(
             scheme.inertia,
-            split(scheme.target, scheme.clamped_target),
+            target,
             scheme.rate,
             split(scheme.origin, scheme.clamped_origin),
             split(scheme.start, scheme.clamped),
             split(scheme.foreseen or scheme.start, scheme.clamped),
             (first, last),
             finish,
+            lambda y: np.asarray(scheme.sampled({**known, "y": y})),
+            scheme.held(known),
+            scheme.load_factor,
             scheme.strain_rate,
             tuple((a, x(known)) for a, x in scheme.strains) if viscous else (),
             scheme.gain,
         )
 
 
-def clamp_rates(problem: Problem, time: float, h: float, at: float) -> dict[str, Any]:
-    """The entries of a step's `Integrator.known` that only moving clamps have, else 0.
+def clamp_rates(problem: Problem, time: float, h: float) -> dict[str, Any]:
+    """Mean velocities of the prescribed positions in a step from ``time`` (s) and after it.
 
-    ``at`` is y's time in steps from ``time`` (s).
+    The entries (N, 3), m/s, of a step's `Integrator.known` that only moving clamps have, else
+    0.  Inertia of clamped nodes acts on others through a mass matrix that is not diagonal.
+    Velocities that only satisfy an integrator's own recursion would ring, as nothing damps
+    them.
     """
     if not problem.clamps.moving:
-        return {"clamp_velocity": 0.0, "clamp_velocity_at_y": 0.0, "clamp_jump": 0.0}
-    at_y, middle = time + at * h, time + 0.5 * h
-    return {
-        "clamp_velocity": _clamp_velocity(problem, time + h, h),
-        "clamp_velocity_at_y": _clamp_velocity(problem, at_y, h),
-        "clamp_jump": _clamp_acceleration(problem, at_y, h)
-        - _clamp_acceleration(problem, middle, h),
-    }
+        return {"clamp_velocity_behind": 0.0, "clamp_velocity_ahead": 0.0}
+    places = [problem.clamped_positions(time + k * h) for k in range(3)]
+    behind, ahead = ((after - before) / h for before, after in pairwise(places))
+    return {"clamp_velocity_behind": behind, "clamp_velocity_ahead": ahead}
 
 
 @lru_cache(maxsize=64)
@@ -192,23 +206,6 @@ def integrator(name: str, spectral_radius: float = 0.8, viscous: bool = False) -
     if name not in INTEGRATORS:
         raise InputError(f"integrator {name!r}: expected {', '.join(INTEGRATORS)}.")
     return Integrator(_SCHEMES[name])
-
-
-def _clamp_velocity(problem: Problem, time: float, h: float) -> Array:
-    """Velocity of the prescribed positions by central differences, (N, 3), m/s.
-
-    Inertia of clamped nodes acts on others through a mass matrix that is not diagonal.
-    Velocities that only satisfy an integrator's own recursion would ring, as nothing damps
-    them, and one-sided differences, put into that recursion, double the acceleration.
-    """
-    ahead, behind = problem.clamped_positions(time + h), problem.clamped_positions(time - h)
-    return (ahead - behind) / (2.0 * h)
-
-
-def _clamp_acceleration(problem: Problem, time: float, h: float) -> Array:
-    """Acceleration of the prescribed positions by central differences, (N, 3), m/s2."""
-    places = [problem.clamped_positions(time + k * h) for k in (-1, 0, 1)]
-    return (places[0] - 2.0 * places[1] + places[2]) / h**2
 
 
 _SCHEMES: dict[str, SchemeOf] = {

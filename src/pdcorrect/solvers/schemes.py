@@ -2,12 +2,13 @@
 
 A step of h seconds solves
 
-    c M (y - q) + d C (y - o) + f_visc(y) = f_int(y) + f_ext
+    c M (y - q) + d C (y - o) + f_visc(y) = f_int(y) + b f_ext + g
 
 for one unknown configuration y, so every integrator minimises the same kind of
 function (thesis eq. 3-6) and projective dynamics needs no more than other factors in G.
 C is Rayleigh damping, d (y - o) the velocity at y; f_visc is the force of the rate of
-stretch e (S(y) - sum of a_k S(x_k)) of viscosity.  Everything else in a step is a linear
+stretch e (S(y) - sum of a_k S(x_k)) of viscosity; b is 1 and g none but for
+generalised-alpha.  Everything else in a step is a linear
 combination of what is known at its start and of y, with coefficients that depend on h
 alone.
 
@@ -99,9 +100,10 @@ def by_component(
     return library.where(free, values, on_clamped(known))
 
 
-_P, _V, _A = Linear(positions=1.0), Linear(velocities=1.0), Linear(accelerations=1.0)
+_P, _V = Linear(positions=1.0), Linear(velocities=1.0)
 _Y, _PRESCRIBED = Linear(y=1.0), Linear(prescribed=1.0)
-_CLAMP_VELOCITY = Linear(clamp_velocity=1.0)
+_BEHIND, _AHEAD = Linear(clamp_velocity_behind=1.0), Linear(clamp_velocity_ahead=1.0)
+_CLAMP_VELOCITY = 0.5 * (_BEHIND + _AHEAD)
 
 
 Strains = tuple[tuple[float, Linear], ...]
@@ -113,9 +115,9 @@ class Scheme:
 
     The linear combinations are of ``positions``, ``velocities`` and the entries of
     `State.memory` at the start of the step; ``time``, s; ``prescribed``, the clamped
-    positions at its end; ``clamp_velocity`` and ``clamp_velocity_at_y``, the clamps'
-    velocities at its end and at y's time; ``clamp_jump``, the change of their
-    acceleration from the middle of the step to y's time; the last ones of ``y`` too.
+    positions at its end; ``clamp_velocity_behind`` and ``clamp_velocity_ahead``, their mean
+    velocities over the step and over as long after it; the last ones of ``y`` and of
+    ``internal_forces_after``, those of the body and its damping at y by the equation, too.
     Those named ``clamped_…`` hold where components are clamped, by default as elsewhere.
 
     Attributes
@@ -132,11 +134,15 @@ class Scheme:
         After the step.
     clamped : Linear
         The prescribed y.
-    at : float
-        The time of y, in steps from the start.
     loads_over : tuple of float
         Loads are averaged over this time interval, in steps from the start, or taken at
         its ends if these are equal.
+    load_factor : float
+        b.
+    held : Linear
+        g, N.
+    sampled : Linear
+        Where loads that follow the body are sampled.
     strain_rate : float
         e, 1/s.
     strains : tuple of (float, Linear)
@@ -159,8 +165,10 @@ class Scheme:
     clamped_origin: Linear | None = None
     clamped_velocities: Linear | None = None
     foreseen: Linear | None = None
-    at: float = 1.0
     loads_over: tuple[float, float] = (0.0, 1.0)
+    load_factor: float = 1.0
+    held: Linear = field(default_factory=Linear)
+    sampled: Linear = _Y
     strain_rate: float = 0.0
     strains: Strains = ()
     gain: float = 1.0
@@ -175,7 +183,7 @@ HISTORY = {
     "strained", "strained_before",
 }  # fmt: skip
 """Entries of a memory that are of use only to a step as long as the last one."""
-WHOLE_MEMORY = frozenset(HISTORY | {"accelerations"})
+WHOLE_MEMORY = frozenset(HISTORY | {"accelerations", "internal_forces"})
 """All entries that any scheme uses."""
 _TIME = Linear(time=1.0)
 
@@ -196,20 +204,27 @@ def bdf2(h: float, known: frozenset[str]) -> Scheme:
     of backward Euler, which, at the start only, does not lower the order.
     """
     started = "previous_positions" in known
-    rate: float = 1.0 / h
-    strains: Strains = ((1.0, _P),)
-    if started:
-        rate, strains = 1.5 / h, ((4.0 / 3.0, _P), (-1.0 / 3.0, Linear(previous_positions=1.0)))
+    rate, strains, kept = _at_ends(h, known)
+    kept["previous_velocities"] = (_V, _V)
     origin = _backward(_P, "previous_positions") if started else _P
     drift = _backward(_V, "previous_velocities") if started else _V
     target = origin + drift / rate
     foreseen = _P + h * (1.5 * _V - Linear(previous_velocities=0.5)) if started else None
-    kept = {"previous_positions": _P, "previous_velocities": _V, "previous_times": _TIME}
     return Scheme(
         rate**2, rate, target, origin, target, _Y, rate * (_Y - origin), foreseen=foreseen,
-        loads_over=(0.5 if started else 0.0, 1.5), strain_rate=rate, strains=strains,
-        memory={name: (row, row) for name, row in kept.items()},
+        loads_over=(0.5 if started else 0.0, 1.5), strain_rate=rate, strains=strains, memory=kept,
     )  # fmt: skip
+
+
+def _at_ends(
+    h: float, known: frozenset[str]
+) -> tuple[float, Strains, dict[str, tuple[Linear, Linear]]]:
+    """Rate of stretch at the end of a step by backward differences, and the memory they need."""
+    memory = {"previous_positions": (_P, _P), "previous_times": (_TIME, _TIME)}
+    if "previous_positions" not in known:
+        return 1.0 / h, ((1.0, _P),), memory
+    before = Linear(previous_positions=1.0)
+    return 1.5 / h, ((4.0 / 3.0, _P), (-1.0 / 3.0, before)), memory
 
 
 def _backward(now: Linear, before: str) -> Linear:
@@ -223,18 +238,18 @@ def midpoint(h: float, known: frozenset[str] = frozenset(), *, viscous: bool = F
     Second order, symplectic; keeps linear and angular momentum.
     """
     target, clamped = _P + 0.5 * h * _V, 0.5 * (_P + _PRESCRIBED)
-    rate, strains, memory = _between(h, 0.5, known, viscous)
+    rate, strains, memory = _between(h, known) if viscous else (0.0, (), {})
     return Scheme(
         4.0 / h**2, 2.0 / h, target, _P, target, 2.0 * _Y - _P, (4.0 / h) * (_Y - _P) - _V,
         clamped,
         clamped_target=clamped - 0.25 * h * (_CLAMP_VELOCITY - _V),
         clamped_velocities=_CLAMP_VELOCITY,
-        at=0.5, strain_rate=rate, strains=strains, gain=2.0, memory=memory,
+        strain_rate=rate, strains=strains, gain=2.0, memory=memory,
     )  # fmt: skip
 
 
 def _between(
-    h: float, at: float, known: frozenset[str], viscous: bool
+    h: float, known: frozenset[str]
 ) -> tuple[float, Strains, dict[str, tuple[Linear, Linear]]]:
     """Rate of stretch at a y between two frames, and the memory that it needs.
 
@@ -243,12 +258,10 @@ def _between(
     two before, are free of that, and second order (as `bdf2`).  The first two steps have
     less to go by.
     """
-    if not viscous:
-        return 0.0, (), {}
     last, before = Linear(strained=1.0), Linear(strained_before=1.0)
     memory = {"strained": (_Y, _Y), "previous_times": (_TIME, _TIME)}
     if "strained" not in known:
-        return 1.0 / (at * h), ((1.0, _P),), memory
+        return 2.0 / h, ((1.0, _P),), memory
     memory["strained_before"] = (last, last)
     if "strained_before" not in known:
         return 1.0 / h, ((1.0, last),), memory
@@ -257,10 +270,13 @@ def _between(
 
 @dataclass(frozen=True)
 class GeneralisedAlpha:
-    """Chung and Hulbert (1993): second order, with chosen damping of high frequencies.
+    """Second order, with chosen damping of high frequencies (Chung and Hulbert 1993).
 
-    A step from a state without accelerations takes its own for the one at its start too,
-    which, at the start only, does not lower the order.
+    M ((1 - alpha_m) a' + alpha_m a) = (1 - alpha_f) f(p') + alpha_f f(p) + loads, with the
+    internal forces f, damping included, of both ends.  So no force is that of a point on the
+    chord of a turning node's path, where strains are other ones.  Divided by 1 - alpha_f it
+    is an equation at the end of the step.  The first step has constant acceleration,
+    which does not lower the order.
 
     Attributes
     ----------
@@ -286,47 +302,51 @@ class GeneralisedAlpha:
 
     def __call__(self, h: float, known: frozenset[str]) -> Scheme:
         """The scheme of a step of h seconds."""
-        r, started = self.spectral_radius, "accelerations" in known
-        alpha_f = r / (r + 1.0)
+        r, started = self.spectral_radius, known >= {"accelerations", "internal_forces"}
+        delay = r / (r + 1.0)
+        alpha_f = delay if started else 0.0
         alpha_m = (2.0 * r - 1.0) / (r + 1.0) if started else 0.0
         gamma = 0.5 - alpha_m + alpha_f if started else 1.0
         beta = 0.25 * (1.0 - alpha_m + alpha_f) ** 2 if started else 0.5
-        a = _A if started else Linear()
-        scale = 1.0 / ((1.0 - alpha_f) * beta * h**2)
+        a = Linear(accelerations=1.0) if started else Linear()
+        factor = 1.0 / (1.0 - alpha_f)
         at_rest = -_V / (beta * h) - (0.5 / beta - 1.0) * a  # a' for y = p
+        new = at_rest + (_Y - _P) / (beta * h**2)
+        inertia = factor * (1.0 - alpha_m) / (beta * h**2)
         rate = gamma / (beta * h)
-        inertia = (1.0 - alpha_m) * scale
 
         def ahead(acceleration: Linear) -> Linear:
             return _V + h * ((1.0 - gamma) * a + gamma * acceleration)
 
-        new = at_rest + scale * (_Y - _P)
-        clamped = alpha_f * _P + (1.0 - alpha_f) * _PRESCRIBED
-        # the clamps' mean acceleration over the step, moved to y's time:
-        acceleration = (_CLAMP_VELOCITY - _V) / h
-        if started:
-            acceleration += Linear(clamp_jump=1.0)
-        start = _P + (1.0 - alpha_f) * h * _V
-        strain_rate, strains, memory = _between(h, 1.0 - alpha_f, known, self.viscous)
+        # the clamps' mean acceleration over the interval of the loads:
+        first, last = 0.5 - delay if started else 0.0, 1.5 - delay
+        clamps = (1.0 - delay) * (_AHEAD - _BEHIND) + (1.0 - 2.0 * first) * (_BEHIND - _V)
+        clamps /= (last - first) * h
+        strain_rate, strains, memory = _at_ends(h, known) if self.viscous else (0.0, (), {})
+        start = _P + h * _V
         return Scheme(
             inertia,
             rate,
-            target=_P - (at_rest + alpha_m / (1.0 - alpha_m) * a) / scale,
-            origin=_P - ((1.0 - alpha_f) * ahead(at_rest) + alpha_f * _V) / rate,
+            target=_P - factor * ((1.0 - alpha_m) * at_rest + alpha_m * a) / inertia,
+            origin=_P - ahead(at_rest) / rate,
             start=start,
-            foreseen=start + 0.5 * ((1.0 - alpha_f) * h) ** 2 * a,
-            positions=_P + (_Y - _P) / (1.0 - alpha_f),
+            positions=_Y,
             velocities=ahead(new),
-            clamped=clamped,
-            clamped_target=clamped - acceleration / inertia,
-            clamped_origin=clamped - Linear(clamp_velocity_at_y=1.0) / rate,
+            clamped_target=_PRESCRIBED - factor * clamps / inertia,
+            clamped_origin=_PRESCRIBED - _CLAMP_VELOCITY / rate,
             clamped_velocities=_CLAMP_VELOCITY,
-            at=1.0 - alpha_f,
-            loads_over=(0.5 - alpha_f if started else 0.0, 1.5 - alpha_f),
+            foreseen=start + 0.5 * h**2 * a,
+            loads_over=(first, last),
+            load_factor=factor,
+            held=alpha_f * factor * Linear(internal_forces=1.0),
+            sampled=(1.0 - alpha_f) * _Y + alpha_f * _P,
             strain_rate=strain_rate,
             strains=strains,
-            gain=1.0 / (1.0 - alpha_f),
-            memory={"accelerations": (new, Linear()), **memory},
+            memory={
+                "accelerations": (new, Linear()),
+                "internal_forces": (Linear(internal_forces_after=1.0), Linear()),
+                **memory,
+            },
         )
 
 

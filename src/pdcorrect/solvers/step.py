@@ -54,8 +54,10 @@ class StepObjective:
     ----------
     start : (N + B, 3)
         First iterate, prescribed where clamped.
-    forces : (N + B, 3)
+    loads : (N, 3)
         All external forces, N.
+    forces : (N + B, 3)
+        Those of the step's equation, N.
     scale : float
         Size of the terms of gamma where it was last evaluated, J: round-off in
         gamma is relative to this.
@@ -89,9 +91,12 @@ class StepObjective:
         if self.problem.has_followers:
             self.forces = self._forces(y[: len(self.problem.positions)])
 
-    def _forces(self, positions: Array) -> Array:
-        loads = self.problem.external_forces(*self.stage.loads_over, positions)
-        return self.problem.extended(loads if self._extra is None else loads + self._extra)
+    def _forces(self, y: Array) -> Array:
+        stage = self.stage
+        self.loads = self.problem.external_forces(*stage.loads_over, stage.sampled(y))
+        if self._extra is not None:
+            self.loads = self.loads + self._extra
+        return self.problem.extended(stage.load_factor * self.loads + stage.held)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """Gamma (J) and its gradient (N + B, 3), N, zero where clamped."""
