@@ -333,16 +333,16 @@ WRONG = {
         r"young of cell 0 in scene 1 \(.*is -100000: expected a finite number above 0",
     ),
     "bad density": (lambda r, p, v: ((p, v), {"density": -1.0}), "density of cell 0 in scene 0"),
-    "nan positions": (lambda r, p, v: ((spoilt(p), v), {}), "positions of node 3 in scene 1"),
-    "nan velocities": (lambda r, p, v: ((p, spoilt(v)), {}), "velocities of node 3 in scene 1"),
-    "nan forces": (lambda r, p, v: ((p, v, spoilt(v)), {}), "forces of node 3 in scene 1"),
+    "nan positions": (lambda r, p, v: ((spoilt(p), v), {}), "positions of node 8 in scene 1"),
+    "nan velocities": (lambda r, p, v: ((p, spoilt(v)), {}), "velocities of node 8 in scene 1"),
+    "nan forces": (lambda r, p, v: ((p, v, spoilt(v)), {}), "forces of node 8 in scene 1"),
 }  # fmt: skip
 
 
 def spoilt(x):
-    """With one NaN, at node 3 of scene 1."""
+    """With one NaN, at node 8 of scene 1, which is free."""
     out = x.clone()
-    out[1, 3, 2] = torch.nan
+    out[1, 8, 2] = torch.nan
     return out
 
 

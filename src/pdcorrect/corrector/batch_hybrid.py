@@ -97,7 +97,7 @@ class WithNodes:
 class BatchCoarseStep:
     """A `CoarseStep` of B scenes.
 
-    Where y of the integrator is the end of the step (all but midpoint and generalised-alpha),
+    Where y of the integrator is the end of the step (all but midpoint),
     the internal modes of a corrected answer stay those of the coarse one: relaxed again, which a
     single scene's `HybridStepper` does, they would only lower its energy, so the gate is
     never more lenient here.  Else y's modes belong to another time, and the gate relaxes those

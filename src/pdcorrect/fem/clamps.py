@@ -103,21 +103,21 @@ class Clamps:
         Components that may move.
     rest : (N, 3)
         Rest positions, m.
-    moving : tuple of (nodes, components, Motion)
+    moving : tuple of (nodes, components, Course)
         Clamps with a prescribed motion.
     """
 
     free: NDArray[np.bool_]
     rest: Array
-    moving: tuple[tuple[NDArray[np.int64], NDArray[np.int64], Motion], ...]
+    moving: tuple[tuple[NDArray[np.int64], NDArray[np.int64], Course], ...]
 
     def positions(self, time: float) -> Array:
         """Prescribed positions (N, 3), m, at a time (s); meaningful where not free."""
         if not self.moving:
             return self.rest
         out = self.rest.copy()
-        for nodes, components, motion in self.moving:
-            moved = move(self.rest[nodes], motion, time)
+        for nodes, components, course in self.moving:
+            moved = course(self.rest[nodes], time)
             out[np.ix_(nodes, components)] = moved[:, components]
         return out
 
@@ -146,24 +146,31 @@ def resolve_clamps(clamps: tuple[Clamp, ...], selector: Selector, rest: Array) -
                 )
         owner[place] = i
         if clamp.motion is not None:
-            moving.append((nodes, components, clamp.motion))
+            moving.append((nodes, components, Course(clamp.motion)))
     free = owner < 0
     if not free.any():
         raise SceneError("clamps hold every component of every node: expected a free one.")
     return Clamps(free, rest, tuple(moving))
 
 
-def move(points: Array, motion: Motion, time: float) -> Array:
-    """Rotate and displace ``points`` (n, 3) as prescribed for a time (s)."""
-    out = points
-    if motion.rotation is not None:
-        angle = math.radians(float(np.interp(time, motion.times, motion.rotation)))
-        centre = np.array(motion.centre)
-        out = centre + (points - centre) @ _rotation("xyz".index(motion.axis), angle).T
-    if motion.displacement is not None:
-        table = np.array(motion.displacement)
-        out = out + [np.interp(time, motion.times, table[:, i]) for i in range(3)]
-    return out
+class Course:
+    """A prescribed motion with its tables as arrays, which steps look up again and again."""
+
+    def __init__(self, motion: Motion) -> None:
+        self._times = np.array(motion.times)
+        self._angles = None if motion.rotation is None else np.array(motion.rotation)
+        self._axis, self._centre = "xyz".index(motion.axis), np.array(motion.centre)
+        self._ways = () if motion.displacement is None else tuple(np.array(motion.displacement).T)
+
+    def __call__(self, points: Array, time: float) -> Array:
+        """``points`` (n, 3) rotated and displaced as prescribed for a time (s)."""
+        out = points
+        if self._angles is not None:
+            angle = math.radians(float(np.interp(time, self._times, self._angles)))
+            out = self._centre + (points - self._centre) @ _rotation(self._axis, angle).T
+        if self._ways:
+            out = out + [np.interp(time, self._times, way) for way in self._ways]
+        return out
 
 
 def _rotation(axis: int, angle: float) -> Array:

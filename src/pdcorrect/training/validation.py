@@ -112,7 +112,7 @@ class Validation:
         """
         hybrid = BatchHybrid(group.stepper, corrector, velocity=self._velocity)
         rest = group.stepper.rest_state()
-        state, previous = rest, None
+        state, previous = group.stepper.initial_state(), None
         total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
         ok = torch.ones(len(group), dtype=torch.bool, device=group.device)
         good = ok.clone()
