@@ -13,6 +13,7 @@ import common
 import numpy as np
 
 import pdcorrect as pc
+from pdcorrect.errors import PdcorrectWarning
 
 GRAVITY = {"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}
 FOOT = {"region": {"plane": "z", "at": "min"}}
@@ -141,7 +142,7 @@ def of_scene(name: str) -> tuple[common.Figures, tuple[Any, ...]]:
     figures: common.Figures = {}
     for label, make in steppers(SCENES[name]).items():
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", pc.PdcorrectWarning)
+            warnings.simplefilter("ignore", PdcorrectWarning)
             stepper = make()
             pc.rollout(stepper, 1)
             started = time.perf_counter()
