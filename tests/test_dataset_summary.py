@@ -92,6 +92,8 @@ def test_the_summary_has_the_numbers_of_hand(tmp_path):
     # squared distances (1.5 s)^2 and (2.5 s)^2 of one node of 8, over two frames
     assert plain.rms_error == pytest.approx(np.sqrt((1.5**2 + 2.5**2) / 16) * 7 / 3)
     assert best.rms_error == pytest.approx(0.5 * plain.rms_error)
+    assert best.relative_error == pytest.approx(0.5 * plain.relative_error)
+    assert reference.relative_error is None
     assert plain.step_error == pytest.approx(0.2 / np.sqrt(8) * 7 / 3)
     assert best.step_error is None
     for value in dataclasses.asdict(best.omega).values():

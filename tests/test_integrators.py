@@ -154,11 +154,12 @@ def test_a_stiff_body_let_go_twisted_gains_no_energy_in_steps_it_does_not_resolv
         material={"young": 1e4 * 1e3 * (cell / h) ** 2, "poisson": 0.4, "density": 1e3},
         time={"step": h, "integrator": "generalised-alpha", "spectral_radius": radius},
     )  # fmt: skip
-    x = problem.positions - [0.0, 0.025, 0.025]
+    centre = np.array([0.0, 0.025, 0.025])
+    x = problem.positions - centre
     angle = 0.5 * x[:, 0] / 0.2
     turned = np.stack([x[:, 0], np.cos(angle) * x[:, 1] - np.sin(angle) * x[:, 2],
                        np.sin(angle) * x[:, 1] + np.cos(angle) * x[:, 2]], axis=1)  # fmt: skip
-    start = pc.State(turned + [0.0, 0.025, 0.025], np.zeros_like(x))
+    start = pc.State(turned + centre, np.zeros_like(x))
     run = pc.rollout(pc.Newton(problem), 40, state=start)
     energy = pc.metrics.energy_balance(run).total
     assert energy[0] > 0.0

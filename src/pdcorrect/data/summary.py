@@ -52,8 +52,11 @@ class RunInfo:
     iterations : float or None
         Mean of a step.
     most_iterations : int or None
+    relative_error : float or None
+        Of the rollout from the reference's, over that one's RMS displacement, mean over
+        simulations; beside a converged reference the error that counts.
     rms_error : float or None
-        Of the rollout from the reference's, mean over simulations, m.
+        The same in m.
     step_error : float or None
         RMS distance from the reference after one step from each of its frames, mean, m.
     omega : Spread or None
@@ -63,6 +66,7 @@ class RunInfo:
     simulations: int
     iterations: float | None
     most_iterations: int | None
+    relative_error: float | None
     rms_error: float | None
     step_error: float | None
     omega: Spread | None
@@ -226,6 +230,9 @@ def _measured_run(simulation: Simulation, name: str, reference: Any) -> dict[str
         return found
     if run.positions is not None:
         found["rms_error"] = rms_error(run.positions, reference)
+        size = rms_error(np.broadcast_to(reference[0], reference.shape), reference)
+        if size > 0.0:
+            found["relative_error"] = found["rms_error"] / size
         plain = simulation.runs.get(PLAIN)
         base = None if name == PLAIN or plain is None else plain.positions
         if base is not None and mean_squared_error(base, reference) > 0.0:
@@ -278,6 +285,7 @@ def _run_info(runs: Sequence[Mapping[str, Any]]) -> RunInfo:
         simulations=len(runs),
         iterations=_mean(iterations),
         most_iterations=max(iterations, default=None),
+        relative_error=_mean([run["relative_error"] for run in runs if "relative_error" in run]),
         rms_error=_mean([run["rms_error"] for run in runs if "rms_error" in run]),
         step_error=_mean([run["step_error"] for run in runs if "step_error" in run]),
         omega=Spread.of(omegas) if omegas else None,
@@ -354,14 +362,19 @@ def _motion_table(info: DatasetInfo) -> Any:
 def _run_table(info: DatasetInfo) -> Any:
     table = _table(
         "runs: mean distance from the reference; Omega, % of the plain run's squared error; cost",
-        "split", "run", "simulations", "RMS, mm", "one step, mm", "Omega", "worst", "iterations",
-        "most", "s",
+        "split", "run", "simulations", "error, %", "RMS, mm", "one step, mm", "Omega", "worst",
+        "iterations", "most", "s",
     )  # fmt: skip
     for name, split in _splits(info):
         for label, run in split.runs.items():
             omega = ("", "") if run.omega is None else (run.omega.mean, run.omega.smallest)
             cost = sum(split.seconds.get(key, 0.0) for key in (label, f"{label} steps"))
-            values = [_text(run.rms_error, 1e3), _text(run.step_error, 1e3), *map(_text, omega)]
+            values = [
+                _text(run.relative_error, 100.0),
+                _text(run.rms_error, 1e3),
+                _text(run.step_error, 1e3),
+                *map(_text, omega),
+            ]
             values += [_text(run.iterations), _text(run.most_iterations), _text(cost or None)]
             table.add_row(name, label, str(run.simulations), *values)
             name = ""
