@@ -326,6 +326,20 @@ def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, mon
     assert (folder / "error_over_time.png").stat().st_size > 5000
 
 
+def test_a_scene_of_another_integrator_is_run_by_the_second_order_one_too(thick):
+    scene = thick.with_changes(time={"integrator": "backward-euler"})
+    known = cases_for(scene, hex27=True)
+    cases = cases_for(scene, hex27=True, second_order=True)
+    assert cases[: len(known)] == known
+    more = cases[len(known) :]
+    assert [(c.base, c.element) for c in more] == [("enhanced", None), ("plain", "hex27")]
+    for case in more:
+        assert not case.plain
+        assert case.problem(scene).scene.time.integrator == "generalised-alpha"
+    itself = scene.with_changes(time={"integrator": "generalised-alpha"})
+    assert cases_for(itself, hex27=True, second_order=True) == cases_for(itself, hex27=True)
+
+
 def test_scenes_of_27_nodes_and_cases_that_fail_have_errors_too(thick, monkeypatch, tmp_path):
     monkeypatch.setenv("PDCORRECT_CACHE", str(tmp_path / "cache"))
     scene = thick.with_changes(time={"integrator": "generalised-alpha", "step": 1e-3})

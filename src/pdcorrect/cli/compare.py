@@ -47,7 +47,7 @@ def compare(
         typer.Option(
             "--converged",
             help="Also the error to the converged motion, which takes long once and is kept on "
-            "disk; adds 27-node elements.",
+            "disk; adds 27-node elements, and runs by generalised-alpha.",
         ),
     ] = False,
     converged_error: Annotated[
@@ -86,7 +86,7 @@ def compare(
     loaded = Scene.load(scene)
     converged = converged or converged_error
     hex27 = hex27 or (converged and loaded.solver.element != HEX27.element)
-    cases = cases_for(loaded, model or [], gate=gate, hex27=hex27)
+    cases = cases_for(loaded, model or [], gate=gate, hex27=hex27, second_order=converged)
     make_folder(output / report.VTU if vtu else output)
     tell_of_compiling()
     count = frames or loaded.time.frames

@@ -29,6 +29,8 @@ class Case:
         Whether a default `Gate` lets the corrector pass.
     element : str or None
         In place of the scene's, on the scene's cells; of base "plain" only.
+    integrator : str or None
+        In place of the scene's.
     """
 
     label: str
@@ -38,12 +40,13 @@ class Case:
     model: str | None = None
     gate: bool = True
     element: str | None = None
+    integrator: str | None = None
 
     @property
     def plain(self) -> bool:
         """Whether it is the scene itself on the coarse mesh."""
-        unchanged = self.base == "plain" and self.model is None and self.element is None
-        return self.refine == 1 and unchanged
+        changes = self.model, self.element, self.integrator
+        return self.refine == 1 and self.base == "plain" and changes == (None, None, None)
 
     def problem(self, scene: Scene) -> Problem:
         """What is stepped.
@@ -53,6 +56,8 @@ class Case:
         InputError
             If there is no such base on its mesh, or an element is given with another base.
         """
+        if self.integrator is not None:
+            scene = scene.with_changes(time={"integrator": self.integrator})
         if self.element is not None:
             return self._with_element(scene)
         if self.base == "enhanced":
@@ -90,7 +95,7 @@ def check_corrected(case: Case, base: str) -> None:
     ------
     InputError
     """
-    expected = {"solver": "pd", "refine": 1, "base": base, "element": None}
+    expected = {"solver": "pd", "refine": 1, "base": base, "element": None, "integrator": None}
     unlike = [
         f"{name} = {getattr(case, name)!r}, expected {wanted!r}"
         for name, wanted in expected.items()
@@ -114,6 +119,7 @@ CASES = (
 HEX27 = Case("coarse PD, hex27", "pd", 1, element="hex27")
 """The scene's cells with 27 nodes each."""
 
+_SECOND_ORDER = "generalised-alpha"
 _BEST = Case("best coarse PD", "pd", 1, "enhanced")
 _FINE_BEST = replace(CASES[0], label="fine best PD", base="enhanced")
 """The coarse model and the reference with the best element."""
@@ -129,7 +135,12 @@ CASE_BASES = ("plain", "enhanced", "best", "total-mass")
 
 
 def cases_for(
-    scene: Scene, models: Sequence[str] = (), *, gate: bool = True, hex27: bool = False
+    scene: Scene,
+    models: Sequence[str] = (),
+    *,
+    gate: bool = True,
+    hex27: bool = False,
+    second_order: bool = False,
 ) -> tuple[Case, ...]:
     """What `compare` runs by default: `cases_with`, and always the best coarse model.
 
@@ -146,6 +157,9 @@ def cases_for(
         Of the correctors.
     hex27 : bool
         Also 27-node elements on the coarse mesh.
+    second_order : bool
+        Also the best coarse model and 27-node elements by generalised-alpha, where the scene
+        has another integrator.
 
     Raises
     ------
@@ -170,6 +184,12 @@ def cases_for(
                 "hex27: the scene's own element is hex27: expected a scene of another element."
             )
         others.append(HEX27)
+    if second_order and scene.time.integrator not in (_SECOND_ORDER, "quasi-static"):
+        others += [
+            replace(case, label=f"{case.label}, {_SECOND_ORDER}", integrator=_SECOND_ORDER)
+            for case in others
+            if case in (_BEST, HEX27)
+        ]
     return (reference, *others)
 
 
