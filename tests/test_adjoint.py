@@ -79,6 +79,8 @@ class Case:
         assert self.result.status.ok, self.result.status
         memory = {n: rng.normal(size=shape) for n in self.result.state.memory}
         memory.pop("previous_times", None)
+        if "internal_forces" in memory:  # where clamped they are for the clamps' work only
+            memory["internal_forces"] *= problem.free
         self.weights = {"positions": rng.normal(size=shape) / problem.cell_size}
         self.weights["velocities"] = rng.normal(size=shape)
         scale = {"accelerations": 1e-3, "previous_positions": 1.0 / problem.cell_size}
@@ -460,8 +462,8 @@ class LinearisedStep:
         )
         stage = case.stepper.integrate(problem, moved, self.h)
         free = problem.free.ravel()
-        before = self.stage.load_factor * self.loads + self.stage.held
-        after = stage.load_factor * (self.loads + forces) + stage.held
+        before = self.stage.load_factor * self.loads + self.stage.past_forces
+        after = stage.load_factor * (self.loads + forces) + stage.past_forces
         right = self.stage.inertia * problem.mass_times(stage.target - self.stage.target)
         right += after - before
         change = np.where(problem.free, 0.0, stage.start - self.stage.start).ravel()

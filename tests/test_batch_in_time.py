@@ -29,6 +29,7 @@ CASES = {
     "clamps that move": ("hex8-bubble", {}, [], True),
     "viscosity": ("hex8-bubble-mean", {"viscosity": 3e-3}, [], False),
     "loads that follow": ("hex8", {}, FOLLOWERS, False),
+    "the best coarse element": ("hex8-enhanced", {"viscosity": 3e-3}, FOLLOWERS[:1], True),
     "all of it": ("hex8-bubble", DAMPED, FOLLOWERS, True),
 }
 INTEGRATORS = ["backward-euler", "bdf2", "midpoint", "generalised-alpha"]
@@ -62,25 +63,34 @@ def test_steps_and_derivatives_are_those_of_single_steps(case, integrator, devic
     stepper = pc.BatchStepper(problems, recover=False, device=device)
     batch, alone = stepper.state(states(problems)), states(problems)
     singles = [pc.ProjectiveDynamics(p) for p in problems]
+    rng = np.random.default_rng(3)
+    extra = [0.02 * rng.normal(size=p.positions.shape) for p in problems]
+    forces = stepper.cells.nodal(extra)[:, : stepper.cells.sizes.nodes]
     for _ in range(4):
-        before, result = batch, stepper(batch)
+        before, result = batch, stepper(batch, forces)
         batch = result.state
         assert set(result.statuses) == {pc.Status.CONVERGED}
         befores = alone
-        results = [single(state) for single, state in zip(singles, alone, strict=True)]
+        results = [single(*both) for single, *both in zip(singles, alone, extra, strict=True)]
         alone = [r.state for r in results]
     for found, wanted in zip(stepper.states(batch), alone, strict=True):
         assert np.abs(found.positions - wanted.positions).max() < 1e-9
         assert set(found.memory) == set(wanted.memory)
+    for found, wanted, p in zip(stepper.states(batch), alone, problems, strict=True):
+        for name in set(found.memory) - {"previous_times"}:
+            mine, other = (state.memory[name][p.free] for state in (found, wanted))
+            np.testing.assert_allclose(mine, other, rtol=0, atol=1e-5 * np.abs(other).max())
     rng = np.random.default_rng(1)
     grads = [rng.normal(size=p.positions.shape) for p in problems]
     nodes = stepper.cells.sizes.nodes
     given = stepper.cells.nodal(grads)[:, :nodes]
-    gradients = pc.BatchGradients(stepper, before, result, given, 0.01 * given, tolerance=1e-10)
+    gradients = pc.BatchGradients(
+        stepper, before, result, given, 0.01 * given, forces=forces, tolerance=1e-10
+    )
     damping = CASES[case][1]
     for i, (single, state, one, g) in enumerate(zip(singles, befores, results, grads, strict=True)):
-        wanted = pc.adjoint(single, state, one, g, 0.01 * g, tolerance=1e-10)
-        for name in ("positions", "velocities", "young", "poisson", "density", *damping):
+        wanted = pc.adjoint(single, state, one, g, 0.01 * g, forces=extra[i], tolerance=1e-10)
+        for name in ("positions", "velocities", "forces", "young", "poisson", "density", *damping):
             name = {"mass": "rayleigh_mass", "stiffness": "rayleigh_stiffness"}.get(name, name)
             value = np.asarray(getattr(wanted, name))
             found = getattr(gradients, name)[i].cpu().numpy()

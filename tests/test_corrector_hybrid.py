@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pdcorrect as pc
-from conftest import box_mesh, held, problem_on, rotation
+from conftest import beam, box_mesh, held, problem_on, rotation
 from hybrid_samples import (
     CELL,
     EULER,
@@ -31,6 +31,7 @@ from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
+from pdcorrect.corrector.placements import moved
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.solvers.rollout import check_same_run
@@ -166,6 +167,32 @@ def test_every_integrator_goes_on_as_if_it_had_found_the_corrected_positions(int
         assert np.allclose(q, way, rtol=0, atol=1e-9 * CELL)
     free = problem.free
     assert np.allclose(w[free], expected[free], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint", "generalised-alpha"])
+def test_a_corrected_state_is_gone_on_from_as_from_the_solution_itself(integrator):
+    """A body that is stiffer than the true one, with the difference as the correction."""
+    time = {"step": 0.01, "frames": 4, "integrator": integrator}
+    loads = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
+    true, stiff = (
+        pc.ProjectiveDynamics(pc.discretise(beam(
+            (3, 2, 2), time=time, loads=loads, material={"young": young, "poisson": 0.4},
+            solver={"mass": "averaged"},
+        )), 1e-10)
+        for young in (1e5, 1.3e5)
+    )  # fmt: skip
+    state = true(true(true.problem.rest_state()).state).state
+    wanted, coarse = true(state).state, stiff(state).state
+    free, mass_times = true.problem.free, true.problem.mass_times
+    scheme = stiff.integrate.scheme(state, 0.01)
+    difference = wanted.positions - coarse.positions
+    found = moved(scheme, coarse, difference, "recomputed", lambda x: mass_times(x) * free)
+    for mine, other in zip(
+        found, (wanted.positions, wanted.velocities, wanted.memory), strict=True
+    ):
+        mine, other = ([x] if isinstance(x, np.ndarray) else x.values() for x in (mine, other))
+        for a, b in zip(mine, other, strict=True):
+            np.testing.assert_allclose(a[free], b[free], rtol=0, atol=1e-6 * np.abs(b).max())
 
 
 @pytest.mark.parametrize("mass", ["consistent", "lumped"])

@@ -107,6 +107,22 @@ def test_the_program_tells_it_once(program, tmp_path):
     assert sum(line.startswith("warning: ") for line in err.splitlines()) == 1
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint", "generalised-alpha"])
+def test_a_body_that_moves_with_its_clamp_is_not_shaken(integrator):
+    drive = {"times": [0.0, 10.0], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 10.0]]}
+    scene = free(
+        clamps=[{"region": {"plane": "x", "at": "min"}, "motion": drive}],
+        initial={"velocity": [0.0, 0.0, 1.0]}, solver={"mass": "averaged"},
+        time={"step": 0.01, "frames": 5, "integrator": integrator},
+    )  # fmt: skip
+    problem = pc.discretise(scene)
+    with pytest.warns(PdcorrectWarning, match="follow the clamps"):
+        run = pc.rollout(pc.Newton(problem, tolerance=1e-11))
+    rigid = problem.positions + run.times[:, None, None] * np.array([0.0, 0.0, 1.0])
+    assert np.abs(run.positions - rigid).max() < 1e-9
+    assert np.abs(run.velocities - [0.0, 0.0, 1.0]).max() < 1e-7
+
+
 def test_frame_zero_is_the_initial_state_and_survives_files(program, tmp_path):
     scene = free(time={"frames": 2})
     (tmp_path / "scene.toml").write_text(scene.to_toml())

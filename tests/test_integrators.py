@@ -1,5 +1,6 @@
 """Time integrators: their orders, what they conserve, damping, and agreement of the solvers."""
 
+import doctest
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import scipy.linalg as sla
 
 import pdcorrect as pc
 from conftest import CLAMPED, GRAVITY, beam, box_mesh, disturbed, problem_on
+from pdcorrect.solvers import schemes
 from test_elements import MESHES
 from time_orders import errors, reference, swinging
 
@@ -319,12 +321,61 @@ def test_lbfgs_is_newton_for_other_energies(energy, element):
     assert np.abs(by_pd.positions - by_newton.positions).max() < 1e-8
 
 
+# --- energy ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("damping", [{}, {"viscosity": 5e-3}, {"mass": 4.0, "stiffness": 4e-3}],
+                         ids=["none", "viscosity", "rayleigh"])  # fmt: skip
+@pytest.mark.parametrize("name", ["bdf2", "midpoint", "generalised-alpha"])
+def test_the_energy_balance_under_moving_clamps_closes(name, damping):
+    """What is put in, less the loss by damping, is there; what the integrator loses vanishes."""
+    times = np.linspace(0.0, 0.2, 401)
+    way = [[0.0, 0.0, 0.01 * np.sin(np.pi * t / 0.2) ** 2] for t in times]
+    motion = {"times": times.tolist(), "displacement": way}
+    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": motion}]
+    gaps = []
+    for count in (20, 80):
+        problem = pc.discretise(beam(
+            clamps=clamps, damping=damping, solver={"element": "hex8-bubble", "mass": "averaged"},
+            material={"young": 2e4, "poisson": 0.3},
+            time={"step": 0.2 / count, "frames": count, "integrator": name},
+        ))  # fmt: skip
+        balance = pc.metrics.energy_balance(pc.rollout(pc.Newton(problem, tolerance=1e-10)))
+        put_in = balance.external_work + balance.clamp_work - balance.damping_loss
+        gaps.append(abs(balance.total - put_in)[-1] / balance.total.max())
+    assert gaps[0] < 0.035
+    assert gaps[1] < 0.005
+
+
 # --- states of other integrators -------------------------------------------------------------
 
 ALL = ["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 MOVING = {
     "times": [0.0, 0.02, 0.1], "rotation": [0.0, 10.0, 0.0], "centre": [0, 0.01, 0.01], "axis": "x",
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("before", ALL)
+@pytest.mark.parametrize("name", ALL)
+def test_a_viscous_state_of_another_integrator_is_gone_on_from(name, before):
+    """Of which some entries of the memory may serve."""
+    damping = {"viscosity": 2e-3}
+    problem = pc.discretise(beam(loads=GRAVITY, damping=damping, solver={"mass": "consistent"}))
+    old = pc.ProjectiveDynamics(problem, integrator=before)
+    state = old(old(problem.rest_state()).state).state
+    found = pc.ProjectiveDynamics(problem, integrator=name)(state)
+    expected = pc.ProjectiveDynamics(problem, integrator=name)(replace(state, memory={}))
+    assert found.status is pc.Status.CONVERGED
+    way = np.abs(expected.state.positions - state.positions).max()
+    assert np.abs(found.state.positions - expected.state.positions).max() < 0.2 * way + 1e-4
+    batch = pc.BatchStepper([problem], integrator=name)
+    (again,) = batch.states(batch(batch.state([state])).state)
+    assert np.abs(again.positions - found.state.positions).max() < 1e-6
+
+
+def test_tables_are_sums_of_numbers_and_arrays_alike():
+    assert doctest.testmod(schemes).failed == 0
+    assert schemes.Linear()({}) == 0.0
 
 
 @pytest.mark.parametrize("before", ALL)

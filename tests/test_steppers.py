@@ -471,6 +471,34 @@ def test_a_step_that_stalls_falls_back_to_newton_cg():
     assert given_up.error_estimate > 1e-5 * problem.cell_size
 
 
+@pytest.mark.parametrize("integrator", ["bdf2", "midpoint", "generalised-alpha"])
+def test_integrators_with_a_memory_go_on_after_substeps(monkeypatch, integrator):
+    """As after a step of their own, also in batches, where all scenes have the same memory."""
+    time = {"step": 0.01, "frames": 6, "integrator": integrator}
+    problem = pc.discretise(beam(time=time, damping={"viscosity": 1e-3}))
+    stepper = pc.ProjectiveDynamics(problem)
+    before = stepper(stepper(problem.rest_state()).state).state
+    whole = stepper(before).state
+    real, calls = stepper._solved, []
+
+    def stuck_in_the_whole_step(*arguments):
+        calls.append(real(*arguments))
+        return replace(calls[0], status=pc.Status.LINE_SEARCH) if len(calls) == 1 else calls[-1]
+
+    monkeypatch.setattr(stepper, "_solved", stuck_in_the_whole_step)
+    result = stepper(before)
+    assert result.status is pc.Status.SUBSTEPPED
+    assert len(calls) == 3
+    parts = result.state
+    assert set(parts.memory) == set(whole.memory)
+    way = np.abs(whole.positions - before.positions).max()
+    assert np.abs(parts.positions - whole.positions).max() < 0.3 * way
+    monkeypatch.undo()
+    after, expected = stepper(parts), stepper(whole)
+    assert after.status is pc.Status.CONVERGED
+    assert np.abs(after.state.positions - expected.state.positions).max() < 0.7 * way
+
+
 def test_substeps_are_the_second_fallback(monkeypatch):
     from pdcorrect.solvers import implicit
 

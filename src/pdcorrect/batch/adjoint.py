@@ -86,11 +86,12 @@ class BatchGradients:
             by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
             kept = self._sums.pop("internal_forces_after", None)
             if kept is not None:
-                kept = stepper.staging.extended(kept)
+                kept = stepper.staging.extended(kept * self._free)
                 by_y = by_y + self._factors[0] * stepper.objective.mass(kept)[:, : self._nodes]
                 by_y = by_y - self._load_slopes("y", kept)
             fine = torch.tensor(in_one(result.statuses), device=by_y.device)
             solver = self._solve(by_y, fine, tolerance)
+            kept = None if kept is None else torch.where(self.ok[:, None, None], kept, 0.0)
             self._push = self.x if kept is None else self.x - kept
             self._damping = DampingTerms(stepper, self._stage, self._y, self.x)
             self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
@@ -272,7 +273,7 @@ class BatchGradients:
         stage, stepper = self._stage, self._stepper
         scheme = stage.scheme
         momentum = stepper.objective.mass(self._push)[:, : self._nodes]
-        scheme.held.transpose(self._push[:, : self._nodes], self._sums)
+        scheme.past_forces.transpose(self._push[:, : self._nodes], self._sums)
         sampled = self._load_slopes("positions", self._push)
         Linear(positions=1.0).transpose(sampled, self._sums)
         if scheme.inertia:

@@ -42,7 +42,7 @@ class BatchStepEquation:
         q, m; not changed later.
     origin, start, foreseen : (B, N, 3)
         See `Scheme`, m; the last two prescribed where clamped.
-    held : (B, N, 3) or 0
+    past_forces : (B, N, 3) or 0
         See `Scheme`, N.
     strains : list of (float, (B, N, 3))
         See `Scheme`.
@@ -55,7 +55,7 @@ class BatchStepEquation:
     origin: Tensor
     start: Tensor
     foreseen: Tensor
-    held: Tensor | float
+    past_forces: Tensor | float
     strains: list[tuple[float, Tensor]]
 
     def sampled(self, y: Tensor) -> Tensor:
@@ -107,7 +107,7 @@ class BatchStaging:
             self._split(known, scheme.origin, scheme.clamped_origin),
             self._split(known, scheme.start, scheme.clamped),
             self._split(known, scheme.foreseen or scheme.start, scheme.clamped),
-            scheme.held(known),
+            scheme.past_forces(known),
             [(a, x(known)) for a, x in scheme.strains],
         )
 

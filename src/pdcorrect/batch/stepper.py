@@ -391,17 +391,17 @@ class BatchStepper:
         if forces is not None:
             total = total + self.staging.extended(forces)
         total = stage.scheme.load_factor * total
-        if isinstance(stage.held, Tensor):
-            total = total + self.staging.extended(stage.held)
+        if isinstance(stage.past_forces, Tensor):
+            total = total + self.staging.extended(stage.past_forces)
         self.objective.forces.copy_(total)
 
     def _internal(self, stage: BatchStepEquation, y: Tensor) -> Tensor | None:
-        """See `BatchStaging.finish`."""
+        """See `BatchStaging.finish`; of no use where clamped."""
         if "internal_forces" not in stage.scheme.memory:
             return None
         moved = self.objective.mass(y - stage.target)
         out = stage.scheme.inertia * moved - self.objective.forces
-        return out[:, : self.cells.sizes.nodes]
+        return out[:, : self.cells.sizes.nodes] * self.staging.free
 
     def _damp(self, stage: BatchStepEquation) -> None:
         objective, cells = self.objective, self.cells

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -71,8 +72,29 @@ class BatchParts:
         """The state after a step with a correction (n, 3) added."""
         scheme = self.stepper.staging(before).scheme
         shift = self.nodes.padded(correction)
-        positions, velocities, memory = moved(scheme, after, shift, self.velocity)
+        positions, velocities, memory = moved(
+            scheme,
+            after,
+            shift,
+            self.velocity,
+            lambda x: _TimesMass.apply(self.stepper, x),  # type: ignore[no-untyped-call]
+        )
         return replace(after, positions=positions, velocities=velocities, memory=memory)
+
+
+class _TimesMass(torch.autograd.Function):
+    """The mass matrix times nodal values (B, N, 3), both zero where clamped."""
+
+    @staticmethod
+    def forward(ctx: Any, stepper: BatchStepper, x: Tensor) -> Tensor:
+        ctx.stepper = stepper
+        free, staging = stepper.staging.free, stepper.staging
+        moved = stepper.objective.mass(staging.extended(x.detach() * free))
+        return moved[:, : x.shape[1]] * free
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        return None, _TimesMass.forward(ctx, ctx.stepper, grads[0])
 
 
 class WithNodes:

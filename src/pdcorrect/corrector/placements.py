@@ -5,7 +5,7 @@ All of it holds for NumPy arrays and tensors alike.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -85,7 +85,11 @@ def check_velocity(velocity: str, integrator: str) -> None:
 
 
 def moved(
-    scheme: Scheme, state: Any, correction: Any, velocity: Velocity
+    scheme: Scheme,
+    state: Any,
+    correction: Any,
+    velocity: Velocity,
+    mass_times: Callable[[Any], Any],
 ) -> tuple[Any, Any, Mapping[str, Any]]:
     """Positions, velocities and memory of a state after a step, corrected.
 
@@ -102,14 +106,19 @@ def moved(
     correction : (..., 3)
         m; zero where clamped.
     velocity : {"recomputed", "kept"}
+    mass_times : callable
+        The mass matrix times a correction, zero where clamped.
     """
     positions = state.positions + correction
     if velocity == "kept":
         return positions, state.velocities, state.memory
     by_y = correction / scheme.positions.coefficients["y"]
-    memory = {
-        name: array + scheme.memory[name][0].coefficients.get("y", 0.0) * by_y
-        for name, array in state.memory.items()
-    }
+    change = {"y": by_y}
+    if "internal_forces" in state.memory:
+        change["internal_forces_after"] = scheme.inertia * mass_times(by_y)
+    memory = {}
+    for name, array in state.memory.items():
+        row = scheme.memory[name][0].coefficients
+        memory[name] = sum((row.get(key, 0.0) * x for key, x in change.items()), array)
     velocities = state.velocities + scheme.velocities.coefficients.get("y", 0.0) * by_y
     return positions, velocities, memory

@@ -128,7 +128,11 @@ class SingleCoarseStep:
     def moved(self, answer: StepResult, correction: Array) -> StepResult:
         """See `CoarseStep`; statistics are those of the corrected state."""
         scheme = self._coarse.integrate.scheme(self._state, self._coarse.time_step)
-        positions, velocities, memory = moved(scheme, answer.state, correction, self._velocity)
+        problem = self._problem
+        positions, velocities, memory = moved(
+            scheme, answer.state, correction, self._velocity,
+            lambda x: problem.mass_times(x) * problem.free,
+        )  # fmt: skip
         state = State(positions, velocities, answer.state.time, memory)
         ratios = self._problem.volume_ratios(positions)
         ratio = float(ratios.min())

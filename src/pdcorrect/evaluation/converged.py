@@ -89,7 +89,7 @@ def converged(
 def _computed(scene: Scene, refine: int, divisor: int, on_step: OnStep | None) -> Trajectory:
     divisor = 1 if scene.time.integrator == "quasi-static" else divisor
     problem = discretise(_refined_in_time(best_coarse(scene), divisor), refine)
-    coarse = discretise(scene, element="hex8", mass="lumped")
+    coarse = discretise(best_coarse(scene))
     nodes = coincident_nodes(problem.positions, coarse.positions, 1e-6 * problem.cell_size)
     stepper = ProjectiveDynamics(problem).prepare()
     states, steps, rows = [problem.initial_state()], [], []

@@ -99,7 +99,10 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
             _where(alive, result.state.positions, rest.positions),
             _where(alive, result.state.velocities, rest.velocities),
             result.state.times,
-            result.state.memory,
+            {
+                name: _where(alive, x, torch.zeros_like(x))
+                for name, x in result.state.memory.items()
+            },
         )
         previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()

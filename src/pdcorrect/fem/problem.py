@@ -135,7 +135,9 @@ class Problem(ElasticBody):
                 PdcorrectWarning,
                 stacklevel=3,
             )
-        return np.where(self.free, wanted, 0.0)
+        h = self.scene.time.step
+        driven = (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
+        return np.where(self.free, wanted, driven)
 
     # --- loads and clamps ---------------------------------------------------------
 

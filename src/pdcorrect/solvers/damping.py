@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.problem import Problem
+from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress
 from pdcorrect.solvers.integrators import StepEquation
 
@@ -46,6 +47,15 @@ class Rayleigh:
         force = self.times(y - self.origin)
         return 0.5 * float(np.vdot(y - self.origin, force)), force
 
+    def loss(self, way: Array, h: float) -> float:
+        """D times the energy lost (J) where nodes move by ``way`` (N, 3) in h seconds."""
+        problem = self._problem
+        out = self.mass * float(np.vdot(way, problem.mass_times(way)))
+        if self.stiffness:
+            x = Following(problem, self.at).lifted(way)
+            out += self.stiffness * float(np.vdot(x, self.tangent.apply(x)))
+        return out / h
+
     def times(self, x: Array) -> Array:
         """The second derivative times x."""
         out = self.mass * self._problem.mass_times(x)
@@ -65,6 +75,7 @@ class Viscous:
 
     def __init__(self, problem: Problem, stage: StepEquation) -> None:
         self._problem = problem
+        self._strain_rate = stage.strain_rate
         self.rate = stage.strain_rate * problem.scene.damping.viscosity
         self.places = [problem.relaxed(x) for _, x in stage.strains]
         factors = [a for a, _ in stage.strains]
@@ -78,6 +89,13 @@ class Viscous:
     def stress(self, stretches: Stretches) -> Array:
         """R C : (S(y) - S') times the points' volumes, (C, 6, Q), J."""
         return self.rate * small_strain_stress(self._problem, self.change(stretches))
+
+    def loss(self, y: Array, h: float) -> float:
+        """Energy lost (J) in h seconds, by the mean rate since the last stretch before y's."""
+        since = 1.0 / self._strain_rate if len(self.parts) == 1 else h
+        change = Stretches(self._problem, y).tensor - self.parts[0][1].tensor
+        power = product(change, small_strain_stress(self._problem, change)).sum()
+        return self._problem.scene.damping.viscosity * h / since**2 * float(power)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """J and N."""

@@ -97,8 +97,10 @@ class Gradients:
     """
 
     def __init__(self, step: TakenStep, after: Mapping[str, Array], y: Array) -> None:
+        self._problem, free = step.stepper.problem, step.stepper.problem.free
+        if "internal_forces" in after:  # where clamped they are for the clamps' work only
+            after = {**after, "internal_forces": after["internal_forces"] * free}
         self._step, self._after, self._y = step, after, y
-        self._problem = step.stepper.problem
         self._objective = step.objective(step.time_step)
         self._objective.follow(y)
         self._scheme = step.integrate.scheme(step.state, step.time_step)
@@ -300,7 +302,7 @@ class Gradients:
         if scheme.inertia:
             by_target = scheme.inertia * problem.mass_times(x)
             self._pull(scheme.target, scheme.clamped_target, by_target)
-        scheme.held.transpose(x, self._sums)
+        scheme.past_forces.transpose(x, self._sums)
         Linear(positions=1.0).transpose(self._by_sampled("positions", self._y, x), self._sums)
         if self._rayleigh is not None:
             self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)

@@ -19,7 +19,6 @@ from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
-from pdcorrect.solvers.reactions import internal_forces
 from pdcorrect.solvers.step import (
     GlobalSolver,
     StepObjective,
@@ -326,8 +325,30 @@ class ImplicitStepper:
                 parts.append(part)
                 current = part.state
             else:
-                return _joined(parts, replace(current, time=state.time + h))
+                memory = self._remembered(state, parts[-2].state, current, forces, h)
+                return _joined(parts, replace(current, time=state.time + h, memory=memory))
         return None
+
+    def _remembered(
+        self, start: State, before: State, end: State, forces: Array | None, h: float
+    ) -> dict[str, Array]:
+        """What the integrator needs of a step of h seconds in parts, of which the last is given."""
+        part = end.time - before.time
+        loads = self.problem.external_forces(before.time, end.time, end.positions)
+        accelerations = (end.velocities - before.velocities) / part * self.problem.free
+        internal = self.problem.mass_times(accelerations) - loads
+        known = {
+            "accelerations": accelerations,
+            "internal_forces": (internal if forces is None else internal - forces)
+            * self.problem.free,
+            "previous_positions": start.positions,
+            "previous_velocities": start.velocities,
+            "previous_times": np.full_like(start.positions, start.time),
+            "strained": 0.5 * (start.positions + end.positions),
+            "strained_before": start.memory.get("strained"),
+        }
+        names = self.integrate.scheme(start, h).memory
+        return {n: x for n, x in known.items() if n in names and x is not None}
 
     def _report(self, outcome: _Outcome, effort: _Effort) -> StepResult:
         state, minimum = outcome.state, outcome.minimum
@@ -343,6 +364,8 @@ class ImplicitStepper:
             "smallest_volume_ratio": float(ratios.min()),
         }
         status = minimum.status
+        if not status.ok:  # what it remembers would be out of balance
+            state = replace(state, memory={})
         if status is Status.CONVERGED and stats["smallest_volume_ratio"] <= 0.0:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
@@ -356,15 +379,13 @@ def _outcome(
     problem: Problem, state: State, objective: StepObjective, minimum: Minimum, h: float
 ) -> _Outcome:
     y, nodes = minimum.positions, len(state.positions)
-    stage = objective.stage
-    after = stage.finish(y[:nodes], objective.forces[:nodes])
-    moved = after.positions - state.positions
-    clamp_work = 0.0
+    stage, forces = objective.stage, objective.forces[:nodes]
+    reaction = np.zeros_like(forces)
     if problem.clamps.moving:
-        reaction = objective.balance(y)[1][:nodes]
-        if stage.load_factor != 1.0:
-            reaction -= (stage.load_factor - 1.0) * internal_forces(problem, state)
-        clamp_work = float(np.vdot(reaction * ~problem.free, moved)) / stage.load_factor
+        reaction = objective.balance(y)[1][:nodes] * ~problem.free
+    after = stage.finish(y[:nodes], forces + reaction)
+    moved = after.positions - state.positions
+    clamp_work = float(np.vdot(reaction, moved)) / stage.load_factor
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
     return _Outcome(
@@ -373,7 +394,7 @@ def _outcome(
         elastic_energy=problem.energy_and_forces(end)[0],
         external_work=float(np.vdot(objective.loads, moved)),
         clamp_work=clamp_work,
-        damping_loss=objective.damping_loss(y, h),
+        damping_loss=objective.damping_loss(y, moved, h),
         modes=end[nodes:] if problem.space.internal else None,
     )
 

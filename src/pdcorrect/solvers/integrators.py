@@ -43,7 +43,7 @@ class StepEquation:
         Loads are averaged over this time interval (s), or taken at its ends if
         these are equal.
     load_factor : float
-    held : (N, 3)
+    past_forces : (N, 3)
         See `Scheme`, N.
     sampled : callable
         y -> where loads that follow the body are sampled, (N, 3).
@@ -51,7 +51,7 @@ class StepEquation:
     strains : tuple of (float, (N, 3))
         See `Scheme`; none in scenes without viscosity.
     finish : callable
-        y and all forces (N, 3) of the equation -> the state after the step.
+        y and all forces (N, 3) of the equation, of moving clamps too -> the state after.
     """
 
     inertia: float
@@ -63,7 +63,7 @@ class StepEquation:
     loads_over: tuple[float, float]
     finish: Callable[[Array, Array], State]
     sampled: Callable[[Array], Array]
-    held: Array | float = 0.0
+    past_forces: Array | float = 0.0
     load_factor: float = 1.0
     strain_rate: float = 0.0
     strains: tuple[tuple[float, Array], ...] = ()
@@ -126,8 +126,10 @@ class Integrator:
         def finish(y: Array, forces: Array) -> State:
             known["y"] = y
             if "internal_forces" in scheme.memory:
-                moved = problem.mass_times(y - target)
-                known["internal_forces_after"] = scheme.inertia * moved - forces
+                internal = scheme.inertia * problem.mass_times(y - target) - forces
+                known["internal_forces_after"] = (
+                    internal if problem.clamps.moving else internal * free
+                )
             memory = {name: split(*rows) for name, rows in scheme.memory.items()}
             velocities = split(scheme.velocities, scheme.clamped_velocities)
             return State(scheme.positions(known), velocities, state.time + h, memory)
@@ -144,7 +146,7 @@ class Integrator:
             (first, last),
             finish,
             lambda y: np.asarray(scheme.sampled({**known, "y": y})),
-            scheme.held(known),
+            scheme.past_forces(known),
             scheme.load_factor,
             scheme.strain_rate,
             tuple((a, x(known)) for a, x in scheme.strains) if viscous else (),

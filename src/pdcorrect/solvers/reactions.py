@@ -76,15 +76,11 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
 
     ``forces`` (N, 3), N, act besides the scene's loads.
     """
-    out = internal_forces(problem, state)
-    out += problem.external_forces(state.time, None, state.positions)
-    return out if forces is None else out + forces
-
-
-def internal_forces(problem: Problem, state: State) -> Array:
-    """f_int - C v at a state, (N, 3), N."""
     damping = problem.scene.damping
     out = problem.forces(state.positions)
+    out += problem.external_forces(state.time, None, state.positions)
+    if forces is not None:
+        out += forces
     if damping.mass:
         out -= damping.mass * problem.mass_times(state.velocities)
     if damping.stiffness:

@@ -213,6 +213,8 @@ def _material(problem: Problem) -> str:
 def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
     """A run on the nodes that it shares with a coarser mesh (T_D of the thesis).
 
+    Without its memory, which is of its own mesh.
+
     Parameters
     ----------
     run : Trajectory
@@ -239,7 +241,6 @@ def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
         scene_toml=run.scene_toml,
         attributes={**run.attributes, "restricted": "to the nodes of a coarser mesh"},
         problem=None,
-        memory={name: array[:, nodes] for name, array in run.memory.items()},
     )
 
 

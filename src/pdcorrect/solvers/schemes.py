@@ -52,11 +52,11 @@ class Linear:
         KeyError
             If an array is missing.
         """
-        total: Any = 0.0
+        total: Any = None
         for name, c in self.coefficients.items():
             term = arrays[name] if c == 1.0 else c * arrays[name]
-            total = term if isinstance(total, float) else total + term
-        return total
+            total = term if total is None else total + term
+        return 0.0 if total is None else total
 
     def transpose(self, x: Any, sums: MutableMapping[str, Any]) -> None:
         """Add coefficient times x to each name's entry of ``sums``."""
@@ -104,6 +104,7 @@ _P, _V = Linear(positions=1.0), Linear(velocities=1.0)
 _Y, _PRESCRIBED = Linear(y=1.0), Linear(prescribed=1.0)
 _BEHIND, _AHEAD = Linear(clamp_velocity_behind=1.0), Linear(clamp_velocity_ahead=1.0)
 _CLAMP_VELOCITY = 0.5 * (_BEHIND + _AHEAD)
+_INTERNAL = Linear(internal_forces_after=1.0)
 
 
 Strains = tuple[tuple[float, Linear], ...]
@@ -116,9 +117,10 @@ class Scheme:
     The linear combinations are of ``positions``, ``velocities`` and the entries of
     `State.memory` at the start of the step; ``time``, s; ``prescribed``, the clamped
     positions at its end; ``clamp_velocity_behind`` and ``clamp_velocity_ahead``, their mean
-    velocities over the step and over as long after it; the last ones of ``y`` and of
-    ``internal_forces_after``, those of the body and its damping at y by the equation, too.
-    Those named ``clamped_…`` hold where components are clamped, by default as elsewhere.
+    velocities over the step and over as long after it.  Those of what follows are of ``y`` too,
+    and of ``internal_forces_after``, the forces of the body and its damping that satisfy the
+    equation at y, c M (y - q) - b f_ext - g.  Those named ``clamped_…`` hold where components
+    are clamped, by default as elsewhere.
 
     Attributes
     ----------
@@ -129,7 +131,8 @@ class Scheme:
     target, origin : Linear
         q and o, m.
     start, foreseen : Linear
-        First iterate, and y as far as it is known, m; the first where there is no second.
+        First iterate, and a y of second order, where Rayleigh stiffness is taken, m; the
+        first iterate if there is none.
     positions, velocities : Linear
         After the step.
     clamped : Linear
@@ -139,7 +142,7 @@ class Scheme:
         its ends if these are equal.
     load_factor : float
         b.
-    held : Linear
+    past_forces : Linear
         g, N.
     sampled : Linear
         Where loads that follow the body are sampled.
@@ -167,7 +170,7 @@ class Scheme:
     foreseen: Linear | None = None
     loads_over: tuple[float, float] = (0.0, 1.0)
     load_factor: float = 1.0
-    held: Linear = field(default_factory=Linear)
+    past_forces: Linear = field(default_factory=Linear)
     sampled: Linear = _Y
     strain_rate: float = 0.0
     strains: Strains = ()
@@ -203,8 +206,9 @@ def bdf2(h: float, known: frozenset[str]) -> Scheme:
     Second order.  Without the state one step of the same length before the step is one
     of backward Euler, which, at the start only, does not lower the order.
     """
-    started = "previous_positions" in known
-    rate, strains, kept = _at_ends(h, known)
+    started = known >= {"previous_positions", "previous_velocities"}
+    rate = (1.5 if started else 1.0) / h
+    strain_rate, strains, kept = _at_ends(h, known)
     kept["previous_velocities"] = (_V, _V)
     origin = _backward(_P, "previous_positions") if started else _P
     drift = _backward(_V, "previous_velocities") if started else _V
@@ -212,7 +216,8 @@ def bdf2(h: float, known: frozenset[str]) -> Scheme:
     foreseen = _P + h * (1.5 * _V - Linear(previous_velocities=0.5)) if started else None
     return Scheme(
         rate**2, rate, target, origin, target, _Y, rate * (_Y - origin), foreseen=foreseen,
-        loads_over=(0.5 if started else 0.0, 1.5), strain_rate=rate, strains=strains, memory=kept,
+        loads_over=(0.5 if started else 0.0, 1.5), strain_rate=strain_rate, strains=strains,
+        memory=kept,
     )  # fmt: skip
 
 
@@ -338,13 +343,13 @@ class GeneralisedAlpha:
             foreseen=start + 0.5 * h**2 * a,
             loads_over=(first, last),
             load_factor=factor,
-            held=alpha_f * factor * Linear(internal_forces=1.0),
+            past_forces=alpha_f * factor * Linear(internal_forces=1.0),
             sampled=(1.0 - alpha_f) * _Y + alpha_f * _P,
             strain_rate=strain_rate,
             strains=strains,
             memory={
                 "accelerations": (new, Linear()),
-                "internal_forces": (Linear(internal_forces_after=1.0), Linear()),
+                "internal_forces": (_INTERNAL, _INTERNAL),
                 **memory,
             },
         )

@@ -96,7 +96,7 @@ class StepObjective:
         self.loads = self.problem.external_forces(*stage.loads_over, stage.sampled(y))
         if self._extra is not None:
             self.loads = self.loads + self._extra
-        return self.problem.extended(stage.load_factor * self.loads + stage.held)
+        return self.problem.extended(stage.load_factor * self.loads + stage.past_forces)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """Gamma (J) and its gradient (N + B, 3), N, zero where clamped."""
@@ -141,13 +141,16 @@ class StepObjective:
         gradient[:nodes] += factor * mass[:, None] * shift
         return y, gradient
 
-    def damping_loss(self, y: Array, h: float) -> float:
-        """Energy that the damping takes out in a step of h seconds, J."""
+    def damping_loss(self, y: Array, way: Array, h: float) -> float:
+        """Energy that the damping takes out in a step of h seconds, J, by mean velocities.
+
+        ``way`` (N, 3) is how far nodes move in it, m.
+        """
         out = 0.0
         if self.rayleigh is not None:
-            out += 2.0 * self.stage.rate * h * self.rayleigh.value_and_gradient(y)[0]
+            out += self.rayleigh.loss(way, h) / self.stage.rate
         if self.viscous is not None:
-            out += 2.0 * self.stage.strain_rate * h * self.viscous.value_and_gradient(y)[0]
+            out += self.viscous.loss(y, h)
         return out
 
     def cell_hessians(self, y: Array, project: bool = False, at_rest: bool = False) -> Array:
