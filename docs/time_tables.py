@@ -49,6 +49,15 @@ def errors() -> Rows:
     return (*heads[:2], *heads[4:]), cells
 
 
+def unlike_bodies() -> Rows:
+    """Errors of all runs on unlike bodies, and their times."""
+    heads, rows = table_of("unlike_bodies", "Errors, % of the RMS displacement")
+    short = [head.replace(", backward-euler", ", BE").replace(", generalised-alpha", ", gen.-α")
+             for head in heads]  # fmt: skip
+    cells = [[row[0], *("" if x == "" else number(x, 2) for x in row[2:])] for row in rows]
+    return (short[0], *short[2:]), cells
+
+
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By name."""
     yield "time-orders", orders
@@ -60,6 +69,7 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "turek-hron-rest", partial(as_measured, "turek_hron", "CSM1", 4)
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
+    yield "unlike-bodies", unlike_bodies
     yield "columns", partial(as_measured, "columns", "Columns")
     yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
 
