@@ -192,9 +192,10 @@ def draw(record: common.Record, path: Path) -> None:
     for k, label in enumerate(RUNS):
         mark, colour = common.MARKS[k % 7], common.COLOURS[k % 7]
         errors = [row[3 + k] for row in rows]
-        axis.plot(errors, mark, color=colour, label=label, fillstyle="none" if k > 6 else "full")
+        name = label.replace(GENERALISED, "gen.-α").replace(EULER, "BE")
+        axis.plot(errors, mark, color=colour, label=name, fillstyle="none" if k > 6 else "full")
     axis.set(ylabel="error, % of the RMS displacement", yscale="log")
     axis.set_xticks(range(len(rows)), [row[0] for row in rows], rotation=30, ha="right")
     common.log_axis(axis.yaxis)
     common.plain(axis, "y")
-    common.save(figure, path, legend_of=axis)
+    common.save(figure, path, legend_of=axis, columns=5)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
@@ -15,6 +16,7 @@ from pdcorrect.errors import PdcorrectError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.projective import ProjectiveDynamics
+from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
 _WORTH_IT = (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
@@ -68,7 +70,7 @@ class SingleRetry:
             estimates[i] = step.error_estimate
             iterations[i] += step.iterations
             ratios[i] = step.stats["smallest_volume_ratio"]
-            y[i] = self._configuration(i, state_of(self._cells, before, i), step.state)
+            y[i] = self._configuration(i, state_of(self._cells, before, i), step, forces)
         return replace(
             result,
             state=with_states(
@@ -90,15 +92,18 @@ class SingleRetry:
         problem: Problem,
     ) -> StepResult | None:
         """The step of one scene; None, and the batch's own status stands, if that fails too."""
-        extra = None
-        if forces is not None:
-            rows = forces[i, : self._cells.node_counts[i]]
-            extra = rows.detach().to("cpu", torch.float64).numpy()
         try:
-            found = self._stepper(i, problem)(state_of(self._cells, before, i), extra)
+            alone = state_of(self._cells, before, i)
+            found = self._stepper(i, problem)(alone, self._extra(i, forces))
         except PdcorrectError:
             return None
         return found if set(found.state.memory) == set(result.state.memory) else None
+
+    def _extra(self, i: int, forces: Tensor | None) -> NDArray[np.float64] | None:
+        if forces is None:
+            return None
+        rows = forces[i, : self._cells.node_counts[i]]
+        return rows.detach().to("cpu", torch.float64).numpy()
 
     def _stepper(self, i: int, problem: Problem) -> ProjectiveDynamics:
         if i not in self._steppers or self._steppers[i].problem is not problem:
@@ -110,11 +115,17 @@ class SingleRetry:
             )
         return self._steppers[i]
 
-    def _configuration(self, i: int, before: State, after: State) -> Tensor:
+    def _configuration(
+        self, i: int, before: State, step: StepResult, forces: Tensor | None
+    ) -> Tensor:
         """The y of a scene that was stepped alone."""
         stepper = self._steppers[i]
-        scheme = stepper.integrate.scheme(before, stepper.time_step)
-        y = solution(scheme, before, after, stepper.problem)
+        integrate, h = stepper.integrate, stepper.time_step
+        if step.status is Status.SUBSTEPPED:  # has no y
+            y = solution(integrate.scheme(before, h), before, step.state, stepper.problem)
+        else:
+            objective = stepper.objective(before, self._extra(i, forces), h)
+            y = step_solution(objective, integrate, h, step)
         nothing = np.zeros((0, 3))
         every = [y if k == i else nothing for k in range(self._cells.sizes.scenes)]
         return self._cells.configurations(every)[i]
