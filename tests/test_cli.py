@@ -247,3 +247,18 @@ def test_compiling_is_told_of_once(tmp_path):
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stderr.count("compiling kernels") == 1
     assert ran.stdout == ""
+
+
+def test_a_run_that_gains_energy_by_turning_far_in_a_step_says_so(program, tmp_path):
+    for turn, young, told in ((60.0, 5e6, True), (5.0, 5e4, False)):
+        scene = beam(
+            (4, 2, 2), clamps=[], loads=[], material={"young": young},
+            initial={"angular_velocity": [0.0, 0.0, turn]},
+            time={"step": 0.01, "frames": 40, "integrator": "midpoint"},
+        )  # fmt: skip
+        (tmp_path / "scene.toml").write_text(scene.to_toml(), encoding="utf-8")
+        status, out, _ = program(
+            "simulate", tmp_path / "scene.toml", "-o", tmp_path / f"{turn}.h5", "--overwrite"
+        )
+        assert status == 0
+        assert ("J that nothing put in" in out) is told

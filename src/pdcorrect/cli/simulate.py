@@ -171,7 +171,7 @@ def _run(
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
-    from pdcorrect.evaluation.report import inverted_frames, three_digits
+    from pdcorrect.evaluation.report import gained_energy, inverted_frames, three_digits
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
@@ -197,6 +197,8 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
     )
     say(inverted_frames(stats, problem.time_step))
+    if problem.scene.time.integrator != "quasi-static":
+        say(gained_energy(stats))
 
 
 def _described(stepper: Stepper) -> dict[str, str]:

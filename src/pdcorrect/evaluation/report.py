@@ -13,13 +13,20 @@ from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
 from pdcorrect.evaluation.report_figures import draw_figures, overlaid_labels
-from pdcorrect.evaluation.report_notes import grouped, inverted_frames, notes, refused_corrections
+from pdcorrect.evaluation.report_notes import (
+    gained_energy,
+    grouped,
+    inverted_frames,
+    notes,
+    refused_corrections,
+)
 from pdcorrect.evaluation.report_table import headings, table, three_digits
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.trajectory import Trajectory
 
 __all__ = [
-    "VTU", "draw_figures", "grouped", "headings", "inverted_frames", "notes", "overlaid_labels",
+    "VTU", "draw_figures", "gained_energy", "grouped", "headings", "inverted_frames", "notes",
+    "overlaid_labels",
     "refused_corrections", "table", "three_digits", "to_csv", "to_json", "to_markdown",
     "write_report", "write_series",
 ]  # fmt: skip

@@ -189,6 +189,25 @@ def _of_the_faults(comparison: Comparison) -> str:
     return f"{'; '.join(told)}." if told else ""
 
 
+_GAINED = 0.1
+"""Of a run's largest energy: more than steps of second order gain where they are short enough."""
+
+
+def gained_energy(stats: Mapping[str, Any]) -> str:
+    """Whether a run has more energy than was put in since its first step; empty if not."""
+    stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
+    put_in = np.cumsum(
+        np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
+    )
+    gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
+    if not gained > _GAINED * stored.max():
+        return ""
+    return (
+        f"the run gained {gained:.3g} J that nothing put in, as the body turns far in a step: "
+        "take smaller steps or a smaller spectral_radius"
+    )
+
+
 def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
     """How many frames of a run ended with inverted cells, and which was the first; empty if none.
 
