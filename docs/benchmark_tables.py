@@ -66,6 +66,19 @@ def derivatives() -> Rows:
     ]
 
 
+def integrators() -> Rows:
+    """Steps by integrator, over those of backward Euler at the same tolerance."""
+    rows = results_of(AMD, "integrators")
+    first = {r["nodes"]: r["median_step_ms"] for r in rows if r["integrator"] == "backward-euler"}
+    cells = []
+    for row in rows:
+        ms, nodes = row["median_step_ms"], row["nodes"]
+        counts = number(ms / first[nodes], 2), number(row["iterations"], 2), number(row["peak_mb"])
+        name = row["integrator"] + (", viscosity" if row["viscosity"] else "")
+        cells.append([str(nodes), name, number(ms), *counts])
+    return ("nodes", "integrator", "ms", "over backward Euler's", "iterations", "peak MB"), cells
+
+
 def batches() -> Rows:
     """Batches of scenes on a GPU."""
     found = results_of(H200, "batch")
@@ -128,6 +141,6 @@ def reading() -> Rows:
 def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
-        "peer": peer, "derivatives": derivatives, "batches": batches,
+        "peer": peer, "derivatives": derivatives, "integrators": integrators, "batches": batches,
         "corrected-steps": corrected_steps, "networks": networks, "reading": reading,
     }.items()  # fmt: skip

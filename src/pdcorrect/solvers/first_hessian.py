@@ -196,6 +196,7 @@ class TrueHessian:
 
     def _renew(self, objective: StepObjective, y: Array, age: int) -> TangentSolver:
         at_rest = age != INSIDE and not self.lagged
+        self._solver = None  # two factors at a time would be the peak of memory
         self._solver = self.tangents.first_hessian(objective, y, at_rest)
         self._shape = self._rotations.of_cells(y)
         self._factors, self.age, self._counts = objective.factors, age, []

@@ -19,6 +19,7 @@ from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
+from pdcorrect.solvers.schemes import WHOLE_MEMORY
 from pdcorrect.solvers.step import (
     GlobalSolver,
     StepObjective,
@@ -229,7 +230,7 @@ class ImplicitStepper:
     def global_solver(
         self, factors: tuple[float, float], volume_scale: float | None = None
     ) -> GlobalSolver:
-        """G's factor; the first one made and the last other one are kept.
+        """G's factor; that of the steps of a run and the last other one are kept.
 
         ``volume_scale`` multiplies the volume weight in G, by default as in this stepper's
         first Hessian.
@@ -237,9 +238,10 @@ class ImplicitStepper:
         scale = self._volume_scale() if volume_scale is None else volume_scale
         key = (*factors, scale)
         if key not in self._solvers:
-            kept = dict(list(self._solvers.items())[:1])
-            kept[key] = GlobalSolver(self.problem, factors, self._backend, scale)
-            self._solvers = kept
+            scheme = self.integrate.scheme_of(self.time_step, WHOLE_MEMORY)
+            own = hessian_factors(self.problem, scheme)
+            self._solvers = {k: s for k, s in self._solvers.items() if k[:2] == own}
+            self._solvers[key] = GlobalSolver(self.problem, factors, self._backend, scale)
         return self._solvers[key]
 
     def objective(

@@ -29,6 +29,7 @@ from pdcorrect.fem.factorisation import (
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.damping import Rayleigh, Viscous, ViscousTangent
 from pdcorrect.solvers.integrators import StepEquation
+from pdcorrect.solvers.schemes import Scheme
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -170,8 +171,8 @@ class StepObjective:
         return HessianOperator(self, self.problem.linearise(y, project), viscous)
 
 
-def hessian_factors(problem: Problem, stage: StepEquation) -> tuple[float, float]:
-    """What multiplies mass (1/s2) and stiffness in a stage's Hessian."""
+def hessian_factors(problem: Problem, stage: StepEquation | Scheme) -> tuple[float, float]:
+    """What multiplies mass (1/s2) and stiffness in a step's Hessian."""
     damping = problem.scene.damping
     slowed = stage.rate * damping.stiffness + stage.strain_rate * damping.viscosity
     return stage.inertia + stage.rate * damping.mass, 1.0 + slowed
