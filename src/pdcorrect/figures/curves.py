@@ -15,6 +15,8 @@ from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_MARKS = "osD^"
+"""Of the first round of colours, the second, ..."""
 _FONT = 9
 """Of legends, points."""
 
@@ -189,8 +191,8 @@ def plot_error_against_time(
     figure, (axis,) = _axes(1, 4.2)
     for index, (label, (seconds, error)) in enumerate(points.items()):
         axis.loglog(
-            1e3 * seconds, (100 if relative else 1e3) * error, "o", markersize=9, label=label,
-            color=_COLOURS[index % len(_COLOURS)],
+            1e3 * seconds, (100 if relative else 1e3) * error, _MARKS[index // len(_COLOURS) % 4],
+            markersize=9, label=label, color=_COLOURS[index % len(_COLOURS)],
         )  # fmt: skip
     axis.set_xlabel("time a frame [ms]")
     axis.set_ylabel("error to the converged motion [%]" if relative else "RMS error [mm]")
