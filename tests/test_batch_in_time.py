@@ -96,9 +96,7 @@ def test_steps_and_derivatives_are_those_of_single_steps(case, integrator, devic
             found = getattr(gradients, name)[i].cpu().numpy()
             found = found[: len(value)] if value.ndim else found
             scale = np.abs(value).max()
-            # the projected stiffness has kinks, across which both take differences
-            off = 2e-4 if damping.get("stiffness") else 2e-5
-            np.testing.assert_allclose(found, value, rtol=0, atol=off * scale)
+            np.testing.assert_allclose(found, value, rtol=0, atol=2e-5 * scale)
 
 
 @pytest.mark.parametrize("mode", ["unrolled", "checkpointed"])

@@ -251,11 +251,13 @@ def test_steps_are_those_of_single_scenes(element):
 
 
 def test_it_takes_fewer_iterations_than_g():
-    """And at most two and a half times as many as with the exact inverse of the same Hessian."""
+    """And at most twice as many as with the exact inverse of the same Hessian."""
     problem = pc.discretise(beam((4, 1, 1), 0.05), 2)
     found = {}
     for kind in ("multigrid", "rest", "G-scaled"):
-        stepper = pc.BatchStepper([problem], 1e-6, first_hessian=kind, recover=False)
+        stepper = pc.BatchStepper(
+            [problem], 1e-6, integrator="backward-euler", first_hessian=kind, recover=False
+        )
         state, count = stepper.rest_state(), 0
         for _ in range(3):
             result = stepper(state)
@@ -263,7 +265,7 @@ def test_it_takes_fewer_iterations_than_g():
             state, count = result.state, count + int(result.iterations[0])
         found[kind] = count
     assert found["multigrid"] < 0.5 * found["G-scaled"]
-    assert found["multigrid"] <= 2.5 * found["rest"]
+    assert found["multigrid"] <= 2 * found["rest"]
 
 
 def test_derivatives_are_those_with_the_exact_inverse():

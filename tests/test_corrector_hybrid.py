@@ -27,7 +27,7 @@ from hybrid_samples import (
 )
 from pdcorrect.corrector import features
 from pdcorrect.corrector.architecture import preset
-from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer, _TimesMass
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
@@ -503,3 +503,28 @@ def test_a_state_or_forces_that_are_none_are_refused():
         stepper(problem.positions)
     with pytest.raises(InputError, match="forces has shape"):
         stepper(problem.rest_state(), np.zeros((2, 3)))
+
+
+def test_the_mass_times_a_correction_is_differentiated_as_it_is_computed():
+    cells = (2, 1, 1), (3, 2, 1)
+    scenes = [pc.discretise(soft_beam(c, solver={"mass": "averaged"})) for c in cells]
+    stepper = pc.BatchStepper(scenes)
+    stepper(stepper.rest_state())
+    generator = torch.Generator().manual_seed(3)
+    x, weight = (
+        torch.randn(stepper.rest_state().positions.shape, generator=generator, dtype=torch.float64)
+        for _ in range(2)
+    )
+    x.requires_grad_()
+    found = _TimesMass.apply(stepper, x)
+    (gradient,) = torch.autograd.grad((found * weight).sum(), x)
+    free = stepper.staging.free
+    wanted = _TimesMass.apply(stepper, weight)
+    torch.testing.assert_close(gradient, wanted, rtol=1e-12, atol=1e-15)
+    assert not found[~free].any()
+    for i, problem in enumerate(scenes):
+        count = len(problem.positions)
+        nodal = (x.detach() * free)[i, :count].numpy()
+        np.testing.assert_allclose(
+            found[i, :count].detach().numpy(), problem.mass_times(nodal) * problem.free, atol=1e-14
+        )

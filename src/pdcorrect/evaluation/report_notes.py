@@ -203,8 +203,8 @@ def gained_energy(stats: Mapping[str, Any]) -> str:
     if not gained > _GAINED * stored.max():
         return ""
     return (
-        f"the run gained {gained:.3g} J that nothing put in, as the body turns far in a step: "
-        "take smaller steps or a smaller spectral_radius"
+        f"the run gained {gained:.3g} J that nothing put in: take smaller steps or a smaller "
+        "spectral_radius"
     )
 
 
