@@ -1,6 +1,6 @@
 """Batches of scenes on one device: steps and derivatives a second, memory, scaling.
 
-    python benchmarks/batch.py [cuda|cpu]
+    python benchmarks/batch.py [cuda|cpu] [sizes|integrators|elements]
 
 Cross-shaped bodies of one size, each with its own Young's modulus and gravity (so none
 share a first Hessian, unless said so), to 1e-4 of the coarse cell size, float64, after
@@ -26,8 +26,16 @@ import pdcorrect as pc
 COARSE, FINE = (16, 7), (12, 5)
 """Cells along the body and along its arms: 405 coarse nodes, 10 449 fine ones."""
 
+INTEGRATORS = ("backward-euler", "bdf2", "midpoint", "generalised-alpha")
 
-def scene(seed: int, shape: tuple[int, int], shared: bool) -> pc.Scene:
+
+def scene(
+    seed: int,
+    shape: tuple[int, int],
+    shared: bool,
+    integrator: str = "backward-euler",
+    element: str = "hex8",
+) -> pc.Scene:
     """A cross with four arms, clamped at one end."""
     rng = np.random.default_rng(seed)
     young = 2e5 if shared else float(rng.uniform(1.5e5, 4e5))
@@ -37,9 +45,10 @@ def scene(seed: int, shape: tuple[int, int], shared: bool) -> pc.Scene:
             "arm_start": 5, "arm_width": 2, "arm_length": shape[1],
         },
         material={"young": young, "poisson": 0.35, "density": 1e3},
-        time={"step": 0.01, "frames": 10, "integrator": "backward-euler"},
+        time={"step": 0.01, "frames": 10, "integrator": integrator},
         clamps=[{"region": {"plane": "x", "at": 0.0}}],
         loads=[{"kind": "gravity", "acceleration": rng.uniform(-15, 15, 3).tolist()}],
+        solver={"element": element, "mass": "lumped" if element == "hex8" else "averaged"},
     )  # fmt: skip
 
 
@@ -50,13 +59,16 @@ def measure(
     device: str,
     first_hessian: str = "auto",
     shared: bool = False,
+    integrator: str = "backward-euler",
+    element: str = "hex8",
 ) -> dict[str, Any]:
     """One batch: times of a step and of its derivative, and what memory they take."""
     if device == "cuda":
         gc.collect()
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
-    problems = [pc.discretise(scene(i, shape, shared), refine=refine) for i in range(count)]
+    scenes = [scene(i, shape, shared, integrator, element) for i in range(count)]
+    problems = [pc.discretise(s, refine=refine) for s in scenes]
     stepper = pc.BatchStepper(
         problems, 1e-4, first_hessian=first_hessian, device=device, recover=False
     )
@@ -84,6 +96,8 @@ def measure(
         "scenes": count,
         "nodes": sizes.nodes,
         "cells": sizes.cells,
+        "integrator": integrator,
+        "element": element,
         "first_hessian": stepper.first_hessian,
         "sharing": shared,
         "converged": all(s is pc.Status.CONVERGED for s in result.statuses),
@@ -168,9 +182,8 @@ def median(function: Callable[[], Any], device: str, runs: int = 5) -> float:
     return statistics.median(taken)
 
 
-def main() -> None:
-    """Measure and write JSON."""
-    device = sys.argv[1] if len(sys.argv) > 1 else "cpu"
+def sizes(device: str) -> dict[str, Any]:
+    """Coarse and fine batches of growing size."""
     gpu = device == "cuda"
     coarse = (1, 4, 16, 64, 256, 1024) if gpu else (1, 4, 16)
     fine = (1, 2, 4, 8, 16) if gpu else (1,)
@@ -185,8 +198,33 @@ def main() -> None:
             measure(8, FINE, 4, device, shared=True),
         ]
         results["newton"] = newton_bound()
-    name = torch.cuda.get_device_name() if gpu else None
-    add("batch", results, name, torch_threads=torch.get_num_threads())
+    return results
+
+
+def integrators(device: str) -> list[dict[str, Any]]:
+    """Coarse batches by integrator."""
+    count = 256 if device == "cuda" else 4
+    return [measure(count, COARSE, 1, device, integrator=name) for name in INTEGRATORS]
+
+
+def elements(device: str) -> list[dict[str, Any]]:
+    """Coarse batches by element, and the fine one that the learned element stands for."""
+    few, many = (16, 256) if device == "cuda" else (1, 4)
+    cases = [("hex8-enhanced", many, COARSE, 1), ("hex8-learned", many, COARSE, 1)]
+    cases.append(("hex8-enhanced", few, FINE, 4))
+    return [
+        measure(n, shape, k, device, integrator="generalised-alpha", element=element)
+        for element, n, shape, k in cases
+    ]
+
+
+def main() -> None:
+    """Measure and write JSON."""
+    device, kind = (sys.argv[1:] + ["cpu", "sizes"][len(sys.argv) - 1 :])[:2]
+    measured = {"sizes": sizes, "integrators": integrators, "elements": elements}[kind](device)
+    name = torch.cuda.get_device_name() if device == "cuda" else None
+    key = "batch" if kind == "sizes" else f"batch {kind}"
+    add(key, measured, name, torch_threads=torch.get_num_threads())
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from pdcorrect._version import __version__ as __version__
 _HOME = {
     "Scene": "pdcorrect.scene",
     "best_coarse": "pdcorrect.scene",
+    "learned_coarse": "pdcorrect.scene",
     "State": "pdcorrect.state",
     "Status": "pdcorrect.state",
     "StepResult": "pdcorrect.state",
@@ -66,6 +67,7 @@ _MODULES = ("metrics", "errors", "figures")
 __all__ = [  # noqa: RUF022
     "Scene",
     "best_coarse",
+    "learned_coarse",
     "State",
     "Status",
     "StepResult",
@@ -126,7 +128,7 @@ if TYPE_CHECKING:
     from pdcorrect.figures import render, render_overlay
     from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
     from pdcorrect.io.vtk import write_vtu_series
-    from pdcorrect.scene import Scene, best_coarse
+    from pdcorrect.scene import Scene, best_coarse, learned_coarse
     from pdcorrect.solvers.adjoint import adjoint
     from pdcorrect.solvers.newton import Newton
     from pdcorrect.solvers.projective import ProjectiveDynamics

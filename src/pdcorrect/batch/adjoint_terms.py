@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch import viscosity
@@ -12,10 +15,80 @@ from pdcorrect.batch.modes import Following, relaxed
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.step_equation import BatchStepEquation
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.fem.cell_correction import CellCorrection
+
+Array = NDArray[np.float64]
 
 _STEP = {torch.float64: 1e-4, torch.float32: 1e-2}
 """Of a deformation gradient's entry, for differences of fourth order of projected tangents."""
 _PLACES, _FACTORS = (1, -1, 2, -2), (8.0, -8.0, -1.0, 1.0)
+
+
+class Written:
+    """Derivatives through what learned elements are written from, scene by scene on the CPU.
+
+    Parameters
+    ----------
+    stepper : BatchStepper
+    """
+
+    def __init__(self, stepper: BatchStepper) -> None:
+        self._stepper = stepper
+        self._corrections = stepper.corrections() if stepper.cells.correction else []
+        material = stepper.present
+        self._mu, self._omega, self._density = (
+            m.to("cpu", torch.float64).numpy()
+            for m in (material.mu, material.volume_weight, material.density)
+        )
+
+    def forces(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Of x . dW/dy by mu and omega, (B, C), for (B, U, 3)."""
+
+        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+            return c.matrix_slopes(self._moved(y, i), self._nodal(x, i)), None
+
+        return self._each(y, slopes)
+
+    def inertia(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Of a . M b by mu and omega, (B, C), for (B, U, 3)."""
+
+        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+            density = self._density[i, : len(c.cells), None, None]
+            local = self._nodal(a, i)[c.cells], self._nodal(b, i)[c.cells]
+            return None, density * np.einsum("cki,cli->ckl", *local)
+
+        return self._each(a, slopes)
+
+    def tangents(self, y: Tensor, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Of x . K z, K projected at y: by y (B, U, 3), and by mu and omega, (B, C)."""
+        by_y = torch.zeros_like(y)
+
+        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+            along, across = self._nodal(x, i), self._nodal(z, i)
+            found, by_matrices = c.tangent_slopes(self._moved(y, i), along, across)
+            by_y[i, : len(found)] = torch.as_tensor(found).to(y)
+            return by_matrices, None
+
+        by_mu, by_omega = self._each(y, slopes)
+        return by_y, by_mu, by_omega
+
+    def _each(
+        self, like: Tensor, slopes: Callable[[CellCorrection, int], tuple[Array | None, Array | None]]
+    ) -> tuple[Tensor, Tensor]:
+        found = np.zeros((2, *self._mu.shape))
+        for i, c in enumerate(self._corrections):
+            if c.writer is not None:
+                weights = (m[i, : len(c.cells)] for m in (self._mu, self._omega))
+                found[:, i, : len(c.cells)] = c.writer.slopes(*weights, *slopes(c, i))
+        by_mu, by_omega = (torch.as_tensor(f).to(like) for f in found)
+        return by_mu, by_omega
+
+    def _nodal(self, field: Tensor, i: int) -> Array:
+        nodes = len(self._stepper.problems[i].positions)
+        return np.asarray(field[i, :nodes].to("cpu", torch.float64).numpy())
+
+    def _moved(self, y: Tensor, i: int) -> Array:
+        return self._nodal(y, i) - self._stepper.problems[i].positions
 
 
 class DampingTerms:
@@ -34,6 +107,7 @@ class DampingTerms:
     ) -> None:
         objective = stepper.objective
         self._stepper, self._cells, self._x = stepper, stepper.cells, x
+        self._written = Written(stepper)
         self._stiff, self._viscous = objective.stiff, objective.viscous
         self.has_rayleigh = objective.damped or objective.stiff
         _, _, self._stiffness, self._rate = objective.factors.clone()
@@ -156,7 +230,11 @@ class DampingTerms:
             change = self._difference(lambda t, e=unit: product(H, cells.point_weights + t * e))
             share = torch.where(unit[term] > 0.0, cells.volumes[term] / unit[term], 0.0)
             found.append((change * share).reshape(n.scenes, n.cells, n.points).sum(dim=2))
-        return cells.gathered(slope / step), found[0], found[1]
+        by_place, by_mu, by_omega = cells.gathered(slope / step), found[0], found[1]
+        if cells.correction is None:
+            return by_place, by_mu, by_omega
+        more = self._written.tangents(self._at, self._x, self._offset)
+        return by_place + more[0], by_mu + more[1], by_omega + more[2]
 
     @staticmethod
     def _difference(function) -> Tensor:  # type: ignore[no-untyped-def]

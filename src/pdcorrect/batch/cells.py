@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.correction import STATE, BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
@@ -115,6 +116,8 @@ class CellBatch:
             points,
         )
         self._gradients = self._gradient_sets(quadratures)
+        written = [p.correction for p in problems if p.correction is not None]
+        self.correction = BatchCorrection(written, n.cells, self.rest) if written else None
 
     def narrowed(self, rows: Tensor) -> CellBatch:
         """Of some scenes."""
@@ -134,6 +137,7 @@ class CellBatch:
             _slots=slots.reshape(-1, self._slots.shape[1]),
             point_weights=self.of_scenes(self.point_weights, rows),
             volumes=self.of_scenes(self.volumes, rows),
+            correction=self.correction and self.correction.narrowed(rows),
         )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
@@ -193,12 +197,25 @@ class CellBatch:
 
     def energy_and_forces(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """Elastic energies (B,), J, and forces (B, U, 3), N, of configurations (B, U, 3)."""
-        density, P = self.points.stress(self.gradients(y - self.rest), self.point_weights)
-        return density.reshape(self.sizes.scenes, -1).sum(dim=1), -self.gathered(P)
+        u = y - self.rest
+        density, P = self.points.stress(self.gradients(u), self.point_weights)
+        energy, forces = density.reshape(self.sizes.scenes, -1).sum(dim=1), -self.gathered(P)
+        if self.correction is None:
+            return energy, forces
+        more, by_cell = self.correction.energy_and_forces(self.local(u))
+        return energy + more, forces + self._of_corners(by_cell)
 
     def linearise(self, y: Tensor, project: bool = False) -> Tangent:
         """The tangent at configurations, for `apply`; ``project`` as in `Points.tangent`."""
-        return self.points.tangent(self.gradients(y - self.rest), self.point_weights, project)
+        u = y - self.rest
+        tangent = self.points.tangent(self.gradients(u), self.point_weights, project)
+        if self.correction is None:
+            return tangent
+        return *tangent, self.correction.linearise(self.local(u), project)
+
+    def tangent_sizes(self) -> tuple[int, ...]:
+        """Numbers that the parts of a tangent have at each point, and in each cell."""
+        return (9, 9, 12) if self.correction is None else (9, 9, 12, STATE)
 
     def of_scenes(self, x: Tensor, rows: Tensor) -> Tensor:
         """What is known at points, (k, B C, Q), of some scenes."""
@@ -206,7 +223,15 @@ class CellBatch:
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
-        return self.gathered(self.points.product(tangent, self.gradients(x)))
+        out = self.gathered(self.points.product(tangent[:3], self.gradients(x)))
+        if self.correction is None:
+            return out
+        return out + self._of_corners(self.correction.apply(tangent[3], self.local(x)))
+
+    def _of_corners(self, by_cell: Tensor) -> Tensor:
+        """Values (B, C, K, 3) of corners summed, and none for modes, (B, U, 3)."""
+        missing = self.sizes.width - by_cell.shape[2]
+        return self.summed(torch.nn.functional.pad(by_cell, (0, 0, 0, missing)))
 
     def set_weights(self, mu: Tensor, omega: Tensor) -> None:
         """Weights of the two energy terms from now on, (B, C), Pa."""

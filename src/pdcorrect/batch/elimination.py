@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 def alike_cells(problem: Problem) -> bool:
     """Whether shape functions and material are the same in all cells of a body."""
     materials, quadrature = problem.materials, problem.quadrature
-    return quadrature.alike_gradients and all(
+    return problem.correction is None and quadrature.alike_gradients and all(
         alike(values)
         for values in (
             quadrature.weights, quadrature.volume_weights,

@@ -102,7 +102,7 @@ def _blocks(cells: CellBatch, tangent: Tangent) -> Tensor:
         for i in range(3):
             D = gradients.new_zeros(9, len(gradients), gradients.shape[3])
             D[3 * i : 3 * i + 3] = gradients[:, mode].transpose(0, 1)
-            columns.append(_pulled(cells, cells.points.product(tangent, D)))
+            columns.append(_pulled(cells, cells.points.product(tangent[:3], D)))
     return torch.stack(columns, dim=2)
 
 

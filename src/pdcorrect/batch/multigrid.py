@@ -352,7 +352,8 @@ def with_mass(problem: Problem, blocks: Array, factor: float) -> tuple[Array, Ar
         besides = problem.mass - by_cells
         if (besides >= -_ROUNDING * problem.mass.max()).all():
             rule, nodal = "lumped", factor * np.maximum(besides, 0.0)
-    masses = factor * density[:, None, None] * space.cell_masses(rule)
+    shares = problem.cell_masses if rule == problem.mass_rule else space.cell_masses(rule)
+    masses = factor * density[:, None, None] * shares
     if len(blocks) == 1 and rule != "per-node":
         masses = masses[:1]
     return blocks + np.kron(masses, np.eye(3)), nodal

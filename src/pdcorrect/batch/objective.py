@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch import viscosity
-from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.gpu import as_kernel, small_products
 from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.shared_matrices import with_rows
@@ -35,13 +37,21 @@ class BatchMass:
         nodes = distinct[0].cells.shape[1]
         blocks = [p.space.cell_masses(p.mass_rule) for p in distinct]
         self._blocks = cells.repeated(blocks, n.cells, nodes, nodes)
+        self._plain = self._blocks
         self._diagonal = all(p.mass_is_diagonal for p in distinct)
         self.density = cells.rest.new_zeros(n.scenes, n.cells)
         self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
 
     def narrowed(self, cells: CellBatch, rows: Tensor) -> BatchMass:
         """Of some scenes, with their cells."""
-        return with_rows(self, rows, "_blocks", "density", "nodal", _cells=cells)
+        return with_rows(self, rows, "_blocks", "_plain", "density", "nodal", _cells=cells)
+
+    def write(self, masses: Sequence[NDArray[np.float64]]) -> None:
+        """Add what learned elements add in each scene, (C, K, K) at density 1, from now on."""
+        if self._blocks is self._plain:
+            self._blocks = self._plain.clone()
+        added = self._cells.tensor(padded(masses, tuple(self._plain.shape[1:])))
+        self._blocks.copy_(self._plain + added)  # in place, for recorded work
 
     def set_density(self, density: Tensor) -> None:
         """Densities (B, C), kg/m3, from now on."""
@@ -117,8 +127,11 @@ class BatchObjective:
         points = cells.volumes.shape[1:]
         self.tangent: Tangent | None = None
         if self.stiff:
-            U, V, T = (cells.rest.new_zeros(k, *points) for k in (9, 9, 12))
-            self.tangent = U, V, T
+            in_cells = points[0], 1
+            self.tangent = tuple(
+                cells.rest.new_zeros(k, *(points if i < 3 else in_cells))
+                for i, k in enumerate(cells.tangent_sizes())
+            )
         self.before = cells.rest.new_zeros(6 if self.viscous else 0, *points)
 
     def narrowed(self, rows: Tensor) -> BatchObjective:

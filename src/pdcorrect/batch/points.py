@@ -17,8 +17,9 @@ from pdcorrect.batch.decomposition import nearest_volume, product, signed_svd, t
 from pdcorrect.batch.point_kernel import PointFunction, at_points
 from pdcorrect.fem.hyperelasticity import COROTATED
 
-Tangent = tuple[Tensor, Tensor, Tensor]
-"""U (9, C, Q), V (9, C, Q) and the tangent (12, C, Q) in their frame."""
+Tangent = tuple[Tensor, ...]
+"""U (9, C, Q), V (9, C, Q) and the tangent (12, C, Q) in their frame; a batch of cells adds what
+its learned elements need."""
 Components = list[Tensor]
 
 

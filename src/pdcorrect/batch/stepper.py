@@ -40,6 +40,7 @@ from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
 from pdcorrect.batch.viscosity import stretches
+from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
 from pdcorrect.solvers.implicit import positive, whole
@@ -289,7 +290,27 @@ class BatchStepper:
 
     def _write(self, material: BatchMaterial) -> None:
         self.cells.set_weights(material.mu, material.volume_weight)
+        if self.cells.correction is not None:
+            written = self.corrections(material)
+            self.cells.correction.write(written)
+            self.objective.mass.write([c.masses for c in written])
         self.objective.mass.set_density(material.density)
+
+    def corrections(self, material: BatchMaterial | None = None) -> list[CellCorrection]:
+        """What the scenes' learned elements add with a material, the present one by default."""
+        material = self._material if material is None else material
+        weights = (m.to("cpu", torch.float64).numpy() for m in (material.mu, material.volume_weight))
+        mu, omega = weights
+        out = []
+        for i, (problem, sound) in enumerate(
+            zip(self.problems, material.sound.tolist(), strict=True)
+        ):
+            correction, count = problem.correction, len(problem.cells)
+            assert correction is not None
+            if material is not self._own and sound and correction.writer is not None:
+                correction = correction.writer.correction(mu[i, :count], omega[i, :count])
+            out.append(correction)
+        return out
 
     def problem_now(self, i: int) -> Problem:
         """The problem of a scene with the material that it has now."""

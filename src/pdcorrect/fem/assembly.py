@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,6 +13,9 @@ from numpy.typing import NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem import kernels
 from pdcorrect.fem.quadrature import Quadrature
+
+if TYPE_CHECKING:
+    from pdcorrect.fem.cell_correction import CorrectionTangent
 
 Array = NDArray[np.float64]
 
@@ -67,6 +71,8 @@ class Linearisation:
         Factors of the signed SVD of F.
     tangent : (C, 12, Q)
         Tangent in their frame times the volumes, J.
+    correction : CorrectionTangent, optional
+        That of a learned element's own energy.
     """
 
     assembly: Assembly
@@ -74,6 +80,7 @@ class Linearisation:
     left: Array
     right: Array
     tangent: Array
+    correction: CorrectionTangent | None = None
 
     def apply(self, x: Array) -> Array:
         """Tangent times x, both (N, 3), without assembling."""
@@ -83,7 +90,7 @@ class Linearisation:
             x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
             np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
         )  # fmt: skip
-        return out
+        return out if self.correction is None else out + self.correction.apply(x)
 
     def assemble(self) -> sp.csr_matrix:
         """The tangent as a sparse matrix (3N, 3N), N/m."""
@@ -96,4 +103,6 @@ class Linearisation:
         kernels.cell_stiffness(
             self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
         )
+        if self.correction is not None:
+            self.correction.add_to(blocks)
         return blocks

@@ -8,7 +8,7 @@ Solvers work on configurations; users see positions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, Linearisation
+from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh
@@ -50,6 +51,8 @@ class ElasticBody:
     cell_size : float
         Coarse cell size (cube root of the mean cell volume), m: the unit of
         tolerances at every refinement.
+    correction : CellCorrection, optional
+        What a learned element adds.
     """
 
     mesh: HexMesh
@@ -57,6 +60,7 @@ class ElasticBody:
     quadrature: Quadrature
     materials: Materials
     cell_size: float
+    correction: CellCorrection | None = field(default=None, kw_only=True)
 
     @property
     def positions(self) -> Array:
@@ -149,7 +153,11 @@ class ElasticBody:
             self.point_weights, self.quadrature.first_volume, energy, by_cell,
             assembly.start, assembly.slots, forces,
         )  # fmt: skip
-        return float(energy.sum()), forces
+        total = float(energy.sum())
+        if self.correction is not None:
+            more, added = self.correction.energy_and_forces(u)
+            total, forces = total + more, forces + added
+        return total, forces
 
     def volume_ratios(self, positions: Array) -> Array:
         """Smallest det F over the quadrature points of each cell, (C,).
@@ -192,12 +200,16 @@ class ElasticBody:
         count, lanes = quadrature.weights.shape
         left, right = np.empty((count, 9, lanes)), np.empty((count, 9, lanes))
         tangent = np.empty((count, 12, lanes))
+        u = self._displacement(configuration)
         kernels.linearise_cells(
-            self.materials.model, self._displacement(configuration), assembly.cells,
+            self.materials.model, u, assembly.cells,
             quadrature.lanes, self.point_weights[cells], quadrature.first_volume,
             project, left, right, tangent,
         )  # fmt: skip
-        return Linearisation(assembly, quadrature, left, right, tangent)
+        correction = None
+        if self.correction is not None:
+            correction = self.correction.tangent(u, project, cells=cells)
+        return Linearisation(assembly, quadrature, left, right, tangent, correction)
 
     def laplacian(self, volume_scale: float = 1.0) -> sp.csr_matrix:
         """Sum (2 mu + s omega) w D^T D, (N + B, N + B), N/m: the stiffness in G (eq. 3-14).

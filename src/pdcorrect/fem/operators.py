@@ -54,6 +54,7 @@ _ELEMENTS = {
     "hex8-bubble": _Element(ElementHex1, 3, 5, bubbles=True),
     "hex8-bubble-mean": _Element(ElementHex1, 3, 5, "mean", bubbles=True),
     "hex8-enhanced": _Element(ElementHex1, 3, 5, "linear", bubbles=True),
+    "hex8-learned": _Element(ElementHex1, 3, 5, "linear", bubbles=True),
     "hex27": _Element(ElementHex2, 5, 7),
 }
 
@@ -194,11 +195,6 @@ class Space:
         masses.flags.writeable = False
         return masses
 
-    def cell_products(self, a: Array, b: Array, rule: str) -> Array:
-        """Derivatives of a . M b by the cells' densities, (C,), for nodal fields (N, 3)."""
-        masses = self.cell_masses(rule)
-        return np.einsum("cki,ckl,cli->c", a[self.cells], masses, b[self.cells], optimize=True)
-
     def volumes(self) -> Array:
         """Rest volume of each cell, (C,), m3."""
         return np.asarray(self._basis.dx.sum(axis=1))
@@ -284,6 +280,13 @@ def mass_matrix(rule: str, space: Space, density: Array) -> sp.csr_matrix:
     if rule == "lumped":
         return diagonal
     raise SceneError(f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node.")
+
+
+def summed_cells(cells: NDArray[np.int64], blocks: Array, count: int) -> sp.csr_matrix:
+    """Matrices of the cells (C, K, K) summed into (count, count)."""
+    width = cells.shape[1]
+    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
+    return sp.csr_matrix(sp.coo_matrix((blocks.ravel(), (rows, columns)), shape=(count, count)))
 
 
 def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:

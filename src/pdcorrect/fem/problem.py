@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError, MeshError, PdcorrectWarning, SceneError
 from pdcorrect.fem.banded import BandOrder
+from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
-from pdcorrect.fem.operators import Space, lumped, mass_matrix
+from pdcorrect.fem.operators import Space, lumped, mass_matrix, summed_cells
 from pdcorrect.fem.thin_cells import warn_of_thin_cells
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
@@ -101,6 +102,12 @@ class Problem(ElasticBody):
         nodal = x[: len(self.positions)]
         out = self.mass[:, None] * nodal if self.mass_is_diagonal else self.mass_matrix @ nodal
         return np.asarray(out) if len(x) == len(nodal) else self.extended(out)
+
+    @property
+    def cell_masses(self) -> Array:
+        """Each cell's share of the mass matrix at density 1, (C, K, K), m3."""
+        shares = self.space.cell_masses(self.mass_rule)
+        return shares if self.correction is None else shares + self.correction.masses
 
     @property
     def time_step(self) -> float:
@@ -291,16 +298,38 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     """A body with the scene's mass rule, clamps and loads."""
     space, quadrature, materials = body.space, body.quadrature, body.materials
     selector = Selector(body.mesh, space.positions, body.cell_size)
-    matrix = mass_matrix(scene.solver.mass, space, materials.density)
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
+    correction = _learned(body, clamps) if scene.solver.element == "hex8-learned" else None
+    matrix = mass_matrix(scene.solver.mass, space, materials.density)
+    if correction is not None:
+        matrix = matrix + summed_cells(
+            space.cells, materials.density[:, None, None] * correction.masses, matrix.shape[0]
+        )
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
     _freeze(space.positions, space.cells, clamps.free, quadrature.lanes, quadrature.weights)
     _freeze(quadrature.volume_weights, matrix.indices, matrix.indptr)
     _freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
-        loads,
+        loads, correction=correction,
     )  # fmt: skip
+
+
+def _learned(body: ElasticBody, clamps: Clamps) -> CellCorrection:
+    from pdcorrect.fem import learned  # the network only where it is needed
+
+    materials = body.materials
+    writer = learned.ElementWriter(learned.released(), body, clamps.free)
+    found = writer.correction(materials.mu, materials.volume_weight)
+    count = int((~found.learned).sum())
+    if count:
+        warnings.warn(
+            f"element 'hex8-learned': {count} of {len(body.cells)} cells are unlike those it was "
+            "trained on and keep the element 'hex8-enhanced'",
+            PdcorrectWarning,
+            stacklevel=4,
+        )
+    return found
 
 
 def _coarse_mesh(scene: Scene, refine: int, given: HexMesh | None) -> HexMesh:

@@ -20,6 +20,7 @@ from pdcorrect.scene.scene import (
     Time,
     best_coarse,
     check_scene,
+    learned_coarse,
     trained_coarse,
 )
 
@@ -50,5 +51,6 @@ __all__ = [
     "Weight",
     "best_coarse",
     "check_scene",
+    "learned_coarse",
     "trained_coarse",
 ]

@@ -77,7 +77,8 @@ class Solver(Strict):
         "hex8-bubble": three incompatible modes a cell, against shear locking.
         "hex8-bubble-mean": both.  "hex8-enhanced": the modes, and the volume term on
         the part of the deformation that is linear in the cell, against both without
-        being too soft.  "hex27": triquadratic, 3x3x3 Gauss points.
+        being too soft.  "hex8-learned": that one with corrections by a network
+        (`pdcorrect.fem.learned`); its mass is "averaged".  "hex27": triquadratic, 3x3x3 Gauss points.
     tolerance
         Largest accepted estimate of a node's distance from the step's exact
         solution, as a fraction of the coarse cell size.
@@ -85,9 +86,22 @@ class Solver(Strict):
 
     mass: Literal["lumped", "averaged", "consistent", "per-node"] = "lumped"
     element: Literal[
-        "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex27"
-    ] = "hex8"
+        "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex8-learned",
+        "hex27",
+    ] = "hex8"  # fmt: skip
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
+
+    @model_validator(mode="before")
+    @classmethod
+    def _mass_of_learned(cls, data: Any) -> Any:
+        """The learned element was trained with one mass rule."""
+        if not isinstance(data, dict) or data.get("element") != "hex8-learned":
+            return data
+        if data.get("mass", "averaged") != "averaged":
+            raise ValueError(
+                f"mass = {data['mass']!r} with element = 'hex8-learned': expected 'averaged'"
+            )
+        return {**data, "mass": "averaged"}
 
 
 class Scene(TomlConfig):
@@ -161,7 +175,7 @@ class Scene(TomlConfig):
         --------
         ``scene.with_changes(material={"poisson": 0.3}, time={"frames": 5})``
         """
-        data = self.model_dump(mode="python", exclude_none=True, by_alias=True)
+        data = self.model_dump(mode="python", exclude_none=True, exclude_unset=True, by_alias=True)
         for section, change in sections.items():
             if isinstance(change, dict) and isinstance(data.get(section), dict):
                 data[section] = {**data[section], **change}
@@ -220,6 +234,21 @@ def best_coarse(scene: Scene) -> Scene:
     """
     check_scene(scene)
     return scene.with_changes(solver={"element": "hex8-enhanced", "mass": "averaged"})
+
+
+def learned_coarse(scene: Scene) -> Scene:
+    """The scene on its coarse mesh with the learned element, see `pdcorrect.fem.learned`.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    Scene
+    """
+    check_scene(scene)
+    return scene.with_changes(solver={"element": "hex8-learned", "mass": "averaged"})
 
 
 def trained_coarse(scene: Scene) -> Scene:

@@ -22,7 +22,12 @@ Weights = tuple[Array, Array]
 
 def mass_slope(problem: Problem, a: Array, b: Array) -> Array:
     """Derivatives of a . M b by the cells' densities, (C,), for nodal a and b (N, 3)."""
-    return problem.space.cell_products(a, b, problem.mass_rule)
+    return cell_products(problem.cells, problem.cell_masses, a, b)
+
+
+def cell_products(cells: NDArray[np.int64], masses: Array, a: Array, b: Array) -> Array:
+    """A . M_c b of each cell, (C,), for matrices (C, K, K) and nodal fields (N, 3)."""
+    return np.einsum("cki,ckl,cli->c", a[cells], masses, b[cells], optimize=True)
 
 
 def gravity_slope(problem: Problem, x: Array, start: float, end: float) -> Array:
@@ -32,7 +37,7 @@ def gravity_slope(problem: Problem, x: Array, start: float, end: float) -> Array
     for load in problem.loads:
         if load.acceleration is not None:
             field = np.broadcast_to(load.amplitude.mean(start, end) * load.acceleration, x.shape)
-            out += problem.space.cell_products(x, field, rule)
+            out += cell_products(problem.cells, problem.space.cell_masses(rule), x, field)
     return out
 
 
@@ -88,6 +93,11 @@ class RayleighTerm:
         count = len(self._problem.positions)
         slope = mass_slope(self._problem, self._x[:count], self._offset[:count])
         return -self._damping.mass * slope
+
+    @property
+    def mass_offset(self) -> Array:
+        """What the mass matrix is multiplied by, (N, 3), N/kg."""
+        return self._damping.mass * self._offset[: len(self._problem.positions)]
 
     @property
     def by_mass(self) -> float:

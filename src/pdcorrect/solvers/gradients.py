@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.sensitivities import weight_slopes
+from pdcorrect.fem.sensitivities import weight_slopes, written_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
     AdjointOperator,
@@ -326,10 +326,26 @@ class Gradients:
         problem = self._problem
         parts = [weight_slopes(problem, self._y, -self.x)]
         parts += [term.weights for term in (self._rayleigh, self._viscous) if term is not None]
+        parts.append(written_slopes(problem, None, self._by_masses))
         rule = problem.scene.material
         by_mu = np.sum([part[0] for part in parts], axis=0)
         by_omega = np.sum([part[1] for part in parts], axis=0)
         return by_mu * rule.has_shear_term, by_omega * rule.has_volume_term
+
+    @property
+    def _by_masses(self) -> Array | None:
+        """By the masses that a learned element writes, (C, 8, 8), kg/m3."""
+        problem = self._problem
+        if problem.correction is None:
+            return None
+        stage, x = self._objective.stage, self._nodal
+        pairs = [(x, stage.inertia * (self._y[: len(x)] - stage.target))]
+        if self._rayleigh is not None:
+            pairs.append((self.x[: len(x)], self._rayleigh.mass_offset))
+        out = np.zeros((len(problem.cells), 8, 8))
+        for a, b in pairs:
+            out -= np.einsum("cki,cli->ckl", a[problem.cells], b[problem.cells])
+        return problem.materials.density[:, None, None] * out
 
     @property
     def _moduli_slopes(self) -> tuple[tuple[Array, Array], ...]:

@@ -1,0 +1,198 @@
+"""What a learned element adds to a batch: `pdcorrect.fem.turned_strains` for B scenes, in torch.
+
+Kept of a configuration, see `state`: R, S, (tr S - S)^-1 and z of each cell, and what its own
+derivative y = K z needs; all lengths are times the cell's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from pdcorrect.batch.decomposition import signed_svd
+from pdcorrect.batch.gpu import small_products
+from pdcorrect.batch.points import Components, computed, moved
+from pdcorrect.batch.shared_matrices import with_rows
+from pdcorrect.fem.cell_correction import CellCorrection
+from pdcorrect.fem.cube_symmetry import MANDEL
+
+_SIZES = (9, 9, 9, 18, 18, 9, 3)
+"""Numbers of R, S, (tr S - S)^-1, z, y, the tensor of y, and w."""
+STATE = sum(_SIZES)
+
+
+class _State(NamedTuple):
+    R: Tensor
+    S: Tensor
+    inverse: Tensor
+    z: Tensor
+    y: Tensor
+    tensor: Tensor
+    w: Tensor
+
+
+class BatchCorrection:
+    """Energies, forces and second derivatives of the corrections of B bodies.
+
+    Parameters
+    ----------
+    corrections : sequence of CellCorrection
+        Of the scenes.
+    cells : int
+        To which their numbers are filled up.
+    like : Tensor
+        Whose type and device are used.
+    """
+
+    def __init__(self, corrections: Sequence[CellCorrection], cells: int, like: Tensor) -> None:
+        count = len(corrections)
+        self._shapes = like.new_zeros(count, cells, 7, 8)
+        self._matrices = like.new_zeros(count, cells, 18, 18)
+        self._sizes = like.new_ones(count, cells)
+        for i, c in enumerate(corrections):
+            self._shapes[i, : len(c.sizes)] = torch.as_tensor(c.shapes)
+            self._sizes[i, : len(c.sizes)] = torch.as_tensor(c.sizes)
+        self._mandel = torch.as_tensor(MANDEL).to(like)
+        self.write(corrections)
+
+    def write(self, corrections: Sequence[CellCorrection]) -> None:
+        """Take their matrices from now on."""
+        for i, c in enumerate(corrections):
+            self._matrices[i, : len(c.sizes)] = torch.as_tensor(c.matrices)
+
+    def narrowed(self, rows: Tensor) -> BatchCorrection:
+        """Of some scenes."""
+        return with_rows(self, rows, "_shapes", "_matrices", "_sizes")
+
+    def energy_and_forces(self, local: Tensor) -> tuple[Tensor, Tensor]:
+        """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""
+        state = self._state(local)
+        energy = 0.5 * (state.z * state.y).sum(dim=(1, 2))
+        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
+        return energy, -self._spread(conjugates)
+
+    def linearise(self, local: Tensor, project: bool = False) -> Tensor:
+        """What `apply` needs, (STATE, B C, 1); ``project`` as in `CellCorrection.tangent`."""
+        state = self._state(local)
+        if project:
+            kept = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
+        else:
+            kept = state
+        flat = [x.flatten(2).flatten(0, 1) for x in kept]
+        return torch.cat(flat, dim=1).T[..., None].contiguous()
+
+    def apply(self, kept: Tensor, local: Tensor) -> Tensor:
+        """The second derivative times changes (B, C, 8, 3), by cell."""
+        scenes, cells = self._sizes.shape
+        parts = kept[..., 0].T.reshape(scenes, cells, STATE).split(_SIZES, dim=2)
+        square = [x.unflatten(2, (3, 3)) if x.shape[2] == 9 else x for x in parts]
+        return self._spread(self._changes(_State(*square), small_products(self._shapes, local)))
+
+    def _spread(self, conjugates: Tensor) -> Tensor:
+        return small_products(self._shapes.transpose(-1, -2), conjugates)
+
+    def _state(self, local: Tensor) -> _State:
+        v = small_products(self._shapes, local)  # (B, C, 7, 3)
+        scenes, cells = v.shape[:2]
+        size = self._sizes[..., None, None]
+        H = (v[..., :3, :].transpose(-1, -2) / size).reshape(-1, 9).T[..., None]
+        R, S, inverse = computed(_stretch, [H.contiguous()], (9, 9, 9))
+
+        def matrices(x: Tensor) -> Tensor:
+            return x[..., 0].T.reshape(scenes, cells, 3, 3)
+
+        R, S, inverse = matrices(R), size * matrices(S), matrices(inverse) / size
+        identity = torch.eye(3, dtype=v.dtype, device=v.device)
+        strain = torch.einsum("nij,bcij->bcn", self._mandel, S - size * identity)
+        turned = small_products(v[..., 3:, :], R)
+        z = torch.cat([strain, turned.flatten(2)], dim=2)
+        y = small_products(self._matrices, z[..., None])[..., 0]
+        tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
+        w = small_products(inverse, self._torque(S, tensor, turned, _vectors(y))[..., None])
+        return _State(R, S, inverse, z, y, tensor, w[..., 0])
+
+    def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
+        return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
+
+    def _changes(self, at: _State, dv: Tensor) -> Tensor:
+        """See `turned_strains`; (B, C, 7, 3)."""
+        back = at.R.transpose(-1, -2)
+        D = small_products(back, dv[..., :3, :].transpose(-1, -2))
+        turn = small_products(at.inverse, -_axial(D)[..., None])[..., 0]
+        dS = D - _cross_columns(turn, at.S)
+        h, y = _vectors(at.z), _vectors(at.y)
+        dh = small_products(dv[..., 3:, :], at.R) - torch.linalg.cross(turn[..., None, :], h)
+        dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dS), dh.flatten(2)], dim=2)
+        dy = small_products(self._matrices, dz[..., None])[..., 0]
+        dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
+        torque = self._torque(at.S, dT, h, _vectors(dy))
+        torque = torque + self._torque(dS, at.tensor, dh, y)
+        trace = dS.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True)
+        torque = torque - trace * at.w + small_products(dS, at.w[..., None])[..., 0]
+        dw = small_products(at.inverse, torque[..., None])[..., 0]
+        dT = dT + _cross_columns(turn, _without(at.tensor, at.w))
+        dy_vectors = _vectors(dy) + torch.linalg.cross(turn[..., None, :], y)
+        return _conjugates(at.R, dT, dw, torch.cat([dy[..., :6], dy_vectors.flatten(2)], dim=2))
+
+
+_OWN = ("y", "tensor", "w")
+
+
+def _stretch(H: Components) -> list[Components]:
+    """R, S and (tr S - S)^-1 of H + I."""
+    U, s, V = signed_svd(moved(H))
+    floor = _KINK * s[0]
+    sums = [torch.maximum(s[1] + s[2], floor), torch.maximum(s[2] + s[0], floor)]
+    sums.append(torch.maximum(s[0] + s[1], floor))
+
+    def product(A: Components, d: Components | None) -> Components:
+        out = []
+        for i in range(3):
+            for j in range(3):
+                terms = [A[3 * i + a] * V[3 * j + a] for a in range(3)]
+                if d is not None:
+                    terms = [t * x for t, x in zip(terms, d, strict=True)]
+                out.append(terms[0] + terms[1] + terms[2])
+        return out
+
+    return [product(U, None), product(V, list(s)), product(V, [1.0 / x for x in sums])]
+
+
+_KINK = 1e-9
+"""As in `pdcorrect.fem.turned_strains`."""
+
+
+def _vectors(y: Tensor) -> Tensor:
+    return y[..., 6:].unflatten(-1, (4, 3))
+
+
+def _axial(A: Tensor) -> Tensor:
+    """e_ijk A_jk."""
+    return torch.stack(
+        [
+            A[..., 1, 2] - A[..., 2, 1],
+            A[..., 2, 0] - A[..., 0, 2],
+            A[..., 0, 1] - A[..., 1, 0],
+        ],
+        dim=-1,
+    )
+
+
+def _cross_columns(a: Tensor, A: Tensor) -> Tensor:
+    """[a] A."""
+    return torch.linalg.cross(a[..., None], A, dim=-2)
+
+
+def _without(T: Tensor, w: Tensor) -> Tensor:
+    """T - [w]."""
+    identity = torch.eye(3, dtype=T.dtype, device=T.device).expand(T.shape)
+    return T - _cross_columns(w, identity)
+
+
+def _conjugates(R: Tensor, T: Tensor, w: Tensor, y: Tensor) -> Tensor:
+    """R (T - [w]) transposed, then R y_m, (B, C, 7, 3)."""
+    first = small_products(R, _without(T, w)).transpose(-1, -2)
+    return torch.cat([first, small_products(_vectors(y), R.transpose(-1, -2))], dim=2)

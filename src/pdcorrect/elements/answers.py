@@ -1,0 +1,272 @@
+"""Linear answers of fine models at the nodes of coarse ones: what an element is learned from.
+
+Each coarse cell is cut into 4 x 4 x 4 cells of the best element without learning.  One factor a
+body gives its displacements under static loads and the lowest modes of its vibrations.  Loads of
+the coarse model are those of the fine one by virtual work: F_c = P^T F_f with the trilinear
+interpolation P, so both models see the same load.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import scipy.ndimage as ndi
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+from numpy.typing import NDArray
+
+from pdcorrect.elements.bodies import Grid, VoxelBody, nodes_of
+from pdcorrect.fem.assembly import Assembly
+from pdcorrect.fem.factorisation import factorise
+from pdcorrect.fem.mesh import VTK_CORNERS
+from pdcorrect.fem.operators import summed_cells
+from pdcorrect.fem.problem import discretise
+from pdcorrect.scene import Scene
+
+Array = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
+
+REFINEMENT = 4
+MODES = 12
+_CORNERS = VTK_CORNERS.astype(int)
+
+
+class Answers(NamedTuple):
+    """Of one body: its coarse mesh of unit cells, and what the fine model does.
+
+    Attributes
+    ----------
+    places : (N, 3) int
+        Of the coarse nodes on the grid.
+    cells : (C, 8) int
+        VTK order.
+    young, density : (C,)
+    poisson : float
+    held : (N,) bool
+    forces, displacements : (L, N, 3)
+        Static loads of the coarse model, and the fine answers, of size 1 in the mean; where
+        ``held`` the displacements are prescribed.
+    energies : (L,)
+        Twice the fine model's elastic energies.
+    squares : (M,)
+        Squared angular frequencies of the modes, ascending.
+    modes : (M, N, 3)
+        Of unit mass in the fine model.
+    stiffness, mass : (24, 24), (8, 8)
+        See `unit_cell`.
+    """
+
+    places: NDArray[np.int64]
+    cells: NDArray[np.int64]
+    young: Array
+    density: Array
+    poisson: float
+    held: NDArray[np.bool_]
+    forces: Array
+    displacements: Array
+    energies: Array
+    squares: Array
+    modes: Array
+    stiffness: Array
+    mass: Array
+
+
+class VoxelMesh(NamedTuple):
+    """Nodes and cells of a grid of unit cells, numbered by place.
+
+    Attributes
+    ----------
+    places : (N, 3) int
+    cells : (C, 8) int
+        VTK order.
+    """
+
+    places: NDArray[np.int64]
+    cells: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, solid: Grid) -> VoxelMesh:
+        """All solid cells, in the order of `numpy.argwhere`."""
+        nodes = nodes_of(solid)
+        numbers = np.full(nodes.shape, -1)
+        numbers[nodes] = np.arange(nodes.sum())
+        corners = np.argwhere(solid)[:, None] + _CORNERS
+        return cls(np.argwhere(nodes), numbers[tuple(np.moveaxis(corners, -1, 0))])
+
+
+@lru_cache(maxsize=64)
+def unit_cell(poisson: float) -> tuple[Array, Array]:
+    """Stiffness (24, 24) of a unit cell of modulus 1, modes eliminated, and mass (8, 8), density 1.
+
+    Of the best element without learning; VTK order, component i of corner k in row 3 k + i.
+    """
+    scene = Scene(
+        body={"shape": "beam", "cells": [1, 1, 1], "cell_size": 1.0},
+        material={"young": 1.0, "poisson": poisson, "density": 1.0},
+        time={"step": 1.0, "frames": 1},
+        solver={"element": "hex8-enhanced", "mass": "averaged"},
+    )
+    problem = discretise(scene)
+    rows = (3 * problem.cells[0][:, None] + np.arange(3)).ravel()
+    K = problem.stiffness(problem.positions).toarray()[np.ix_(rows, rows)]
+    M = problem.mass_matrix.toarray()[np.ix_(problem.cells[0], problem.cells[0])]
+    return K, M
+
+
+def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
+    """What the fine model of a body does under loads drawn from ``rng``."""
+    coarse = VoxelMesh.of(body.solid)
+    fine = VoxelMesh.of(_refined(body.solid))
+    P = _interpolation(coarse, fine)
+    scale = 1.0 / REFINEMENT
+    young, density = _refined(body.young), _refined(body.density)
+    solid = _refined(body.solid)
+    K1, M1 = unit_cell(body.poisson)
+    count = len(fine.places)
+    assembly = Assembly(fine.cells, count)
+    blocks = K1.reshape(8, 3, 8, 3).transpose(0, 2, 1, 3)
+    K = assembly.matrix(scale * young[solid][:, None, None, None, None] * blocks)
+    weights = scale**3 * density[solid]
+    M = summed_cells(fine.cells, weights[:, None, None] * M1, count)
+    held = body.held[tuple(coarse.places.T)]
+    fixed = (P @ held.astype(float)) > 1.0 - 1e-9
+    free = np.flatnonzero(np.repeat(~fixed, 3))
+    factor = factorise(sp.csr_matrix(K[free][:, free]), "cholespy", unknowns=3)
+    points = scale * fine.places
+    loads = _loads(fine, points, weights, fixed, rng)
+    moved = _moved_clamps(body.held, coarse, P, points, rng)
+    F = np.concatenate([loads, np.zeros((len(moved), count, 3))])
+    U = np.zeros_like(F)
+    for i, prescribed in enumerate(moved):
+        U[len(loads) + i] = prescribed
+    right = F.reshape(len(F), -1) - (K @ U.reshape(len(U), -1).T).T
+    U.reshape(len(U), -1)[:, free] = np.stack([factor.solve(b) for b in right[:, free]])
+    flat = U.reshape(len(U), -1)
+    size = np.sqrt((U**2).sum(axis=2).mean(axis=1))
+    F, flat = F / size[:, None, None], flat / size[:, None]
+    squares, shapes = _modes(K, M, free, factor.solve)
+    at = _at_coarse(coarse, fine)
+    return Answers(
+        coarse.places,
+        coarse.cells,
+        body.young[body.solid],
+        body.density[body.solid],
+        body.poisson,
+        held,
+        np.einsum("fn,lfi->lni", P.toarray(), F, optimize=True),
+        flat.reshape(U.shape)[:, at],
+        np.einsum("li,li->l", flat, (K @ flat.T).T),
+        squares,
+        shapes.reshape(len(shapes), -1, 3)[:, at],
+        K1,
+        M1,
+    )
+
+
+def _refined(grid: NDArray[T]) -> NDArray[T]:
+    for axis in range(3):
+        grid = np.repeat(grid, REFINEMENT, axis=axis)
+    return grid
+
+
+def _at_coarse(coarse: VoxelMesh, fine: VoxelMesh) -> NDArray[np.int64]:
+    """Numbers of the fine nodes at the coarse ones."""
+    shape = fine.places.max(axis=0) + 1
+    numbers = np.zeros(shape, dtype=np.int64)
+    numbers[tuple(fine.places.T)] = np.arange(len(fine.places))
+    return numbers[tuple((REFINEMENT * coarse.places).T)]
+
+
+def _interpolation(coarse: VoxelMesh, fine: VoxelMesh) -> sp.csr_matrix:
+    """Trilinear, (fine nodes, coarse nodes)."""
+    numbers = np.full(coarse.places.max(axis=0) + 2, -1)
+    numbers[tuple(coarse.places.T)] = np.arange(len(coarse.places))
+    low, inside = np.divmod(fine.places, REFINEMENT)
+    rows, columns, values = [], [], []
+    for corner in _CORNERS:
+        share = inside / REFINEMENT
+        weight = np.prod(np.where(corner, share, 1.0 - share), axis=1)
+        used = np.flatnonzero(weight > 0.0)
+        rows.append(used)
+        columns.append(numbers[tuple((low[used] + corner).T)])
+        values.append(weight[used])
+    shape = (len(fine.places), len(coarse.places))
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return sp.csr_matrix(sp.coo_matrix(entries, shape=shape))
+
+
+def _modes(K: sp.csr_matrix, M: sp.csr_matrix, free, solve) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    mass = sp.csr_matrix(sp.kron(M, sp.eye_array(3)))[free][:, free]
+    stiffness = sp.csr_matrix(K[free][:, free])
+    inverse = spla.LinearOperator(stiffness.shape, matvec=solve, dtype=np.float64)
+    start = np.random.default_rng(0).normal(size=len(free))
+    squares, vectors = spla.eigsh(stiffness, MODES, mass, sigma=0.0, OPinv=inverse, v0=start)
+    order = np.argsort(squares)
+    shapes = np.zeros((MODES, K.shape[0]))
+    shapes[:, free] = vectors[:, order].T
+    return squares[order], shapes
+
+
+# --- loads -----------------------------------------------------------------------------------------
+
+
+def _loads(
+    fine: VoxelMesh,
+    points: Array,
+    masses: Array,
+    fixed: NDArray[np.bool_],
+    rng: np.random.Generator,
+) -> Array:
+    """Static loads (L, nodes, 3) on the fine nodes that are not fixed."""
+    count = len(points)
+    nodal = np.bincount(fine.cells.ravel(), np.repeat(masses, 8) / 8.0, minlength=count)[:, None]
+    centre = points.mean(axis=0)
+    away = (points - centre) / max(1.0, np.ptp(points, axis=0).max())
+    out = [nodal * rng.normal(size=3)]  # gravity
+    out += [nodal * (rng.normal(size=3) + away @ rng.normal(size=(3, 3))) for _ in range(2)]
+    quadratic = np.einsum("ni,nj,ijk->nk", away, away, rng.normal(size=(3, 3, 3)))
+    out.append(nodal * quadratic)
+    out.append(nodal * np.cross(rng.normal(size=3), away))  # torsion
+    for wide in (True, False):
+        axis, side = int(rng.integers(3)), int(rng.integers(2))
+        area = np.where(fixed, 0.0, _face_areas(fine, axis, side))[:, None]
+        if not area.any():
+            continue
+        place = points[rng.choice(np.flatnonzero(area[:, 0] > 0.0))]
+        reach = 1e3 if wide else rng.uniform(0.7, 2.0)
+        near = np.exp(-((points - place) ** 2).sum(axis=1) / (2.0 * reach**2))[:, None]
+        traction = rng.normal(size=3) + 2.0 * away @ rng.normal(size=(3, 3))
+        out.append(area * near * traction)
+    return np.stack(out)
+
+
+def _face_areas(fine: VoxelMesh, axis: int, side: int) -> Array:
+    """Area of each node's share in the outer faces that look along an axis, (nodes,)."""
+    corners = np.flatnonzero(_CORNERS[:, axis] == side)
+    centre = 2 * fine.places[fine.cells].mean(axis=1).round(1)  # of the cells, in half cells
+    index = np.round(centre).astype(int) // 2
+    shape = index.max(axis=0) + 2
+    solid = np.zeros(shape, dtype=bool)
+    solid[tuple(index.T)] = True
+    beyond = index.copy()
+    beyond[:, axis] += 1 if side else -1
+    outer = (beyond[:, axis] < 0) | ~solid[tuple(np.maximum(beyond, 0).T)]
+    faces = fine.cells[outer][:, corners]
+    share = 1.0 / (4.0 * REFINEMENT**2)
+    return np.bincount(faces.ravel(), np.full(faces.size, share), minlength=len(fine.places))
+
+
+def _moved_clamps(
+    held: Grid, coarse: VoxelMesh, P: sp.csr_matrix, points: Array, rng: np.random.Generator
+) -> list[Array]:
+    """A rigid motion of one of several groups of held nodes, as fields (nodes, 3)."""
+    groups, count = ndi.label(held, structure=np.ones((3, 3, 3)))
+    if count < 2:
+        return []
+    chosen = groups[tuple(coarse.places.T)] == 1 + rng.integers(count)
+    moved = (P @ chosen.astype(float)) > 1.0 - 1e-9
+    centre = points[moved].mean(axis=0)
+    rigid = rng.normal(size=3) + np.cross(0.5 * rng.normal(size=3), points - centre)
+    return [moved[:, None] * rigid]

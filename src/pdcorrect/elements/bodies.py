@@ -1,0 +1,236 @@
+"""Random voxel bodies on which an element is learned: shapes, held nodes, materials."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Grid = NDArray[np.bool_]
+
+_LARGEST = (12, 6, 6)
+"""Cells along the axes of the box that a body lies in, before its axes are permuted."""
+_FEWEST, _MOST = 4, 110
+"""Cells of a body."""
+_MOST_HELD = 0.6
+"""Share of the nodes."""
+_NEARLY_INCOMPRESSIBLE = 0.3
+"""Share of the bodies with a Poisson's ratio from 0.45 to 0.495."""
+_TWO_MATERIALS = 0.3
+"""Share of the bodies."""
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelBody:
+    """A body of unit cells, its materials relative to a first one of modulus and density 1.
+
+    Attributes
+    ----------
+    kind : str
+        Of its shape.
+    solid : (a, b, c) bool
+    held : (a + 1, b + 1, c + 1) bool
+        Of the nodes, those whose three components are clamped.
+    young, density : (a, b, c)
+    poisson : float
+    """
+
+    kind: str
+    solid: Grid
+    held: Grid
+    young: Array
+    density: Array
+    poisson: float
+
+
+def draw(rng: np.random.Generator) -> VoxelBody:
+    """A body; the same one from a generator in the same state."""
+    kinds = sorted(_SHAPES)
+    while True:
+        kind = kinds[rng.integers(len(kinds))]
+        solid = _connected(_SHAPES[kind](rng))
+        if not _FEWEST <= solid.sum() <= _MOST:
+            continue
+        solid = _trimmed(solid.transpose(rng.permutation(3)))
+        held = _held(solid, rng)
+        if _holds(held, nodes_of(solid)):
+            break
+    young, density = _materials(solid, rng)
+    low, high = (0.45, 0.495) if rng.random() < _NEARLY_INCOMPRESSIBLE else (0.0, 0.45)
+    return VoxelBody(kind, solid, held, young, density, float(rng.uniform(low, high)))
+
+
+def nodes_of(cells: Grid) -> Grid:
+    """Nodes (a + 1, b + 1, c + 1) that a cell touches."""
+    out = np.zeros(tuple(n + 1 for n in cells.shape), dtype=bool)
+    for i, j, k in np.ndindex(2, 2, 2):
+        a, b, c = cells.shape
+        out[i : i + a, j : j + b, k : k + c] |= cells
+    return out
+
+
+# --- shapes ------------------------------------------------------------------------------------
+
+
+def _beam(rng: np.random.Generator) -> Grid:
+    thick = rng.integers(1, 5, size=2)
+    return np.ones((rng.integers(3, _LARGEST[0] + 1), *thick), dtype=bool)
+
+
+def _plate(rng: np.random.Generator) -> Grid:
+    return np.ones((*rng.integers(3, 9, size=2), rng.integers(1, 3)), dtype=bool)
+
+
+def _union(rng: np.random.Generator) -> Grid:
+    solid = np.zeros(_LARGEST, dtype=bool)
+    for _ in range(rng.integers(2, 5)):
+        solid[_box(rng, solid.shape)] = True
+    return solid
+
+
+def _holed(rng: np.random.Generator) -> Grid:
+    solid = np.ones((rng.integers(4, 9), rng.integers(3, 6), rng.integers(1, 5)), dtype=bool)
+    for _ in range(rng.integers(1, 4)):
+        size = np.minimum(rng.integers(1, 3, size=3), np.array(solid.shape) - 1)
+        start = [rng.integers(0, n - s + 1) for n, s in zip(solid.shape, size, strict=True)]
+        solid[tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))] = False
+    return solid
+
+
+def _frame(rng: np.random.Generator) -> Grid:
+    a, b, depth = rng.integers(4, 9), rng.integers(4, 8), rng.integers(1, 4)
+    wall = rng.integers(1, 3)
+    solid = np.ones((a, b, depth), dtype=bool)
+    solid[wall : a - wall, wall : b - wall] = False
+    if rng.random() < 0.5:  # open at one side
+        solid[:, b - wall :] = False
+    return solid
+
+
+def _stepped(rng: np.random.Generator) -> Grid:
+    solid = np.zeros(_LARGEST, dtype=bool)
+    start = 0
+    for _ in range(rng.integers(2, 5)):
+        length, height, depth = rng.integers(1, 5), rng.integers(1, 6), rng.integers(1, 5)
+        solid[start : start + length, :height, :depth] = True
+        start += length
+    return solid
+
+
+def _random(rng: np.random.Generator) -> Grid:
+    """A body that grew cell by cell."""
+    solid = np.zeros((8, 6, 6), dtype=bool)
+    solid[4, 3, 3] = True
+    for _ in range(rng.integers(_FEWEST, 60)):
+        around = _neighbours(solid) & ~solid
+        places = np.argwhere(around)
+        solid[tuple(places[rng.integers(len(places))])] = True
+    return solid
+
+
+_SHAPES = {
+    "beam": _beam,
+    "plate": _plate,
+    "union": _union,
+    "holed": _holed,
+    "frame": _frame,
+    "stepped": _stepped,
+    "random": _random,
+}
+
+
+def _box(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[slice, ...]:
+    size = [rng.integers(1, n + 1) if i == 0 else rng.integers(1, 4) for i, n in enumerate(shape)]
+    size = list(rng.permutation(size))
+    size = [min(s, n) for s, n in zip(size, shape, strict=True)]
+    start = [rng.integers(0, n - s + 1) for n, s in zip(shape, size, strict=True)]
+    return tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))
+
+
+def _neighbours(solid: Grid) -> Grid:
+    """Cells that share a face with a solid one, or are one."""
+    out = solid.copy()
+    for axis in range(3):
+        ahead = np.moveaxis(out, axis, 0)
+        source = np.moveaxis(solid, axis, 0)
+        ahead[1:] |= source[:-1]
+        ahead[:-1] |= source[1:]
+    return out
+
+
+def _connected(solid: Grid) -> Grid:
+    """The part with the first cell that hangs together by faces."""
+    if not solid.any():
+        return solid
+    part = np.zeros_like(solid)
+    part[tuple(np.argwhere(solid)[0])] = True
+    while True:
+        grown = _neighbours(part) & solid
+        if (grown == part).all():
+            return part
+        part = grown
+
+
+def _trimmed(solid: Grid) -> Grid:
+    found = np.argwhere(solid)
+    low, high = found.min(axis=0), found.max(axis=0) + 1
+    return solid[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+
+
+# --- held nodes and materials --------------------------------------------------------------------
+
+
+def _held(solid: Grid, rng: np.random.Generator) -> Grid:
+    """Nodes of one or two faces of the body's box, or of parts of them; seldom an edge besides."""
+    nodes = nodes_of(solid)
+    held = np.zeros_like(nodes)
+    for _ in range(1 if rng.random() < 0.7 else 2):
+        axis, side = int(rng.integers(3)), int(rng.integers(2))
+        held |= _on_side(nodes, axis, side, rng, least=2 if rng.random() < 0.35 else None)
+    if rng.random() < 0.1:
+        held |= _on_side(nodes, int(rng.integers(3)), int(rng.integers(2)), rng, least=1)
+    return held & nodes
+
+
+def _on_side(
+    nodes: Grid, axis: int, side: int, rng: np.random.Generator, least: int | None
+) -> Grid:
+    """Nodes of one face of the box, or of a part at least ``least`` nodes wide."""
+    region = np.zeros_like(nodes)
+    np.moveaxis(region, axis, 0)[-side] = True
+    for other in {0, 1, 2} - {axis} if least else ():
+        count = nodes.shape[other]
+        width = int(rng.integers(min(least or 1, count), count + 1))
+        start = int(rng.integers(0, count - width + 1))
+        view = np.moveaxis(region, other, 0)
+        view[:start] = False
+        view[start + width :] = False
+    return region
+
+
+def _holds(held: Grid, nodes: Grid) -> bool:
+    """Whether a whole face of a cell is held, and enough is not."""
+    whole = 0
+    for axis in range(3):
+        faces = [held]
+        for other in {0, 1, 2} - {axis}:
+            moved = np.moveaxis(faces[0], other, 0)
+            faces = [np.moveaxis(moved[1:] & moved[:-1], 0, other)]
+        whole += int(faces[0].sum())
+    return whole > 0 and held.sum() <= _MOST_HELD * nodes.sum()
+
+
+def _materials(solid: Grid, rng: np.random.Generator) -> tuple[Array, Array]:
+    young, density = np.ones(solid.shape), np.ones(solid.shape)
+    if rng.random() < _TWO_MATERIALS:
+        region = np.zeros(solid.shape, dtype=bool)
+        if rng.random() < 0.5:
+            axis = int(np.argmax(solid.shape))
+            np.moveaxis(region, axis, 0)[rng.integers(1, max(2, solid.shape[axis])) :] = True
+        else:
+            region[_box(rng, solid.shape)] = True
+        young[region] = 10.0 ** rng.uniform(-1.0, 1.0)
+        density[region] = 10.0 ** rng.uniform(-0.3, 0.3)
+    return young, density

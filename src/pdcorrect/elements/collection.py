@@ -1,0 +1,84 @@
+"""Answers of many bodies in files, computed by several processes; started again, it goes on."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from pdcorrect._files import make_folder, replacing
+from pdcorrect.data.workers import one_thread
+from pdcorrect.elements.answers import Answers, answers
+from pdcorrect.elements.bodies import draw
+from pdcorrect.errors import InputError
+
+A_FILE = 25
+"""Bodies in a file."""
+_SINGLE = ("forces", "displacements", "modes")
+"""Kept in single precision."""
+
+
+def generate(
+    folder: Path, count: int, seed: int, workers: int = 1, seconds: float | None = None
+) -> int:
+    """Compute the files that are missing of ``count`` bodies; how many are still missing.
+
+    Body i depends on the seed and i alone.  After ``seconds`` nothing new is begun.
+    """
+    make_folder(folder)
+    deadline = None if seconds is None else time.monotonic() + seconds
+    numbers = range(-(-count // A_FILE))
+    missing = [n for n in numbers if not _path(folder, n).exists()]
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(_write, folder, seed, n, deadline) for n in missing]
+        return sum(not task.result() for task in as_completed(tasks))
+
+
+def read(folder: Path, count: int) -> Iterator[Answers]:
+    """The first ``count`` bodies.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or damaged.
+    """
+    for number in range(-(-count // A_FILE)):
+        yield from read_file(_path(folder, number))[: count - number * A_FILE]
+
+
+def read_file(path: Path) -> list[Answers]:
+    """The bodies of one file."""
+    try:
+        with np.load(path) as data:
+            return [
+                Answers(*(data[f"{i}/{name}"] for name in Answers._fields)) for i in range(A_FILE)
+            ]
+    except (OSError, KeyError, ValueError) as error:
+        raise InputError(f"{path}: {error}. Delete it and generate again.") from None
+
+
+def _path(folder: Path, number: int) -> Path:
+    return folder / f"bodies-{number:04d}.npz"
+
+
+def _write(folder: Path, seed: int, number: int, deadline: float | None) -> bool:
+    """One file, unless it is too late."""
+    if deadline is not None and time.monotonic() > deadline:
+        return False
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    arrays = {}
+    with one_thread():
+        for i in range(A_FILE):
+            rng = np.random.default_rng([seed, number * A_FILE + i])
+            found = answers(draw(rng), rng)
+            for name, value in found._asdict().items():
+                kept = np.asarray(value)
+                arrays[f"{i}/{name}"] = kept.astype(np.float32) if name in _SINGLE else kept
+    with replacing(_path(folder, number)) as part, part.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    return True

@@ -1,0 +1,231 @@
+"""The linear problem on coarse meshes, with derivatives by the cells' matrices, and its loss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pdcorrect.elements.answers import Answers
+from pdcorrect.fem.cell_correction import cell_shapes
+from pdcorrect.fem.learned import bounded, own_mass, own_stiffness, root, scalar_map, strain_map
+from pdcorrect.fem.mesh import VTK_CORNERS
+from pdcorrect.fem.neighbourhood import neighbourhoods
+
+Array = NDArray[np.float64]
+
+_LOADS, _MODES = 8, 12
+FLOORS = (0.01, 0.01, 0.01, 0.003)
+"""Below which errors hardly count: of displacements, energies, shapes and squared frequencies."""
+WEIGHTS = (1.0, 1.0, 1.0, 2.0)
+
+
+@lru_cache(maxsize=1)
+def unit_strains() -> Array:
+    """T (18, 24) of a unit cell, see `strain_map`."""
+    return strain_map(cell_shapes(VTK_CORNERS[None].astype(float))[0][0])
+
+
+class Sample(NamedTuple):
+    """One body: what the network sees, and what its answers are judged by; arrays of NumPy."""
+
+    features: Array
+    near: Array
+    K: Array
+    M: Array
+    stiff_root: Array
+    heavy_root: Array
+    young: Array
+    density: Array
+    rows: NDArray[np.int64]
+    free: NDArray[np.bool_]
+    forces: Array
+    displacements: Array
+    energies: Array
+    squares: Array
+    modes: Array
+
+
+def sample(body: Answers) -> Sample:
+    """Prepare one body."""
+    poisson = float(body.poisson)
+    K, M = body.stiffness, body.mass
+    count = len(body.cells)
+    index = body.places[body.cells[:, 0]]
+    corners = body.held[body.cells].astype(float)
+    x = neighbourhoods(index, body.young, np.full(count, poisson), corners)
+    rows = (3 * body.cells[:, :, None] + np.arange(3)).reshape(count, 24)
+    return Sample(
+        x.astype(np.float32), corners.any(axis=1).astype(float), K, M,
+        root(own_stiffness(K, unit_strains())), root(own_mass(M)),
+        body.young, body.density, rows, ~np.repeat(body.held, 3),
+        body.forces.reshape(len(body.forces), -1).astype(float),
+        body.displacements.reshape(len(body.forces), -1).astype(float),
+        body.energies, body.squares, body.modes.reshape(len(body.modes), -1).astype(float),
+    )  # fmt: skip
+
+
+class Batch(NamedTuple):
+    """Bodies of a batch, their cells one after the other; solved as padded dense systems.
+
+    Attributes
+    ----------
+    features : (C, F), near : (C,)
+    owner : (C,)
+        Body of each cell.
+    K : (B, 24, 24), M : (B, 8, 8), stiff_root : (B, 18, 18), heavy_root : (B, 7, 7)
+        Of its unit cell.
+    young, density : (C,)
+    rows : (C, 24)
+        Place of each displacement among the body's, which are padded to n.
+    solve : (C, 24)
+        Place among the free ones, padded to m; m itself where held.
+    free : (B, n)
+    forces, displacements : (B, L, n)
+    energies : (B, L), loaded : (B, L)
+        Whether there is such a load.
+    squares : (B, M)
+    modes : (B, M, n)
+    """
+
+    features: Tensor
+    near: Tensor
+    owner: Tensor
+    K: Tensor
+    M: Tensor
+    stiff_root: Tensor
+    heavy_root: Tensor
+    young: Tensor
+    density: Tensor
+    rows: Tensor
+    solve: Tensor
+    places: Tensor
+    forces: Tensor
+    displacements: Tensor
+    energies: Tensor
+    loaded: Tensor
+    squares: Tensor
+    modes: Tensor
+
+    def to(self, device: str) -> Batch:
+        """On a device."""
+        return Batch(*(x.to(device) for x in self))
+
+
+def collate(samples: Sequence[Sample]) -> Batch:
+    """Bodies of similar size."""
+    size = len(samples)
+    n = max(s.forces.shape[1] for s in samples)
+    m = max(int(s.free.sum()) for s in samples)
+    solve, places = [], np.full((size, m), n)
+    forces, displacements = np.zeros((size, _LOADS, n + 1)), np.zeros((size, _LOADS, n + 1))
+    energies, loaded = np.ones((size, _LOADS)), np.zeros((size, _LOADS))
+    modes = np.zeros((size, _MODES, n + 1))
+    for i, s in enumerate(samples):
+        number = np.where(s.free, np.cumsum(s.free) - 1, m)
+        solve.append(number[s.rows])
+        places[i, : s.free.sum()] = np.flatnonzero(s.free)
+        count, width = s.forces.shape
+        forces[i, :count, :width], displacements[i, :count, :width] = s.forces, s.displacements
+        energies[i, :count], loaded[i, :count] = s.energies, 1.0
+        modes[i, :, :width] = s.modes
+    stacked = {
+        name: np.stack([getattr(s, name) for s in samples])
+        for name in ("K", "M", "stiff_root", "heavy_root", "squares")
+    }
+    joined = {
+        name: np.concatenate([getattr(s, name) for s in samples])
+        for name in ("features", "near", "young", "density", "rows")
+    }
+    owner = np.repeat(np.arange(size), [len(s.rows) for s in samples])
+    arrays = dict(
+        **stacked, **joined, owner=owner, solve=np.concatenate(solve), places=places,
+        forces=forces, displacements=displacements, energies=energies, loaded=loaded, modes=modes,
+    )  # fmt: skip
+    return Batch(**{k: torch.as_tensor(v) for k, v in arrays.items()})
+
+
+class Errors(NamedTuple):
+    """Squared relative errors of each body: displacements and energies (B, L), shapes and squared
+    frequencies (B, M).
+    """
+
+    displacements: Tensor
+    energies: Tensor
+    shapes: Tensor
+    squares: Tensor
+
+
+def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
+    """Of the coarse models with matrices N (C, 18, 18) and H (C, 7, 7); without learning if None.
+
+    A mode with the fine model's omega^2 should satisfy u = omega^2 K^-1 M phi = phi, and
+    phi . M phi / phi . M u is by how much omega^2 is off.
+    """
+    K, M = batch.K[batch.owner], batch.M[batch.owner]
+    if N is not None and H is not None:
+        T, P = (torch.as_tensor(f()).to(K) for f in (unit_strains, scalar_map))
+        gate = torch.ones(len(N), 18, dtype=K.dtype, device=K.device)
+        gate[:, :6] = batch.near[:, None]
+        N = N.to(K) * gate[:, :, None] * gate[:, None, :]
+        left = batch.stiff_root[batch.owner] @ T
+        K = K + left.mT @ bounded(torch, N) @ left
+        below = batch.heavy_root[batch.owner] @ P
+        M = M + below.mT @ bounded(torch, H.to(K)) @ below
+    K = K * batch.young[:, None, None]
+    M = M * batch.density[:, None, None]
+    size, m = batch.places.shape
+    flat = batch.owner[:, None, None] * (m + 1) ** 2
+    flat = flat + batch.solve[:, :, None] * (m + 1) + batch.solve[:, None, :]
+    A = torch.zeros(size * (m + 1) ** 2, dtype=K.dtype, device=K.device)
+    A = A.index_add(0, flat.flatten(), K.flatten()).reshape(size, m + 1, m + 1)[:, :m, :m]
+    n = batch.forces.shape[2] - 1
+    A = A + torch.diag_embed((batch.places == n).to(K))
+    factor = torch.linalg.cholesky(A)
+
+    def times(matrices: Tensor, x: Tensor) -> Tensor:
+        """Cell matrices (C, 24, 24) times fields (B, L, n + 1)."""
+        places = batch.rows[:, None].expand(-1, x.shape[1], -1)
+        local = torch.gather(x[batch.owner], 2, places) @ matrices.mT
+        out = torch.zeros_like(x).flatten(0, 1)
+        line = batch.owner[:, None] * x.shape[1] + torch.arange(x.shape[1], device=x.device)
+        where = line[:, :, None] * (n + 1) + places
+        return out.flatten().index_add(0, where.flatten(), local.flatten()).reshape(x.shape)
+
+    index = batch.places[:, None]
+
+    def solved(x: Tensor) -> Tensor:
+        """K^-1 x on the free components, zero elsewhere."""
+        right = torch.gather(x, 2, index.expand(-1, x.shape[1], -1))
+        found = torch.cholesky_solve(right.mT, factor).mT
+        return torch.zeros_like(x).scatter(2, index.expand(-1, x.shape[1], -1), found)
+
+    held = batch.displacements.scatter(2, index.expand(-1, _LOADS, -1), 0.0)
+    u = held + solved(batch.forces - times(K, held))
+    u = torch.cat([u[..., :n], torch.zeros_like(u[..., n:])], dim=2)
+    size_u = (batch.displacements**2).sum(dim=2) + 1e-30
+    by_load = ((u - batch.displacements) ** 2).sum(dim=2) / size_u * batch.loaded
+    energy = ((u * times(K, u)).sum(dim=2) / batch.energies - 1.0) ** 2 * batch.loaded
+    full = torch.kron(torch.eye(1, dtype=K.dtype, device=K.device), M)
+    spread = (full[:, :, None, :, None] * torch.eye(3).to(K)[None, None, :, None]).reshape(
+        -1, 24, 24
+    )
+    inertia = times(spread, batch.modes)
+    v = batch.squares[:, :, None] * solved(inertia)
+    v = torch.cat([v[..., :n], torch.zeros_like(v[..., n:])], dim=2)
+    shapes = ((v - batch.modes) ** 2).sum(dim=2) / (batch.modes**2).sum(dim=2)
+    ratio = (batch.modes * inertia).sum(dim=2) / (v * inertia).sum(dim=2)
+    return Errors(by_load, energy, shapes, (ratio - 1.0) ** 2)
+
+
+def loss(found: Errors, base: Errors) -> Tensor:
+    """Of each body, (B,): mean squared errors over those without learning, with floors."""
+    shares = []
+    for errors, without, floor, weight in zip(found, base, FLOORS, WEIGHTS, strict=True):
+        shares.append(weight * errors.mean(dim=1) / (without.mean(dim=1) + floor**2))
+    return torch.stack(shares).sum(dim=0) / sum(WEIGHTS)

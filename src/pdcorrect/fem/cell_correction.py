@@ -1,0 +1,209 @@
+"""Energy and mass that a learned element adds to the cells of a body, see `learned`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.fem import turned_strains
+from pdcorrect.fem.assembly import Assembly
+from pdcorrect.fem.cube_symmetry import PATTERNS
+from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
+
+Array = NDArray[np.float64]
+
+_POINTS = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+_STEP = 1e-4
+"""Of the size, for differences of fourth order of strains."""
+_NO_SHIFT = np.empty((0, 18))
+
+
+class Writer(Protocol):
+    """Writes corrections from the weights mu and omega of each cell, (C,), Pa."""
+
+    def correction(self, mu: Array, omega: Array) -> CellCorrection:
+        """Those of a body."""
+
+    def slopes(
+        self, mu: Array, omega: Array, by_matrices: Array | None, by_masses: Array | None
+    ) -> tuple[Array, Array]:
+        """Derivatives by both weights, from those by a correction's matrices and masses."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellCorrection:
+    """Sum over cells of 1/2 z . K z with the strains z of `turned_strains`, and mass besides.
+
+    Attributes
+    ----------
+    cells : (C, 8)
+    shapes : (C, 7, 8)
+        What z is made of, see `cell_shapes`.
+    sizes : (C,)
+        m.
+    matrices : (C, 18, 18)
+        K, N/m.
+    masses : (C, 8, 8)
+        At density 1, m3; rows add up to zero.
+    learned : (C,) bool
+        Cells that are corrected at all.
+    writer : Writer, optional
+        What wrote it, from the cells' moduli.
+    """
+
+    cells: NDArray[np.int64]
+    shapes: Array
+    sizes: Array
+    matrices: Array
+    masses: Array
+    learned: NDArray[np.bool_]
+    writer: Writer | None = None
+
+    def energy_and_forces(self, u: Array, shift: Array = _NO_SHIFT) -> tuple[float, Array]:
+        """1/2 z . K z - shift . z (J) and its forces (N, 3) for displacements (N or more, 3)."""
+        energy, by_cell = np.empty(len(self.cells)), np.empty((*self.cells.shape, 3))
+        turned_strains.energy_and_forces(
+            u, self.cells, self.shapes, self.sizes, self.matrices, shift, energy, by_cell
+        )
+        return float(energy.sum()), self._gathered(u, by_cell)
+
+    def strains(self, u: Array) -> Array:
+        """z, (C, 18), m."""
+        out = np.empty((len(self.cells), 18))
+        turned_strains.strains(u, self.cells, self.shapes, self.sizes, out)
+        return out
+
+    def tangent(
+        self, u: Array, project: bool = False, shift: Array = _NO_SHIFT, cells: slice = slice(None)
+    ) -> CorrectionTangent:
+        """The second derivative; ``project`` leaves the rest of K's own one where z is not zero.
+
+        That is positive semi-definite together with the element's projected one near rest.
+        """
+        part = self if cells == slice(None) else self.of_cells(cells)
+        out = np.empty((len(part.cells), 21, 21))
+        turned_strains.tangents(
+            u, part.cells, part.shapes, part.sizes, part.matrices, shift, project, out
+        )
+        return CorrectionTangent(part, out)
+
+    def matrix_slopes(self, u: Array, x: Array) -> Array:
+        """Derivatives (C, 18, 18) of x . dW/du by the matrices, m2, for (N or more, 3)."""
+        return _symmetric_products(self.rates(u, x), self.strains(u))
+
+    def rates(self, u: Array, x: Array) -> Array:
+        """Change (C, 18) of the strains by x, by differences of fourth order."""
+        step = _STEP * self.sizes.mean() / max(float(np.abs(x).max()), 1e-300)
+        ahead, behind = (
+            8.0 * self.strains(u + step * s * x) - self.strains(u + 2.0 * step * s * x)
+            for s in (1.0, -1.0)
+        )
+        return np.asarray((ahead - behind) / (12.0 * step))
+
+    def tangent_slopes(self, u: Array, x: Array, z: Array) -> tuple[Array, Array]:
+        """Derivatives of x . K z, K the projected tangent at u: by u, and by the matrices.
+
+        (N or more, 3) and (C, 18, 18); by differences of fourth order.
+        """
+        alone = replace(self, cells=np.arange(self.cells.size).reshape(self.cells.shape))
+        unit = np.linalg.pinv(self.shapes)  # (C, 8, 7): displacements of one amplitude each
+        u_of, x_of, z_of = (field[self.cells].reshape(-1, 3) for field in (u, x, z))
+        along, across = (
+            (self.shapes @ field.reshape(*self.cells.shape, 3)).reshape(-1, 21, 1)
+            for field in (x_of, z_of)
+        )
+
+        def contracted(v: Array) -> Array:
+            H = alone.tangent(v, project=True).matrices
+            return np.asarray((np.swapaxes(along, 1, 2) @ H @ across)[:, 0, 0])
+
+        step = _STEP * self.sizes[:, None, None]
+        slopes = np.empty((len(self.cells), 7, 3))
+        for a in range(7):
+            for i in range(3):
+                way = np.zeros((*self.cells.shape, 3))
+                way[..., i] = (step * unit)[..., a]
+                way = way.reshape(-1, 3)
+                ahead, behind = (
+                    8.0 * contracted(u_of + s * way) - contracted(u_of + 2.0 * s * way)
+                    for s in (1.0, -1.0)
+                )
+                slopes[:, a, i] = (ahead - behind) / 12.0
+        by_cell = np.swapaxes(self.shapes, 1, 2) @ (slopes / step)
+        return self._gathered(u, by_cell), _symmetric_products(self.rates(u, x), self.rates(u, z))
+
+    def of_cells(self, cells: slice) -> CellCorrection:
+        """Of some cells."""
+        names = ("cells", "shapes", "sizes", "matrices", "masses", "learned")
+        return replace(self, **{name: getattr(self, name)[cells] for name in names})
+
+    def _gathered(self, u: Array, by_cell: Array) -> Array:
+        """Summed at the nodes; zero for what else u has."""
+        out = np.empty_like(u)
+        assembly = self.assembly
+        turned_strains.gather_nodes(
+            assembly.start, assembly.slots, by_cell.reshape(-1, 3), out[: len(assembly.start) - 1]
+        )
+        out[len(assembly.start) - 1 :] = 0.0
+        return out
+
+    @cached_property
+    def assembly(self) -> Assembly:
+        """Sums cells' values at the nodes."""
+        return Assembly(self.cells, int(self.cells.max()) + 1)
+
+
+def _symmetric_products(a: Array, b: Array) -> Array:
+    out = a[:, :, None] * b[:, None]
+    return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionTangent:
+    """The second derivative of a correction's energy at one configuration.
+
+    Attributes
+    ----------
+    matrices : (C, 21, 21)
+        By the amplitudes of the cells' shapes, N/m.
+    """
+
+    correction: CellCorrection
+    matrices: Array
+
+    def apply(self, x: Array) -> Array:
+        """Times x (N or more, 3)."""
+        correction = self.correction
+        by_cell = np.empty((*correction.cells.shape, 3))
+        turned_strains.apply_tangents(
+            x, correction.cells, correction.shapes, self.matrices, by_cell
+        )
+        return correction._gathered(x, by_cell)
+
+    def add_to(self, blocks: Array) -> None:
+        """Add the cells' matrices to blocks (C, L, L, 3, 3) of nodes, N/m."""
+        turned_strains.add_blocks(self.matrices, self.correction.shapes, blocks)
+
+
+def cell_shapes(corners: Array) -> tuple[Array, Array]:
+    """Shapes (C, 7, 8) and sizes (C,), m, of cells with these corners (C, 8, 3) at rest.
+
+    The first three rows give the mean gradient times the size, the others the four patterns'
+    amplitudes, which vanish for affine displacements (Flanagan and Belytschko 1981).
+    """
+    points = np.stack(np.meshgrid(*[_POINTS] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    slopes = shape_derivatives(points)
+    J = np.einsum("cki,jqk->cqij", corners, slopes)
+    weights = np.abs(np.linalg.det(J))
+    gradients = np.einsum("jqk,cqji->ckiq", slopes, np.linalg.inv(J), optimize=True)
+    volumes = weights.sum(axis=1) / len(points)
+    mean = np.einsum("ckiq,cq->cik", gradients, weights) / (len(points) * volumes)[:, None, None]
+    sizes = np.cbrt(volumes)
+    hourglass = PATTERNS / len(VTK_CORNERS)
+    offsets = np.einsum("mk,cki->cmi", hourglass, corners)
+    patterns = hourglass - np.einsum("cmi,cik->cmk", offsets, mean)
+    return np.concatenate([sizes[:, None, None] * mean, patterns], axis=1), sizes

@@ -1,0 +1,376 @@
+"""A cell's 18 strains z in the frame that turns with it, and a potential of them.
+
+With a the cell's size, u_k the displacements of its corners and b_k, g_mk the rows of ``shapes``,
+
+    F = I + sum_k u_k b_k^T,    h_m = sum_k g_mk u_k    (m = 1 ... 4),    F = R S,
+
+z holds a (S - I) in Mandel's notation and the four vectors R^T h_m; h_m vanishes for affine
+displacements.  A potential e(z) with y = de/dz, written as a symmetric tensor Y and vectors y_m,
+has the derivatives
+
+    de/dF = R (a Y - [w]),    de/dh_m = R y_m,
+    (tr S - S) w = sum_m R^T h_m x y_m + a axial(S Y),
+
+[w] the matrix of the cross product with w, axial(A)_i = e_ijk A_jk: the second part is what the
+frame's turning adds, without which forces would have no potential.  Second derivatives are exact
+too.  Everything here counts S and F times a, so that all numbers of z are lengths.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
+from pdcorrect.fem.kernels import CHUNK, PARALLEL
+from pdcorrect.fem.kernels import gather_nodes as gather_nodes
+
+Array = NDArray[np.float64]
+
+_ROOT = np.sqrt(0.5)
+_ROWS = np.array([0, 1, 2, 1, 2, 0])
+_COLUMNS = np.array([0, 1, 2, 2, 0, 1])
+_KINK = 1e-9
+"""Of the largest stretch: sums of two stretches below it count as it."""
+
+
+@njit(**OPTIONS)
+def _tensor(y, out):  # type: ignore[no-untyped-def]
+    """Symmetric tensor (3, 3) of the first six numbers."""
+    for n in range(6):
+        value = y[n] if n < 3 else _ROOT * y[n]
+        out[_ROWS[n], _COLUMNS[n]] = out[_COLUMNS[n], _ROWS[n]] = value
+
+
+@njit(**OPTIONS)
+def _product(A, B, out):  # type: ignore[no-untyped-def]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
+
+
+@njit(**OPTIONS)
+def _back(R, A, out):  # type: ignore[no-untyped-def]
+    """R^T A."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = R[0, i] * A[0, j] + R[1, i] * A[1, j] + R[2, i] * A[2, j]
+
+
+@njit(**OPTIONS)
+def _add_cross(a, b, factor, out):  # type: ignore[no-untyped-def]
+    out[0] += factor * (a[1] * b[2] - a[2] * b[1])
+    out[1] += factor * (a[2] * b[0] - a[0] * b[2])
+    out[2] += factor * (a[0] * b[1] - a[1] * b[0])
+
+
+@njit(**OPTIONS)
+def _add_axial(A, factor, out):  # type: ignore[no-untyped-def]
+    out[0] += factor * (A[1, 2] - A[2, 1])
+    out[1] += factor * (A[2, 0] - A[0, 2])
+    out[2] += factor * (A[0, 1] - A[1, 0])
+
+
+@njit(**OPTIONS)
+def _times(A, x, out):  # type: ignore[no-untyped-def]
+    for i in range(3):
+        out[i] = A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2]
+
+
+@njit(**OPTIONS)
+def _amplitudes(u, nodes, shapes, v):  # type: ignore[no-untyped-def]
+    """V (7, 3): rows of shapes (7, 8) times the corners' displacements."""
+    for a in range(7):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(8):
+            s, n = shapes[a, k], nodes[k]
+            x += s * u[n, 0]
+            y += s * u[n, 1]
+            z += s * u[n, 2]
+        v[a, 0], v[a, 1], v[a, 2] = x, y, z
+
+
+@njit(**OPTIONS)
+def _spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
+    """Out (8, 3): sign times the transpose of `_amplitudes` of A (7, 3)."""
+    for k in range(8):
+        for i in range(3):
+            total = 0.0
+            for a in range(7):
+                total += shapes[a, k] * A[a, i]
+            out[k, i] = sign * total
+
+
+@njit(**OPTIONS)
+def _frames(v, sizes, begin, end, F, U, s, V, B, W):  # type: ignore[no-untyped-def]
+    """Signed SVDs of a F for cells begin ... end - 1, one a lane; v (cells, 7, 3)."""
+    for l in range(F.shape[1]):
+        c = min(begin + l, end - 1) - begin
+        for i in range(3):
+            for j in range(3):
+                F[3 * i + j, l] = v[c, j, i] + (sizes[begin + c] if i == j else 0.0)
+    signed_svd_lanes(F, U, s, V, B, W)
+
+
+@njit(**OPTIONS)
+def _unpack(U, s, V, l, R, S, Y):  # type: ignore[no-untyped-def]
+    """R, S and (tr S - S)^-1 of lane l."""
+    floor = _KINK * s[0, l]
+    for i in range(3):
+        for j in range(3):
+            r, t, y = 0.0, 0.0, 0.0
+            for a in range(3):
+                r += U[3 * i + a, l] * V[3 * j + a, l]
+                both = V[3 * i + a, l] * V[3 * j + a, l]
+                t += both * s[a, l]
+                y += both / max(s[(a + 1) % 3, l] + s[(a + 2) % 3, l], floor)
+            R[i, j], S[i, j], Y[i, j] = r, t, y
+
+
+@njit(**OPTIONS)
+def _strains(v, R, S, size, z):  # type: ignore[no-untyped-def]
+    for n in range(6):
+        i, j = _ROWS[n], _COLUMNS[n]
+        z[n] = S[i, j] - size if i == j else S[i, j] / _ROOT
+    for m in range(4):
+        for i in range(3):
+            z[6 + 3 * m + i] = R[0, i] * v[3 + m, 0] + R[1, i] * v[3 + m, 1] + R[2, i] * v[3 + m, 2]
+
+
+@njit(**OPTIONS)
+def _turning(z, y, S, Y, T, A, t, w):  # type: ignore[no-untyped-def]
+    """w; T becomes the tensor of y, A and t are scratch."""
+    _tensor(y, T)
+    _product(S, T, A)
+    t[:] = 0.0
+    _add_axial(A, 1.0, t)
+    for m in range(4):
+        _add_cross(z[6 + 3 * m : 9 + 3 * m], y[6 + 3 * m : 9 + 3 * m], 1.0, t)
+    _times(Y, t, w)
+
+
+@njit(**OPTIONS)
+def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
+    """Out (7, 3): R (T - [w]) transposed, R y_m; A is scratch."""
+    A[0, 0], A[1, 1], A[2, 2] = T[0, 0], T[1, 1], T[2, 2]
+    A[0, 1], A[1, 0] = T[0, 1] + w[2], T[1, 0] - w[2]
+    A[0, 2], A[2, 0] = T[0, 2] - w[1], T[2, 0] + w[1]
+    A[1, 2], A[2, 1] = T[1, 2] + w[0], T[2, 1] - w[0]
+    for i in range(3):
+        for j in range(3):
+            out[j, i] = R[i, 0] * A[0, j] + R[i, 1] * A[1, j] + R[i, 2] * A[2, j]
+        for m in range(4):
+            out[3 + m, i] = R[i, 0] * y[6 + 3 * m] + R[i, 1] * y[7 + 3 * m] + R[i, 2] * y[8 + 3 * m]
+
+
+@njit(**OPTIONS)
+def _change(dv, R, S, Y, T, w, z, y, K, factor, D, A, B, dT, t, turn, dz, dy, dw, out):  # type: ignore[no-untyped-def]
+    """Out (7, 3): change of `_conjugates` by dv (7, 3); dz (18,) that of z.
+
+    Without y's own second part where ``factor`` is 0: then the result is positive where K is.
+    """
+    for i in range(3):
+        for j in range(3):
+            D[i, j] = R[0, i] * dv[j, 0] + R[1, i] * dv[j, 1] + R[2, i] * dv[j, 2]
+    t[:] = 0.0
+    _add_axial(D, -1.0, t)
+    _times(Y, t, turn)  # the frame turns by R [turn]
+    for j in range(3):  # dS = D - [turn] S, column by column
+        B[0, j] = D[0, j] - (turn[1] * S[2, j] - turn[2] * S[1, j])
+        B[1, j] = D[1, j] - (turn[2] * S[0, j] - turn[0] * S[2, j])
+        B[2, j] = D[2, j] - (turn[0] * S[1, j] - turn[1] * S[0, j])
+    for n in range(6):
+        i, j = _ROWS[n], _COLUMNS[n]
+        dz[n] = B[i, j] if i == j else 0.5 * (B[i, j] + B[j, i]) / _ROOT
+    for m in range(4):
+        part = dz[6 + 3 * m : 9 + 3 * m]
+        for i in range(3):
+            part[i] = R[0, i] * dv[3 + m, 0] + R[1, i] * dv[3 + m, 1] + R[2, i] * dv[3 + m, 2]
+        _add_cross(turn, z[6 + 3 * m : 9 + 3 * m], -1.0, part)
+    for n in range(18):
+        total = 0.0
+        for l in range(18):
+            total += K[n, l] * dz[l]
+        dy[n] = total
+    _tensor(dy, dT)
+    t[:] = 0.0
+    _product(S, dT, A)
+    _add_axial(A, 1.0, t)
+    for m in range(4):
+        here = slice(6 + 3 * m, 9 + 3 * m)
+        _add_cross(z[here], dy[here], 1.0, t)
+        _add_cross(dz[here], y[here], factor, t)
+    if factor != 0.0:
+        _product(B, T, A)
+        _add_axial(A, 1.0, t)
+        trace = B[0, 0] + B[1, 1] + B[2, 2]
+        for i in range(3):
+            t[i] -= trace * w[i] - (B[i, 0] * w[0] + B[i, 1] * w[1] + B[i, 2] * w[2])
+    _times(Y, t, dw)
+    if factor != 0.0:  # R turns: [turn] (T - [w]) and turn x y_m
+        for j in range(3):
+            D[0, j], D[1, j], D[2, j] = T[0, j], T[1, j], T[2, j]
+        D[0, 1] += w[2]
+        D[1, 0] -= w[2]
+        D[0, 2] -= w[1]
+        D[2, 0] += w[1]
+        D[1, 2] += w[0]
+        D[2, 1] -= w[0]
+        for j in range(3):
+            dT[0, j] += turn[1] * D[2, j] - turn[2] * D[1, j]
+            dT[1, j] += turn[2] * D[0, j] - turn[0] * D[2, j]
+            dT[2, j] += turn[0] * D[1, j] - turn[1] * D[0, j]
+        for m in range(4):
+            _add_cross(turn, y[6 + 3 * m : 9 + 3 * m], 1.0, dy[6 + 3 * m : 9 + 3 * m])
+    _conjugates(R, dT, dw, dy, A, out)
+
+
+@njit(**PARALLEL)
+def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell):  # type: ignore[no-untyped-def]
+    """1/2 z . K z - shift . z of each cell, (C,), and its forces -d/du, (C, 8, 3).
+
+    Parameters
+    ----------
+    u : (N, 3)
+        Displacements, m.
+    cells : (C, 8)
+    shapes : (C, 7, 8)
+        a b_k and g_mk.
+    sizes : (C,)
+        a, m.
+    matrices : (C, 18, 18)
+        K, N/m.
+    shift : (C or 0, 18)
+        N; none where empty.
+    """
+    count = cells.shape[0]
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
+        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
+        s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
+        v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
+        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        T, A, out = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
+        t, w = np.empty(3), np.empty(3)
+        for c in range(begin, end):
+            _amplitudes(u, cells[c], shapes[c], v[c - begin])
+        _frames(v, sizes, begin, end, F, U, s, V, B, W)
+        for c in range(begin, end):
+            l = c - begin
+            _unpack(U, s, V, l, R, S, Y)
+            _strains(v[l], R, S, sizes[c], z)
+            total = 0.0
+            for n in range(18):
+                row = 0.0
+                for m in range(18):
+                    row += matrices[c, n, m] * z[m]
+                less = shift[c, n] if len(shift) else 0.0
+                total += z[n] * (0.5 * row - less)
+                y[n] = row - less
+            energy[c] = total
+            _turning(z, y, S, Y, T, A, t, w)
+            _conjugates(R, T, w, y, A, out)
+            _spread(out, shapes[c], -1.0, by_cell[c])
+
+
+@njit(**PARALLEL)
+def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
+    """Z of each cell, out (C, 18), m."""
+    count = cells.shape[0]
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
+        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
+        s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
+        v = np.empty((CHUNK, 7, 3))
+        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        for c in range(begin, end):
+            _amplitudes(u, cells[c], shapes[c], v[c - begin])
+        _frames(v, sizes, begin, end, F, U, s, V, B, W)
+        for c in range(begin, end):
+            _unpack(U, s, V, c - begin, R, S, Y)
+            _strains(v[c - begin], R, S, sizes[c], out[c])
+
+
+@njit(**PARALLEL)
+def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: ignore[no-untyped-def]
+    """Second derivatives of the same by the amplitudes v (7, 3) of the shapes, (C, 21, 21), N/m.
+
+    ``project`` leaves out what makes them indefinite where K is not.
+    """
+    count = cells.shape[0]
+    factor = 0.0 if project else 1.0
+    for chunk in prange((count + CHUNK - 1) // CHUNK):
+        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
+        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
+        s, W9, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
+        v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
+        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        T, A, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        D, dT, column = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
+        t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+        dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
+        for c in range(begin, end):
+            _amplitudes(u, cells[c], shapes[c], v[c - begin])
+        _frames(v, sizes, begin, end, F, U, s, V, W9, W)
+        for c in range(begin, end):
+            l = c - begin
+            _unpack(U, s, V, l, R, S, Y)
+            _strains(v[l], R, S, sizes[c], z)
+            for n in range(18):
+                row = -shift[c, n] if len(shift) else 0.0
+                for m in range(18):
+                    row += matrices[c, n, m] * z[m]
+                y[n] = row
+            _turning(z, y, S, Y, T, A, t, w)
+            if project:
+                y[:] = 0.0
+            for a in range(7):
+                for i in range(3):
+                    dv[a, i] = 1.0
+                    _change(
+                        dv, R, S, Y, T, w, z, y, matrices[c], factor,
+                        D, A, B, dT, t, turn, dz, dy, dw, column,
+                    )  # fmt: skip
+                    dv[a, i] = 0.0
+                    for b in range(7):
+                        for j in range(3):
+                            out[c, 3 * b + j, 3 * a + i] = column[b, j]
+
+
+@njit(**PARALLEL)
+def add_blocks(tangent, shapes, blocks):  # type: ignore[no-untyped-def]
+    """Add the tangents (C, 21, 21) to cells' matrices (C, L, L, 3, 3) of nodes."""
+    for c in prange(len(shapes)):
+        half = np.empty((7, 3, 8, 3))
+        for a in range(7):
+            for i in range(3):
+                for k in range(8):
+                    for j in range(3):
+                        total = 0.0
+                        for b in range(7):
+                            total += tangent[c, 3 * a + i, 3 * b + j] * shapes[c, b, k]
+                        half[a, i, k, j] = total
+        for l in range(8):
+            for k in range(8):
+                for i in range(3):
+                    for j in range(3):
+                        total = 0.0
+                        for a in range(7):
+                            total += shapes[c, a, l] * half[a, i, k, j]
+                        blocks[c, l, k, i, j] += total
+
+
+@njit(**PARALLEL)
+def apply_tangents(x, cells, shapes, tangent, by_cell):  # type: ignore[no-untyped-def]
+    """The tangents times x (N, 3), by cell, (C, 8, 3)."""
+    for c in prange(cells.shape[0]):
+        dv, out = np.empty((7, 3)), np.empty((7, 3))
+        _amplitudes(x, cells[c], shapes[c], dv)
+        flat, to = dv.reshape(21), out.reshape(21)
+        for n in range(21):
+            total = 0.0
+            for m in range(21):
+                total += tangent[c, n, m] * flat[m]
+            to[n] = total
+        _spread(out, shapes[c], 1.0, by_cell[c])

@@ -1,0 +1,312 @@
+"""The learned element with any network: what holds by construction, and how solvers take it."""
+
+import numpy as np
+import pytest
+import torch
+
+import pdcorrect as pc
+from conftest import beam, cross, problem_on
+from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem import learned
+from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
+from pdcorrect.fem.mesh import HexMesh, voxel_mesh
+from pdcorrect.fem.neighbourhood import SIZE, permutations
+
+OUTPUTS = 171 + 28
+
+
+@pytest.fixture(autouse=True, scope="module")
+def any_network():
+    """Weights at random, with answers as large as bounds allow."""
+    rng = np.random.default_rng(0)
+    sizes = (SIZE, 24, 24, OUTPUTS)
+    arrays = {}
+    for i, (n, m) in enumerate(zip(sizes, sizes[1:], strict=False)):
+        arrays[f"layers.{2 * i}.weight"] = rng.normal(size=(m, n)) / np.sqrt(n)
+        arrays[f"layers.{2 * i}.bias"] = rng.normal(size=m)
+    network = learned.Network(arrays)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learned, "released", lambda: network)
+        yield network
+
+
+def learned_problem(scene):
+    return pc.discretise(pc.learned_coarse(scene))
+
+
+def u_shape():
+    solid = np.ones((4, 2, 3), dtype=bool)
+    solid[1:3, :, 1:] = False
+    solid[0, 0, 2] = False
+    return solid
+
+
+def test_the_corrections_are_large_enough_to_test(any_network):
+    N, H = any_network(np.random.default_rng(1).normal(size=(5, SIZE)))
+    S = learned.bounded(np, N)
+    assert 0.2 < np.abs(np.linalg.eigvalsh(S)).max() < learned.BOUND + 1e-12
+    assert np.abs(np.linalg.eigvalsh(learned.bounded(np, H))).max() > 0.2
+
+
+@pytest.mark.parametrize("g", [3, 17, 40])
+def test_answers_turn_with_the_cube(any_network, g):
+    x = np.random.default_rng(2).normal(size=(4, SIZE))
+    for answer, moved, moves in zip(
+        any_network(x), any_network(x[:, permutations()[g]]), (on_strains(), on_scalars()),
+        strict=True,
+    ):  # fmt: skip
+        R = np.zeros((answer.shape[1],) * 2)
+        R[range(len(R)), moves.places[g]] = moves.signs[g]
+        assert moved == pytest.approx(R @ answer @ R.T, abs=1e-6)
+
+
+@pytest.mark.parametrize("g", [5, 22, 43])
+def test_a_turned_body_has_turned_forces(g):
+    R = group()[g]
+    solid = u_shape()
+    mesh = voxel_mesh(solid, (0, 0, 0), 0.1)
+    order = np.arange(8) if np.linalg.det(R) > 0.0 else [1, 0, 3, 2, 5, 4, 7, 6]
+    other = HexMesh.create(mesh.positions @ R.T, mesh.cells[:, order])
+    problems = [problem_on(m, "hex8-learned") for m in (mesh, other)]
+    u = 0.02 * np.random.default_rng(4).normal(size=mesh.positions.shape)
+    first = problems[0].forces(mesh.positions + u)
+    second = problems[1].forces(other.positions + u @ R.T)
+    assert second == pytest.approx(first @ R.T, abs=1e-6 * np.abs(first).max())
+    a, b = (p.mass_matrix.toarray() for p in problems)
+    assert b == pytest.approx(a, abs=1e-6 * a.max())
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.495])
+def test_affine_deformations_of_free_bodies_are_exact(poisson):
+    """The patch test, up to the boundary."""
+    mesh = voxel_mesh(u_shape(), (0, 0, 0), 0.1)
+    F = np.eye(3) + 0.2 * np.random.default_rng(5).normal(size=(3, 3))
+    forces = [
+        problem_on(mesh, element, material={"poisson": poisson}).forces(mesh.positions @ F.T)
+        for element in ("hex8-enhanced", "hex8-learned")
+    ]
+    assert forces[1] == pytest.approx(forces[0], abs=1e-10 * np.abs(forces[0]).max())
+
+
+def test_rigid_motions_cost_nothing_and_the_body_is_stable_at_rest():
+    problem = problem_on(voxel_mesh(u_shape(), (0, 0, 0), 0.1), "hex8-learned")
+    values = np.linalg.eigvalsh(problem.stiffness(problem.positions).toarray())
+    assert np.abs(values[:6]).max() < 1e-9 * values[-1]
+    assert values[6] > 1e-5 * values[-1]
+    M = problem.mass_matrix.toarray()
+    assert np.linalg.eigvalsh(M).min() > 0.0
+    plain = problem_on(voxel_mesh(u_shape(), (0, 0, 0), 0.1), "hex8-enhanced")
+    assert problem.mass == pytest.approx(plain.mass, rel=1e-12)
+
+
+def test_strains_are_corrected_at_held_corners_only():
+    problem = learned_problem(beam((5, 2, 2)))
+    strains = np.abs(problem.correction.matrices[:, :6]).max(axis=(1, 2))
+    held = ~problem.free.any(axis=1)[problem.cells]
+    assert (strains[held.any(axis=1)] > 0.0).all()
+    assert (strains[~held.any(axis=1)] == 0.0).all()
+
+
+def test_what_the_matrices_depend_on_has_no_units():
+    """Twice the size, 10 times the modulus: K of 20 times, mass of 8 times."""
+    first = learned_problem(beam())
+    other = learned_problem(beam(cell_size=0.04, material={"young": 1e7}))
+    K, L = first.correction.matrices, other.correction.matrices
+    assert pytest.approx(20.0 * K, abs=1e-9 * np.abs(L).max()) == L
+    assert other.correction.masses == pytest.approx(8.0 * first.correction.masses, rel=1e-9)
+
+
+def test_energy_forces_and_stiffness_agree():
+    problem = learned_problem(cross())
+    rng = np.random.default_rng(6)
+    x = problem.positions + 0.01 * rng.normal(size=problem.positions.shape)
+    d = rng.normal(size=x.shape)
+    e = 1e-6
+    work = (problem.energy(x + e * d) - problem.energy(x - e * d)) / (2 * e)
+    assert work == pytest.approx(-np.vdot(problem.forces(x), d), rel=1e-6)
+    change = -(problem.forces(x + e * d) - problem.forces(x - e * d)) / (2 * e)
+    Kd = (problem.stiffness(x) @ d.ravel()).reshape(d.shape)
+    assert Kd == pytest.approx(change, abs=1e-6 * np.abs(Kd).max())
+
+
+@pytest.mark.parametrize("integrator", ["backward-euler", "bdf2", "midpoint", "generalised-alpha"])
+def test_newton_and_projective_dynamics_agree(integrator):
+    problem = learned_problem(cross(time={"integrator": integrator}))
+    steppers = [cls(problem, tolerance=1e-9) for cls in (pc.ProjectiveDynamics, pc.Newton)]
+    runs = [pc.rollout(stepper, 6) for stepper in steppers]
+    size = np.abs(runs[0].positions - problem.positions).max()
+    assert runs[0].positions == pytest.approx(runs[1].positions, abs=1e-7 * size)
+
+
+@pytest.mark.parametrize("solver", [pc.ProjectiveDynamics, pc.Newton])
+def test_statics_end_in_equilibrium(solver):
+    problem = learned_problem(beam(time={"integrator": "quasi-static", "frames": 2}))
+    result = pc.rollout(solver(problem, tolerance=1e-9), 2)
+    unbalanced = problem.forces(result.positions[-1]) + problem.external_forces(1.0)
+    assert (
+        np.abs(unbalanced[problem.free]).max() < 1e-6 * np.abs(problem.external_forces(1.0)).max()
+    )
+
+
+def test_a_free_body_keeps_its_momentum():
+    scene = beam(
+        clamps=[], loads=[], initial={"velocity": [1.0, 0.0, 0.5], "angular_velocity": [0, 5, 3]}
+    )
+    problem = learned_problem(scene)
+    run = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 10)
+    momenta = [problem.mass_times(v).sum(axis=0) for v in run.velocities]
+    assert momenta[-1] == pytest.approx(momenta[0], abs=1e-9 * np.abs(momenta[0]).max())
+
+
+def two_materials(**changes):
+    parts = [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 0.02]]}, "young": 3e6,
+              "poisson": 0.3, "density": 2e3}]  # fmt: skip
+    return beam((4, 2, 2), materials=parts, **changes)
+
+
+@pytest.mark.parametrize("what", ["young", "poisson", "density"])
+@pytest.mark.parametrize(
+    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
+)
+def test_derivatives_by_the_material(what, damping):
+    """Of a step from a moving state, cell by cell, through what the network sees."""
+    problem = learned_problem(two_materials(damping=damping))
+    rng = np.random.default_rng(7)
+    start = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 3)
+    state = pc.State(start.positions[-1], start.velocities[-1], 0.0)
+    g = rng.normal(size=problem.positions.shape)
+
+    def after(problem):
+        stepper = pc.ProjectiveDynamics(problem, tolerance=1e-12)
+        return stepper, stepper(state)
+
+    stepper, result = after(problem)
+    gradients = pc.adjoint(stepper, state, result, g, tolerance=1e-10)
+    direction = rng.normal(size=len(problem.cells))
+    values = {name: getattr(problem.materials, name) for name in ("young", "poisson", "density")}
+    scale = {"young": 1e6, "poisson": 0.1, "density": 1e3}[what]
+
+    def value(t):
+        changed = {**values, what: values[what] + t * scale * direction}
+        return np.vdot(g, after(problem.with_material(**changed))[1].state.positions)
+
+    e = 1e-3
+    found = (8 * (value(e) - value(-e)) - (value(2 * e) - value(-2 * e))) / (12 * e)
+    expected = scale * np.vdot(getattr(gradients, what), direction)
+    assert expected == pytest.approx(found, rel=5e-5)
+
+
+def test_modes_are_of_both_corrections():
+    problem = learned_problem(beam())
+    plain = pc.discretise(pc.best_coarse(beam()))
+    found, without = pc.modes(problem, 3), pc.modes(plain, 3)
+    assert np.abs(found.frequencies / without.frequencies - 1.0).max() > 1e-3
+    u = found.shapes[0]
+    K = problem.stiffness(problem.positions)
+    square = (2 * np.pi * found.frequencies[0]) ** 2
+    free = problem.free.ravel()
+    left = (K @ u.ravel())[free]
+    right = square * problem.mass_times(u).ravel()[free]
+    assert left == pytest.approx(right, abs=1e-6 * np.abs(right).max())
+
+
+def test_cells_off_the_grid_keep_the_element_and_are_counted():
+    mesh = voxel_mesh(np.ones((3, 2, 2), dtype=bool), (0, 0, 0), 0.1)
+    x = mesh.positions.copy()
+    x[-1] += 0.03
+    with pytest.warns(PdcorrectWarning, match="1 of 12 cells"):
+        problem = problem_on(HexMesh.create(x, mesh.cells), "hex8-learned")
+    assert problem.correction.learned.sum() == 11
+    assert not problem.correction.matrices[~problem.correction.learned].any()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"material": {"poisson": 0.4999}},
+        {"clamps": [{"region": {"plane": "x", "at": 0.0}, "components": ["x"]},
+                    {"region": {"plane": "y", "at": 0.0}, "components": ["y"]},
+                    {"region": {"plane": "z", "at": 0.0}, "components": ["z"]}]},
+        {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "young": 1e9}]},
+    ],
+)  # fmt: skip
+def test_what_it_was_not_trained_for_is_told(changes):
+    with pytest.warns(PdcorrectWarning, match="unlike those it was trained on"):
+        learned_problem(beam(**changes))
+
+
+def test_another_mass_rule_is_refused():
+    with pytest.raises(SceneError, match="mass"):
+        beam(solver={"element": "hex8-learned", "mass": "lumped"})
+    assert beam(solver={"element": "hex8-learned"}).solver.mass == "averaged"
+
+
+def test_second_order_under_refinement():
+    """Of the lowest elastic frequency of a free block, whose mode is smooth."""
+
+    def frequency(k, element):
+        scene = beam((2 * k, k, k), 0.04 / k, 0.3, clamps=[], loads=[])
+        scene = scene.with_changes(solver={"element": element, "mass": "averaged"})
+        return pc.modes(pc.discretise(scene), 7).frequencies[-1]
+
+    right = frequency(10, "hex8-enhanced")
+    coarse, fine = (right - frequency(k, "hex8-learned") for k in (4, 8))
+    assert np.log2(coarse / fine) > 1.8
+
+
+def batch_of_two(damping):
+    problems = [learned_problem(s) for s in (two_materials(damping=damping), cross(damping=damping))]
+    return problems, pc.BatchStepper(problems, 1e-10)
+
+
+def test_batches_equal_single_steps():
+    problems, stepper = batch_of_two({})
+    state = stepper.rest_state()
+    for _ in range(4):
+        state = stepper(state).state
+    for i, problem in enumerate(problems):
+        single = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 4).positions[-1]
+        assert state.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
+)
+def test_derivatives_of_batches_equal_those_of_single_steps(damping):
+    problems, batch = batch_of_two(damping)
+    before = batch(batch.rest_state()).state
+    result = batch(before)
+    rng = np.random.default_rng(8)
+    g = torch.as_tensor(rng.normal(size=tuple(before.positions.shape)))
+    memory = {k: torch.as_tensor(rng.normal(size=g.shape)) for k in result.state.memory}
+    memory = {k: 1e-3 * v for k, v in memory.items()}
+    found = pc.BatchGradients(batch, before, result, g, grad_memory=memory, tolerance=1e-10)
+    for i, problem in enumerate(problems):
+        n, count = len(problem.positions), len(problem.cells)
+
+        def own(field, i=i, n=n):
+            return field[i, :n].numpy()
+
+        state = pc.State(
+            own(before.positions), own(before.velocities), before.times[i],
+            {k: own(v) for k, v in before.memory.items()},
+        )  # fmt: skip
+        stepper = pc.ProjectiveDynamics(problem, tolerance=1e-12)
+        single = pc.adjoint(
+            stepper, state, stepper(state), own(g), tolerance=1e-12,
+            grad_memory={k: own(v) for k, v in memory.items()},
+        )  # fmt: skip
+        for name in ("positions", "young", "poisson", "density"):
+            a, b = getattr(found, name)[i], getattr(single, name)
+            expected = pytest.approx(b, abs=2e-5 * np.abs(b).max())
+            assert a[: n if name == "positions" else count].numpy() == expected
+
+
+def test_batches_take_other_materials():
+    problems, stepper = batch_of_two({})
+    stepper.set_material(young=5e5, poisson=0.2)
+    after = stepper(stepper.rest_state()).state
+    for i, problem in enumerate(problems):
+        other = problem.with_material(young=5e5, poisson=0.2)
+        single = pc.rollout(pc.ProjectiveDynamics(other, tolerance=1e-10), 1).positions[-1]
+        assert after.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-9)
