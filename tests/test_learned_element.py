@@ -255,7 +255,9 @@ def test_second_order_under_refinement():
 
 
 def batch_of_two(damping):
-    problems = [learned_problem(s) for s in (two_materials(damping=damping), cross(damping=damping))]
+    problems = [
+        learned_problem(s) for s in (two_materials(damping=damping), cross(damping=damping))
+    ]
     return problems, pc.BatchStepper(problems, 1e-10)
 
 

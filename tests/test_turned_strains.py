@@ -82,7 +82,7 @@ def test_affine_displacements_have_no_other_strains_than_stretch(cells):
     F = np.eye(3) + 0.3 * np.random.default_rng(3).normal(size=(3, 3))
     z = correction.strains(rest @ F.T - rest)
     assert z[:, 6:] == pytest.approx(0.0, abs=1e-15)
-    U, s, Vt = np.linalg.svd(F)
+    _, s, Vt = np.linalg.svd(F)
     stretch = Vt.T @ np.diag(s) @ Vt
     assert z[:, :3] / correction.sizes[:, None] == pytest.approx(
         np.broadcast_to(np.diag(stretch) - 1.0, (CELLS, 3)), abs=1e-12

@@ -65,7 +65,7 @@ class MissingExtraError(PdcorrectError, ImportError):
 
 
 EXTRAS = {
-    "torch": "learn", "torch_geometric": "learn", "safetensors": "learn", "tensorboard": "learn",
+    "torch": "learn", "torch_geometric": "learn", "tensorboard": "learn",
     "pyvista": "view", "matplotlib": "view", "imageio": "view", "dask": "cluster",
     "distributed": "cluster",
 }  # fmt: skip

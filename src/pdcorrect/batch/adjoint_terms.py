@@ -73,13 +73,16 @@ class Written:
         return by_y, by_mu, by_omega
 
     def _each(
-        self, like: Tensor, slopes: Callable[[CellCorrection, int], tuple[Array | None, Array | None]]
+        self,
+        like: Tensor,
+        slopes: Callable[[CellCorrection, int], tuple[Array | None, Array | None]],
     ) -> tuple[Tensor, Tensor]:
         found = np.zeros((2, *self._mu.shape))
         for i, c in enumerate(self._corrections):
             if c.writer is not None:
-                weights = (m[i, : len(c.cells)] for m in (self._mu, self._omega))
-                found[:, i, : len(c.cells)] = c.writer.slopes(*weights, *slopes(c, i))
+                count = len(c.cells)
+                mu, omega = self._mu[i, :count], self._omega[i, :count]
+                found[:, i, :count] = c.writer.slopes(mu, omega, *slopes(c, i))
         by_mu, by_omega = (torch.as_tensor(f).to(like) for f in found)
         return by_mu, by_omega
 

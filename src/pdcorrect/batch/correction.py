@@ -87,8 +87,9 @@ class BatchCorrection:
     def apply(self, kept: Tensor, local: Tensor) -> Tensor:
         """The second derivative times changes (B, C, 8, 3), by cell."""
         scenes, cells = self._sizes.shape
-        parts = kept[..., 0].T.reshape(scenes, cells, STATE).split(_SIZES, dim=2)
-        square = [x.unflatten(2, (3, 3)) if x.shape[2] == 9 else x for x in parts]
+        flat = kept[..., 0].T.reshape(scenes, cells, STATE)
+        parts = torch.split(flat, list(_SIZES), dim=2)
+        square = [x.reshape(*x.shape[:2], 3, 3) if x.shape[2] == 9 else x for x in parts]
         return self._spread(self._changes(_State(*square), small_products(self._shapes, local)))
 
     def _spread(self, conjugates: Tensor) -> Tensor:
@@ -166,7 +167,7 @@ _KINK = 1e-9
 
 
 def _vectors(y: Tensor) -> Tensor:
-    return y[..., 6:].unflatten(-1, (4, 3))
+    return y[..., 6:].reshape(*y.shape[:-1], 4, 3)
 
 
 def _axial(A: Tensor) -> Tensor:

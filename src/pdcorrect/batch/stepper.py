@@ -299,7 +299,9 @@ class BatchStepper:
     def corrections(self, material: BatchMaterial | None = None) -> list[CellCorrection]:
         """What the scenes' learned elements add with a material, the present one by default."""
         material = self._material if material is None else material
-        weights = (m.to("cpu", torch.float64).numpy() for m in (material.mu, material.volume_weight))
+        weights = (
+            m.to("cpu", torch.float64).numpy() for m in (material.mu, material.volume_weight)
+        )
         mu, omega = weights
         out = []
         for i, (problem, sound) in enumerate(

@@ -42,12 +42,15 @@ def compare(
     hex27: Annotated[
         bool, typer.Option("--hex27", help="Also 27-node elements on the coarse mesh.")
     ] = False,
+    learned: Annotated[
+        bool, typer.Option("--learned", help="Also the learned element on the coarse mesh.")
+    ] = False,
     converged: Annotated[
         bool,
         typer.Option(
             "--converged",
             help="Also the error to the converged motion, which takes long once and is kept on "
-            "disk; adds 27-node elements, and runs by generalised-alpha.",
+            "disk; adds learned and 27-node elements, and runs by generalised-alpha.",
         ),
     ] = False,
     converged_error: Annotated[
@@ -85,8 +88,11 @@ def compare(
     check_models(model or [], gate)
     loaded = Scene.load(scene)
     converged = converged or converged_error
-    hex27 = hex27 or (converged and loaded.solver.element != HEX27.element)
-    cases = cases_for(loaded, model or [], gate=gate, hex27=hex27, second_order=converged)
+    if converged and loaded.solver.element != HEX27.element:
+        hex27 = learned = True
+    cases = cases_for(
+        loaded, model or [], gate=gate, hex27=hex27, learned=learned, second_order=converged
+    )
     make_folder(output / report.VTU if vtu else output)
     tell_of_compiling()
     count = frames or loaded.time.frames

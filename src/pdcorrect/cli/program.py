@@ -18,7 +18,7 @@ from pdcorrect.cli.evaluate import evaluate
 from pdcorrect.cli.export import export
 from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
-from pdcorrect.cli.train import train
+from pdcorrect.cli.train import train, train_element
 from pdcorrect.cli.validate import validate
 from pdcorrect.errors import (
     EXTRAS,
@@ -34,7 +34,17 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
 )
-for command in (simulate, compare, render, export, train, evaluate, validate, doctor):
+for command in (
+    simulate,
+    compare,
+    render,
+    export,
+    train,
+    train_element,
+    evaluate,
+    validate,
+    doctor,
+):
     app.command()(command)
 app.add_typer(dataset, name="dataset")
 

@@ -40,6 +40,9 @@ def simulate(
     gate: Annotated[
         bool, typer.Option(help="Of the corrector: let the default gate refuse its corrections.")
     ] = True,
+    learned: Annotated[
+        bool, typer.Option("--learned", help="With the learned element, whatever the scene's own.")
+    ] = False,
     frames: Frames = None,
     vtu: Annotated[
         Optional[Path],
@@ -61,6 +64,8 @@ def simulate(
     if model is not None:
         _check_corrected(model, solver, refine)
     loaded = Scene.load(scene)
+    if learned:
+        loaded = _learned(loaded, model)
     if vtu:
         make_folder(vtu)
     tell_of_compiling()
@@ -81,6 +86,17 @@ def simulate(
             load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
         )
         say(f"wrote {series}")
+
+
+def _learned(scene: Scene, model: str | None) -> Scene:
+    from pdcorrect.scene import learned_coarse
+
+    if model is not None:
+        raise InputError(
+            f"--learned with --model {model}: expected one of them; a corrector is for the coarse "
+            "model that it was trained on."
+        )
+    return learned_coarse(scene)
 
 
 def _check_corrected(model: str, solver: SolverName, refine: int) -> None:

@@ -100,3 +100,32 @@ def _tell(at: Progress, row: Mapping[str, Any]) -> None:
         if name not in ("stage", "seconds")
     )
     typer.echo(f"{at.seconds:7.1f} s  stage {at.stage}  {at.total:6d}  {numbers}")
+
+
+def train_element(
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
+    bodies: Annotated[int, typer.Option(help="Random bodies to learn from.", min=1)] = 4000,
+    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 30_000,
+    seed: Annotated[int, typer.Option(help="Of bodies, weights and order.", min=0)] = 45,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
+    workers: Annotated[int, typer.Option(help="Processes that compute answers.", min=1)] = 1,
+    seconds: Annotated[
+        Optional[float],
+        typer.Option(help="Stop after about so many seconds; the same command goes on."),
+    ] = None,
+) -> None:
+    """Train the network that writes the learned element's cells (extra 'learn').
+
+    Random bodies are generated in OUTPUT, and what an earlier call left there is taken up.
+    Exit status 1 if time was up before the end.
+    """
+    from pdcorrect.elements.training import ElementRecipe
+    from pdcorrect.elements.training import train as train_network
+
+    recipe = ElementRecipe(bodies=bodies, iterations=iterations, seed=seed)
+    tell_of_compiling()
+    if not train_network(
+        recipe, output, device=device, workers=workers, seconds=seconds, report=typer.echo
+    ):
+        typer.echo(f"{output}: not finished; the same command goes on")
+        raise typer.Exit(_UNFINISHED)

@@ -134,7 +134,7 @@ def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
     fixed = (P @ held.astype(float)) > 1.0 - 1e-9
     free = np.flatnonzero(np.repeat(~fixed, 3))
     factor = factorise(sp.csr_matrix(K[free][:, free]), "cholespy", unknowns=3)
-    points = scale * fine.places
+    points: Array = np.asarray(scale * fine.places, dtype=np.float64)
     loads = _loads(fine, points, weights, fixed, rng)
     moved = _moved_clamps(body.held, coarse, P, points, rng)
     F = np.concatenate([loads, np.zeros((len(moved), count, 3))])
@@ -209,7 +209,7 @@ def _modes(K: sp.csr_matrix, M: sp.csr_matrix, free, solve) -> tuple[Array, Arra
     return squares[order], shapes
 
 
-# --- loads -----------------------------------------------------------------------------------------
+# --- loads ---------------------------------------------------------------------------------------
 
 
 def _loads(
@@ -223,8 +223,8 @@ def _loads(
     count = len(points)
     nodal = np.bincount(fine.cells.ravel(), np.repeat(masses, 8) / 8.0, minlength=count)[:, None]
     centre = points.mean(axis=0)
-    away = (points - centre) / max(1.0, np.ptp(points, axis=0).max())
-    out = [nodal * rng.normal(size=3)]  # gravity
+    away: Array = (points - centre) / max(1.0, np.ptp(points, axis=0).max())
+    out: list[Array] = [nodal * rng.normal(size=3)]  # gravity
     out += [nodal * (rng.normal(size=3) + away @ rng.normal(size=(3, 3))) for _ in range(2)]
     quadratic = np.einsum("ni,nj,ijk->nk", away, away, rng.normal(size=(3, 3, 3)))
     out.append(nodal * quadratic)
@@ -255,7 +255,8 @@ def _face_areas(fine: VoxelMesh, axis: int, side: int) -> Array:
     outer = (beyond[:, axis] < 0) | ~solid[tuple(np.maximum(beyond, 0).T)]
     faces = fine.cells[outer][:, corners]
     share = 1.0 / (4.0 * REFINEMENT**2)
-    return np.bincount(faces.ravel(), np.full(faces.size, share), minlength=len(fine.places))
+    counts = np.bincount(faces.ravel(), minlength=len(fine.places))
+    return np.asarray(share * counts, dtype=np.float64)
 
 
 def _moved_clamps(
@@ -269,4 +270,4 @@ def _moved_clamps(
     moved = (P @ chosen.astype(float)) > 1.0 - 1e-9
     centre = points[moved].mean(axis=0)
     rigid = rng.normal(size=3) + np.cross(0.5 * rng.normal(size=3), points - centre)
-    return [moved[:, None] * rigid]
+    return [np.asarray(moved[:, None] * rigid)]

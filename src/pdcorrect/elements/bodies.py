@@ -115,7 +115,7 @@ def _stepped(rng: np.random.Generator) -> Grid:
     for _ in range(rng.integers(2, 5)):
         length, height, depth = rng.integers(1, 5), rng.integers(1, 6), rng.integers(1, 5)
         solid[start : start + length, :height, :depth] = True
-        start += length
+        start += int(length)
     return solid
 
 
@@ -142,8 +142,8 @@ _SHAPES = {
 
 
 def _box(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[slice, ...]:
-    size = [rng.integers(1, n + 1) if i == 0 else rng.integers(1, 4) for i, n in enumerate(shape)]
-    size = list(rng.permutation(size))
+    drawn = [rng.integers(1, n + 1) if i == 0 else rng.integers(1, 4) for i, n in enumerate(shape)]
+    size = [int(n) for n in rng.permutation(drawn)]
     size = [min(s, n) for s, n in zip(size, shape, strict=True)]
     start = [rng.integers(0, n - s + 1) for n, s in zip(shape, size, strict=True)]
     return tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))

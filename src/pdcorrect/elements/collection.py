@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,23 +32,10 @@ def generate(
     """
     make_folder(folder)
     deadline = None if seconds is None else time.monotonic() + seconds
-    numbers = range(-(-count // A_FILE))
-    missing = [n for n in numbers if not _path(folder, n).exists()]
+    missing = [n for n, path in enumerate(file_paths(folder, count)) if not path.exists()]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         tasks = [pool.submit(_write, folder, seed, n, deadline) for n in missing]
         return sum(not task.result() for task in as_completed(tasks))
-
-
-def read(folder: Path, count: int) -> Iterator[Answers]:
-    """The first ``count`` bodies.
-
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged.
-    """
-    for number in range(-(-count // A_FILE)):
-        yield from read_file(_path(folder, number))[: count - number * A_FILE]
 
 
 def read_file(path: Path) -> list[Answers]:
@@ -62,6 +49,11 @@ def read_file(path: Path) -> list[Answers]:
         raise InputError(f"{path}: {error}. Delete it and generate again.") from None
 
 
+def file_paths(folder: Path, count: int) -> list[Path]:
+    """Files of the first ``count`` bodies."""
+    return [_path(folder, number) for number in range(-(-count // A_FILE))]
+
+
 def _path(folder: Path, number: int) -> Path:
     return folder / f"bodies-{number:04d}.npz"
 
@@ -71,7 +63,7 @@ def _write(folder: Path, seed: int, number: int, deadline: float | None) -> bool
     if deadline is not None and time.monotonic() > deadline:
         return False
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    arrays = {}
+    arrays: dict[str, Any] = {}
     with one_thread():
         for i in range(A_FILE):
             rng = np.random.default_rng([seed, number * A_FILE + i])

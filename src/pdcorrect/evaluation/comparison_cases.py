@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import BASES, Problem, coarse_model, discretise
-from pdcorrect.scene import Scene, best_coarse, check_scene, trained_coarse
+from pdcorrect.scene import Scene, best_coarse, check_scene, learned_coarse, trained_coarse
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Case:
     solver : str
         "pd" or "newton".
     refine : int
-    base : {"plain", "enhanced", "best", "total-mass"}
-        "enhanced": element and mass of `best_coarse`.  Others as of `coarse_model`: "best" is
+    base : {"plain", "enhanced", "learned", "best", "total-mass"}
+        "enhanced", "learned": element and mass of `best_coarse`, `learned_coarse`.  Others as of `coarse_model`: "best" is
         what correctors were trained on.  "total-mass" is for the coarse mesh only.
     model : str or None
         Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
@@ -62,6 +62,8 @@ class Case:
             return self._with_element(scene)
         if self.base == "enhanced":
             return discretise(best_coarse(scene), self.refine)
+        if self.base == "learned":
+            return discretise(learned_coarse(scene), self.refine)
         if self.refine == 1:
             return coarse_model(scene, self.base)
         if self.base not in ("plain", "best"):
@@ -121,6 +123,8 @@ HEX27 = Case("coarse PD, hex27", "pd", 1, element="hex27")
 
 _SECOND_ORDER = "generalised-alpha"
 _BEST = Case("best coarse PD", "pd", 1, "enhanced")
+LEARNED = Case("learned coarse PD", "pd", 1, "learned")
+"""The coarse model with the learned element."""
 _FINE_BEST = replace(CASES[0], label="fine best PD", base="enhanced")
 """The coarse model and the reference with the best element."""
 
@@ -130,7 +134,7 @@ _FINE_TRAINED = replace(CASES[0], label="fine PD as trained", base="best")
 _COARSE = {"best": "coarse PD as trained", "total-mass": "coarse PD, total mass"}
 """Labels of coarse models that are corrected, by their base."""
 
-CASE_BASES = ("plain", "enhanced", "best", "total-mass")
+CASE_BASES = ("plain", "enhanced", "learned", "best", "total-mass")
 """In the order of rows."""
 
 
@@ -140,6 +144,7 @@ def cases_for(
     *,
     gate: bool = True,
     hex27: bool = False,
+    learned: bool = False,
     second_order: bool = False,
 ) -> tuple[Case, ...]:
     """What `compare` runs by default: `cases_with`, and always the best coarse model.
@@ -157,9 +162,11 @@ def cases_for(
         Of the correctors.
     hex27 : bool
         Also 27-node elements on the coarse mesh.
+    learned : bool
+        Also the learned element.
     second_order : bool
-        Also the best coarse model and 27-node elements by generalised-alpha, where the scene
-        has another integrator.
+        The best coarse model, the learned and the 27-node elements also by generalised-alpha,
+        where the scene has another integrator.
 
     Raises
     ------
@@ -178,6 +185,13 @@ def cases_for(
                 f"models {', '.join(models)}: correct a coarse model that this scene has not: "
                 f"{why}. Expected a scene that has one, or models of another base."
             )
+    if learned and scene.solver != learned_coarse(scene).solver:
+        if _impossible(scene, learned_coarse(scene)):
+            raise InputError(
+                "learned: the scene's 27-node elements have nodes where it has none: expected a "
+                "scene of another element."
+            )
+        others.append(LEARNED)
     if hex27:
         if scene.solver.element == HEX27.element:
             raise InputError(
@@ -188,7 +202,7 @@ def cases_for(
         others += [
             replace(case, label=f"{case.label}, {_SECOND_ORDER}", integrator=_SECOND_ORDER)
             for case in others
-            if case in (_BEST, HEX27)
+            if case in (_BEST, LEARNED, HEX27)
         ]
     return (reference, *others)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem import kernels
 from pdcorrect.fem.quadrature import Quadrature
-
-if TYPE_CHECKING:
-    from pdcorrect.fem.cell_correction import CorrectionTangent
 
 Array = NDArray[np.float64]
 
@@ -61,6 +58,16 @@ class Assembly:
         return indptr.astype(np.int32), (keys % self._count).astype(np.int32), place.ravel()
 
 
+class MoreTangent(Protocol):
+    """A second derivative that is added to that of the quadrature points."""
+
+    def apply(self, x: Array) -> Array:
+        """Times x (N, 3)."""
+
+    def add_to(self, blocks: Array) -> None:
+        """Add the cells' matrices to blocks (C, L, L, 3, 3)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Linearisation:
     """The tangent of the elastic energy at one state, see `kernels.linearise_cells`.
@@ -71,7 +78,7 @@ class Linearisation:
         Factors of the signed SVD of F.
     tangent : (C, 12, Q)
         Tangent in their frame times the volumes, J.
-    correction : CorrectionTangent, optional
+    correction : MoreTangent, optional
         That of a learned element's own energy.
     """
 
@@ -80,7 +87,7 @@ class Linearisation:
     left: Array
     right: Array
     tangent: Array
-    correction: CorrectionTangent | None = None
+    correction: MoreTangent | None = None
 
     def apply(self, x: Array) -> Array:
         """Tangent times x, both (N, 3), without assembling."""

@@ -23,7 +23,15 @@ _NO_SHIFT = np.empty((0, 18))
 
 
 class Writer(Protocol):
-    """Writes corrections from the weights mu and omega of each cell, (C,), Pa."""
+    """Writes corrections from the weights mu and omega of each cell, (C,), Pa.
+
+    Attributes
+    ----------
+    digest : str
+        Of what it was trained to write.
+    """
+
+    digest: str
 
     def correction(self, mu: Array, omega: Array) -> CellCorrection:
         """Those of a body."""

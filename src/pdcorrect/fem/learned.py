@@ -18,20 +18,21 @@ partly held nodes, of another Poisson's ratio, or beside much softer or stiffer 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.errors import FileFormatError, FileVersionError
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
 from pdcorrect.fem.cube_symmetry import (
     MANDEL,
     SCALAR_PATTERNS,
-    SignedPermutations,
     on_scalars,
     on_strains,
 )
@@ -39,6 +40,7 @@ from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.neighbourhood import (
     CELLS,
+    SIZE,
     neighbourhood_slopes,
     neighbourhoods,
     on_grid,
@@ -59,6 +61,7 @@ _CONTRAST = 0.85
 """Of 2 E'/(E + E'): how far from 1 a neighbour's may be."""
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
+_DIGEST = 16
 _DIGITS = 6
 """Of the numbers of a neighbourhood: cells that differ by less are alike."""
 
@@ -122,32 +125,45 @@ class Network:
     ----------
     arrays : dict
         Weights by name, as `pdcorrect.elements.network` has them.
+    digest : str
+        Of their file.
+
+    Attributes
+    ----------
+    digest : str
+    shape : (int, int)
+        Numbers of a neighbourhood, and of an answer.
     """
 
-    def __init__(self, arrays: dict[str, NDArray[Any]]) -> None:
+    def __init__(self, arrays: dict[str, NDArray[Any]], digest: str = "") -> None:
+        self.digest = digest
         numbers = sorted({int(name.split(".")[1]) for name in arrays})
         self._layers = [
             (arrays[f"layers.{n}.weight"].T, arrays[f"layers.{n}.bias"]) for n in numbers
         ]
         self._type = self._layers[0][0].dtype
+        self.shape = len(self._layers[0][0]), self._layers[-1][0].shape[1]
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
         """N (C, 18, 18) and (C, 7, 7) for neighbourhoods (C, F), averaged over the symmetries."""
-        _, first, inverse = np.unique(
-            x.round(_DIGITS), axis=0, return_index=True, return_inverse=True
-        )
-        found = self._layered(self._turned(x[first]))[-1].reshape(len(first), 48, -1)
-        N, H = (_mean(part, moves) for part, moves in zip(_halves(found), _moves(), strict=True))
-        return N[inverse.ravel()], H[inverse.ravel()]
+        first, inverse, turns = _alike_up_to_symmetry(x)
+        distinct = np.take_along_axis(x[first], permutations()[turns[first]], axis=1)
+        found = self._layered(self._turned(distinct))[-1].reshape(len(first), 48, -1)
+        split = halves(STRAINS).places.shape[1]
+        answers = []
+        for part, size in ((found[..., :split], STRAINS), (found[..., split:], SCALARS)):
+            half = halves(size)
+            mean = _mean(part, half)[inverse]
+            turned = np.take_along_axis(mean, half.places[turns], axis=1) * half.signs[turns]
+            answers.append(turned[:, half.number])
+        N, H = answers
+        return N, H
 
     def slopes(self, x: Array, by_N: Array, by_H: Array) -> Array:
         """Derivatives (C, F) of a function by the neighbourhoods, from those by N and H."""
         layered = self._layered(self._turned(x))
-        parts = [
-            _mean_transposed(part, moves)
-            for part, moves in zip((by_N, by_H), _moves(), strict=True)
-        ]
-        back = np.concatenate(parts, axis=2).reshape(len(layered[-1]), -1)
+        parts = (_mean_transposed(part, halves(part.shape[1])) for part in (by_N, by_H))
+        back = np.concatenate(list(parts), axis=2).reshape(len(layered[-1]), -1)
         for i, (weight, _) in reversed(list(enumerate(self._layers))):
             back = back @ weight.T
             if i:
@@ -173,63 +189,119 @@ class Network:
         return [*out, out[-1] @ weight + bias]
 
 
-def _moves() -> tuple[SignedPermutations, SignedPermutations]:
-    return on_strains(), on_scalars()
+class Halves(NamedTuple):
+    """Lower halves of symmetric matrices (n, n), and what they become when a cell is turned.
 
+    Attributes
+    ----------
+    number : (n, n)
+        Place of each entry in the lower half.
+    places, signs : (48, h)
+        For each symmetry, y = signs * x[places] is the half of the matrix turned back.
+    """
 
-def _halves(x: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    split = STRAINS * (STRAINS + 1) // 2
-    return x[..., :split], x[..., split:]
+    number: NDArray[np.int64]
+    places: NDArray[np.int64]
+    signs: Array
 
 
 @lru_cache(maxsize=2)
-def _turned_back(scalars: bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Where entries of a symmetric matrix are in its lower half, (n, n); and for each symmetry
-
-    places and signs (48, .) of the lower half of a matrix that is turned back.
-    """
-    moves = on_scalars() if scalars else on_strains()
-    size = moves.places.shape[1]
+def halves(size: int) -> Halves:
+    """Of matrices N of stiffness (`STRAINS`) or mass (`SCALARS`)."""
+    moves = on_scalars() if size == SCALARS else on_strains()
     rows, columns = np.tril_indices(size)
     number = np.zeros((size, size), dtype=np.int64)
     number[rows, columns] = number[columns, rows] = np.arange(len(rows))
     back = np.argsort(moves.places, axis=1)  # N'[i, j] = s_i s_j N[p_i, p_j] of the turned cell
     signs = np.take_along_axis(moves.signs, back, axis=1)
-    return (
-        number,
-        number[back[:, rows], back[:, columns]],
-        signs[:, rows] * signs[:, columns],
-    )
+    places = number[back[:, rows], back[:, columns]]
+    return Halves(number, places, signs[:, rows] * signs[:, columns])
 
 
-def _mean(lower: NDArray[Any], moves: SignedPermutations) -> Array:
-    """The mean (C, n, n) of symmetric matrices given by lower halves (C, 48, .), turned back."""
-    number, places, signs = _turned_back(moves.places.shape[1] == SCALARS)
+@lru_cache(maxsize=1)
+def _probes() -> Array:
+    """Two numbers of any neighbourhood in each of the cube's 48 orientations, (F, 48, 2)."""
+    numbers = np.random.default_rng(0).normal(size=(SIZE, 2))
+    out = np.empty((SIZE, 48, 2))
+    for g, places in enumerate(permutations()):
+        out[places, g] = numbers
+    return out
+
+
+def _alike_up_to_symmetry(
+    x: Array,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Cells that stand for others, and for each cell its number among them, (C,).
+
+    And the symmetry g for which x[permutations()[g]] is the same for all that are alike, (C,).
+    """
+    probed = np.tensordot(x, _probes(), axes=1)  # (C, 48, 2)
+    lowest = probed[..., 0].argmin(axis=1)
+    key = np.take_along_axis(probed, lowest[:, None, None], axis=1)[:, 0].round(_DIGITS)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return first, inverse.ravel(), lowest
+
+
+def _mean(lower: NDArray[Any], half: Halves) -> Array:
+    """The mean (C, h) of lower halves (C, 48, h), turned back."""
     total = np.zeros((len(lower), lower.shape[2]))
-    for g in range(48):
-        total += lower[:, g, places[g]] * signs[g]
-    return np.asarray(total[:, number] / 48.0)
+    for g, (places, signs) in enumerate(zip(half.places, half.signs, strict=True)):
+        total += lower[:, g, places] * signs
+    return total / 48.0
 
 
-def _mean_transposed(slopes: Array, moves: SignedPermutations) -> Array:
-    """Derivatives (C, 48, .) by the lower halves, from those (C, n, n) by the mean."""
-    number, places, signs = _turned_back(moves.places.shape[1] == SCALARS)
+def _mean_transposed(slopes: Array, half: Halves) -> Array:
+    """Derivatives (C, 48, h) by the lower halves, from those (C, n, n) by the mean."""
     count = len(slopes)
-    lower = np.zeros((count, places.shape[1]))
-    for entry, place in enumerate(number.ravel()):
+    lower = np.zeros((count, half.places.shape[1]))
+    for entry, place in enumerate(half.number.ravel()):
         lower[:, place] += slopes.reshape(count, -1)[:, entry]
-    out = np.zeros((count, 48, places.shape[1]))
-    for g in range(48):
-        out[:, g, places[g]] = lower * signs[g] / 48.0
+    out = np.zeros((count, *half.places.shape))
+    for g, (places, signs) in enumerate(zip(half.places, half.signs, strict=True)):
+        out[:, g, places] = lower * signs / 48.0
     return out
 
 
 @lru_cache(maxsize=1)
 def released() -> Network:
-    """The network that comes with the package."""
-    from safetensors.numpy import load_file
+    """The network that comes with the package.
 
-    return Network(load_file(MODEL))
+    Raises
+    ------
+    FileFormatError, FileVersionError
+        See `read_network`.
+    """
+    return read_network(MODEL)
+
+
+def read_network(path: Path) -> Network:
+    """A network from a file of weights.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing or damaged.
+    FileVersionError
+        If the network sees other neighbourhoods, or answers otherwise.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        content = path.read_bytes()
+        network = Network(load(content), hashlib.sha256(content).hexdigest()[:_DIGEST])
+    except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
+        raise FileFormatError(
+            f"{path}: no weights of a learned element ({error}): expected a file as `pdcorrect "
+            "train-element` writes it. Install the package again for its own."
+        ) from None
+    expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
+    if network.shape != expected:
+        raise FileVersionError(
+            f"{path}: from {network.shape[0]} to {network.shape[1]} numbers: expected "
+            f"{expected[0]} and {expected[1]}, those of this version's learned element."
+        )
+    return network
 
 
 class ElementWriter:
@@ -246,12 +318,14 @@ class ElementWriter:
 
     def __init__(self, network: Network, body: ElasticBody, free: NDArray[np.bool_]) -> None:
         self._network, self._body = network, body
+        self.digest = network.digest
         self._grid = on_grid(body.positions, body.cells)
-        held, some = ~free.any(axis=1), ~free.all(axis=1)
+        held: NDArray[np.bool_] = ~free.max(axis=1)
+        some: NDArray[np.bool_] = ~free.min(axis=1)
         cells = self._grid.cells
         self._held = held[cells].astype(float)
         self._inside = self._held.max(axis=1) == 0.0
-        partly = np.asarray((some & ~held)[cells].any(axis=1))
+        partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
         self._fits: NDArray[np.bool_] = self._grid.regular & ~partly
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
@@ -347,9 +421,10 @@ class ElementWriter:
         return x, np.asarray(learned & (alike | (window == 0.0)).all(axis=1))
 
     def _answers(self, x: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """N and H of the learned cells, strains uncorrected away from held corners."""
         N, H = self._network(x)
         inside = self._inside[learned]
-        N[inside, :6] = N[inside, :, :6] = 0.0
+        N[inside, :6], N[inside, :, :6] = 0.0, 0.0
         return N, H
 
     def _shares(self, x: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -1,8 +1,8 @@
 """What the learned element sees of a cell: its neighbours, held nodes and Poisson's ratio.
 
-Cells lie on a grid.  A window of 5 x 5 x 5 cells about each has 2 E' / (E + E') for the modulus
+Cells lie on a grid.  A window of 7 x 7 x 7 cells about each has 2 E' / (E + E') for the modulus
 E' of a neighbour and the cell's own E: 0 where there is none, 1 for the same, 2 for rigid.  A
-window of 4 x 4 x 4 nodes has 1 where a node is held.
+window of 6 x 6 x 6 nodes has 1 where a node is held.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 Array = NDArray[np.float64]
 
-CELLS, NODES = 5, 4
+CELLS, NODES = 7, 6
 """Widths of the windows."""
 SIZE = CELLS**3 + NODES**3 + 2
 """Numbers of a neighbourhood."""

@@ -78,7 +78,8 @@ class Solver(Strict):
         "hex8-bubble-mean": both.  "hex8-enhanced": the modes, and the volume term on
         the part of the deformation that is linear in the cell, against both without
         being too soft.  "hex8-learned": that one with corrections by a network
-        (`pdcorrect.fem.learned`); its mass is "averaged".  "hex27": triquadratic, 3x3x3 Gauss points.
+        (`pdcorrect.fem.learned`); its mass is "averaged".  "hex27": triquadratic, 3x3x3
+        Gauss points.
     tolerance
         Largest accepted estimate of a node's distance from the step's exact
         solution, as a fraction of the coarse cell size.

@@ -199,7 +199,20 @@ def run_attributes(stepper: Stepper) -> dict[str, str]:
         "element": problem.element,
         "mass": problem.mass_rule,
         "material": _material(problem),
+        **_learned(problem),
         **stepper.describe(),
+    }
+
+
+def _learned(problem: Problem) -> dict[str, str]:
+    """Which weights wrote the cells, and how many."""
+    correction = problem.correction
+    if correction is None:
+        return {}
+    digest = "" if correction.writer is None else correction.writer.digest
+    return {
+        "element_weights": digest,
+        "learned_cells": f"{int(correction.learned.sum())} of {len(correction.learned)}",
     }
 
 

@@ -1,0 +1,1 @@
+"""Learning what `pdcorrect.fem.learned` writes into cells: bodies, answers, network, training."""

@@ -1,0 +1,267 @@
+"""Training of the network that writes elements, from nothing to weights and card; it resumes."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.torch import save
+from torch import Tensor
+
+from pdcorrect._environment import environment
+from pdcorrect._files import make_folder, replacing, write_bytes, write_text
+from pdcorrect.elements.collection import file_paths, generate, read_file
+from pdcorrect.elements.linear import Batch, Errors, Sample, collate, errors, loss, sample
+from pdcorrect.elements.network import ElementNetwork
+from pdcorrect.errors import InputError
+from pdcorrect.fem.learned import LARGEST_POISSON
+from pdcorrect.fem.neighbourhood import CELLS, NODES, SIZE
+
+WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
+_CHECKPOINT = "checkpoint.pt"
+_VALIDATION = 200
+_DECAY = 1e-4
+_WARM_UP = 200
+"""Iterations."""
+
+
+@dataclass(frozen=True)
+class ElementRecipe:
+    """How the network is trained.
+
+    Attributes
+    ----------
+    bodies : int
+        Random bodies to learn from; others, and fewer, judge it.
+    seed : int
+    width, depth : int
+        Of the hidden layers, and how many.
+    iterations, batch : int
+        Steps of the optimiser, and bodies in each.
+    symmetries : int
+        Of the cube's 48, drawn anew in each step.
+    rate : float
+        Largest learning rate; it falls as a cosine.
+    """
+
+    bodies: int = 4000
+    seed: int = 45
+    width: int = 256
+    depth: int = 3
+    iterations: int = 30_000
+    batch: int = 16
+    symmetries: int = 8
+    rate: float = 2e-3
+
+
+Report = Callable[[str], None]
+
+
+def train(
+    recipe: ElementRecipe,
+    folder: Path,
+    *,
+    device: str = "cpu",
+    workers: int = 1,
+    seconds: float | None = None,
+    report: Report = print,
+) -> bool:
+    """Generate bodies, train, and write weights and card into a folder; whether it is finished.
+
+    What is there of an earlier call is taken up: files of bodies, and the last checkpoint.
+
+    Raises
+    ------
+    InputError
+        If the folder's checkpoint is of another recipe.
+    """
+    started = time.monotonic()
+
+    def left() -> float | None:
+        return None if seconds is None else max(0.0, seconds - (time.monotonic() - started))
+
+    make_folder(folder)
+    sets = {"training": (recipe.bodies, recipe.seed), "validation": (_VALIDATION, recipe.seed + 1)}
+    for name, (count, seed) in sets.items():
+        report(f"{name}: {count} bodies")
+        if generate(folder / name, count, seed, workers, left()):
+            return False
+    known, others = (_samples(folder / name, count, workers) for name, (count, _) in sets.items())
+    trainer = Trainer(recipe, known, others, device)
+    path = folder / _CHECKPOINT
+    if path.exists():
+        trainer.restore(path)
+        report(f"goes on at iteration {trainer.iteration}")
+    while trainer.iteration < recipe.iterations:
+        if left() == 0.0:
+            return False
+        trainer.epoch(left())
+        trainer.save(path)
+        report(trainer.line())
+    write_bytes(folder / WEIGHTS, save(trainer.weights()))
+    write_text(folder / CARD, json.dumps(trainer.card(device), indent=1) + "\n")
+    report(f"wrote {folder / WEIGHTS}")
+    return True
+
+
+class Trainer:
+    """The network, its optimiser and the batches of bodies.
+
+    Attributes
+    ----------
+    iteration : int
+    """
+
+    def __init__(
+        self, recipe: ElementRecipe, known: Sequence[Sample], others: Sequence[Sample], device: str
+    ) -> None:
+        self._recipe, self._device = recipe, device
+        torch.manual_seed(recipe.seed)
+        self._rng = np.random.default_rng(recipe.seed)
+        self._network = ElementNetwork(SIZE, recipe.width, recipe.depth).to(device)
+        self._optimiser = torch.optim.AdamW(
+            self._network.parameters(), lr=recipe.rate, weight_decay=_DECAY
+        )
+        self._batches, self._validation = (
+            _batches(samples, recipe.batch, device) for samples in (known, others)
+        )
+        with torch.no_grad():
+            self._base = [errors(batch, None, None) for batch in self._batches]
+            self._without = [errors(batch, None, None) for batch in self._validation]
+        self.iteration = 0
+        self._loss = float("nan")
+
+    def epoch(self, seconds: float | None = None) -> None:
+        """Each body once, or as many as the recipe, or the time (s), still has."""
+        deadline = None if seconds is None else time.monotonic() + seconds
+        losses = []
+        for i in self._rng.permutation(len(self._batches)):
+            late = deadline is not None and time.monotonic() > deadline
+            if late or self.iteration >= self._recipe.iterations:
+                break
+            losses.append(self._step(self._batches[i], self._base[i]))
+        if losses:
+            self._loss = float(torch.stack(losses).mean())
+
+    def _step(self, batch: Batch, base: Errors) -> Tensor:
+        recipe, network = self._recipe, self._network
+        for group in self._optimiser.param_groups:
+            fall = 0.5 + 0.5 * np.cos(np.pi * self.iteration / recipe.iterations)
+            group["lr"] = recipe.rate * min(1.0, (self.iteration + 1) / _WARM_UP) * fall
+        chosen = self._rng.choice(48, recipe.symmetries, replace=False)
+        symmetries = torch.as_tensor(chosen, device=self._device)
+        value = loss(errors(batch, *network(batch.features, symmetries)), base).mean()
+        self._optimiser.zero_grad()
+        value.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        self._optimiser.step()
+        self.iteration += 1
+        return value.detach()
+
+    def measured(self) -> dict[str, float]:
+        """Errors on the validation bodies, and without learning."""
+        with torch.no_grad():
+            found = [errors(b, *self._network(b.features)) for b in self._validation]
+            pairs = zip(found, self._without, strict=True)
+            judged = torch.cat([loss(a, b) for a, b in pairs]).mean()
+        return {
+            "loss": float(judged),
+            **{f"{k}, learned": v for k, v in _means(found).items()},
+            **{f"{k}, without": v for k, v in _means(self._without).items()},
+        }
+
+    def line(self) -> str:
+        """Where it is, in a line."""
+        found = self.measured()
+        return (
+            f"iteration {self.iteration}: loss {self._loss:.3f}, validation {found['loss']:.3f}, "
+            f"displacements {100 * found['displacements, learned']:.2f} % "
+            f"({100 * found['displacements, without']:.2f} % without learning), "
+            f"first frequency {100 * found['first frequency, learned']:.2f} % "
+            f"({100 * found['first frequency, without']:.2f} %)"
+        )
+
+    def weights(self) -> dict[str, Tensor]:
+        """By name, on the CPU."""
+        return {k: v.detach().cpu().contiguous() for k, v in self._network.state_dict().items()}
+
+    def card(self, device: str) -> dict[str, Any]:
+        """What is written beside the weights."""
+        return {
+            "format": 1,
+            "window": {"cells": CELLS, "nodes": NODES},
+            "largest_poisson": LARGEST_POISSON,
+            "recipe": asdict(self._recipe),
+            "validation": self.measured(),
+            "device": device,
+            "environment": environment(),
+        }
+
+    def save(self, path: Path) -> None:
+        """Write a checkpoint."""
+        state = {
+            "recipe": asdict(self._recipe),
+            "iteration": self.iteration,
+            "network": self._network.state_dict(),
+            "optimiser": self._optimiser.state_dict(),
+            "rng": self._rng.bit_generator.state,
+        }
+        with replacing(path) as part:
+            torch.save(state, part)
+
+    def restore(self, path: Path) -> None:
+        """Take up a checkpoint.
+
+        Raises
+        ------
+        InputError
+            If it is of another recipe.
+        """
+        state = torch.load(path, map_location=self._device, weights_only=True)
+        if state["recipe"] != asdict(self._recipe):
+            raise InputError(
+                f"{path}: of recipe {state['recipe']}: expected {asdict(self._recipe)}. Use "
+                "another folder."
+            )
+        self.iteration = state["iteration"]
+        self._network.load_state_dict(state["network"])
+        self._optimiser.load_state_dict(state["optimiser"])
+        self._rng.bit_generator.state = state["rng"]
+
+
+def _means(found: Sequence[Errors]) -> dict[str, float]:
+    """Relative errors, mean over bodies."""
+    count = [(e.displacements > 0.0).sum(dim=1).clamp_min(1) for e in found]
+    u = [(e.displacements.sum(dim=1) / n).sqrt() for e, n in zip(found, count, strict=True)]
+    return {
+        "displacements": float(torch.cat(u).mean()),
+        "first frequency": float(torch.cat([0.5 * e.squares[:, 0].sqrt() for e in found]).mean()),
+        "frequencies": float(torch.cat([0.5 * e.squares.sqrt().mean(dim=1) for e in found]).mean()),
+    }
+
+
+def _samples(folder: Path, count: int, workers: int) -> list[Sample]:
+    """Prepared bodies, by several processes."""
+    paths = file_paths(folder, count)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        every = [s for part in pool.map(_of_file, paths) for s in part]
+    return every[:count]
+
+
+def _of_file(path: Path) -> list[Sample]:
+    return [sample(body) for body in read_file(path)]
+
+
+def _batches(samples: Sequence[Sample], size: int, device: str) -> list[Batch]:
+    """Bodies of similar size together, which are padded to one."""
+    order = sorted(range(len(samples)), key=lambda i: int(samples[i].free.sum()))
+    parts = [order[i : i + size] for i in range(0, len(order), size)]
+    return [collate([samples[i] for i in part]).to(device) for part in parts]
