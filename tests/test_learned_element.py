@@ -11,6 +11,8 @@ from pdcorrect.fem import learned
 from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.neighbourhood import SIZE, permutations
+from pdcorrect.solvers.integrators import backward_euler
+from pdcorrect.solvers.step import StepObjective
 
 OUTPUTS = 171 + 28
 
@@ -196,6 +198,17 @@ def test_derivatives_by_the_material(what, damping):
     assert expected == pytest.approx(found, rel=5e-5)
 
 
+def test_viscosity_is_of_the_whole_stiffness():
+    """At rest its second derivative is the rate times that of the energy."""
+    problem = learned_problem(two_materials(damping={"viscosity": 2e-3}))
+    stage = backward_euler(problem, problem.rest_state(), 0.01)
+    objective = StepObjective(problem, problem.rest_state(), stage)
+    rest = problem.extended(problem.positions)
+    blocks = objective.viscous.tangent(rest).blocks()
+    K = problem.linearise(rest).blocks()
+    assert blocks == pytest.approx(objective.viscous.rate * K, abs=1e-9 * np.abs(blocks).max())
+
+
 def test_modes_are_of_both_corrections():
     problem = learned_problem(beam())
     plain = pc.discretise(pc.best_coarse(beam()))
@@ -261,8 +274,9 @@ def batch_of_two(damping):
     return problems, pc.BatchStepper(problems, 1e-10)
 
 
-def test_batches_equal_single_steps():
-    problems, stepper = batch_of_two({})
+@pytest.mark.parametrize("damping", [{}, {"viscosity": 1e-3}, {"stiffness": 1e-3}], ids=str)
+def test_batches_equal_single_steps(damping):
+    problems, stepper = batch_of_two(damping)
     state = stepper.rest_state()
     for _ in range(4):
         state = stepper(state).state

@@ -59,6 +59,17 @@ class Written:
 
         return self._each(a, slopes)
 
+    def products(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        """Of a . K b by mu and omega, (B, C), for strains (B, C, 18)."""
+
+        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+            left, right = (x[i, : len(c.cells)].to("cpu", torch.float64).numpy() for x in (a, b))
+            return 0.5 * (
+                left[:, :, None] * right[:, None] + right[:, :, None] * left[:, None]
+            ), None
+
+        return self._each(a, slopes)
+
     def tangents(self, y: Tensor, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Of x . K z, K projected at y: by y (B, U, 3), and by mu and omega, (B, C)."""
         by_y = torch.zeros_like(y)
@@ -128,6 +139,12 @@ class DampingTerms:
             weights = self._rate * self._cells.point_weights
             self._stress = viscosity.stress(self._rates, weights)
             self._strains = [(a, relaxed(self._cells, place)) for a, place in stage.strains]
+        self._against: Tensor | None = None
+        if self._viscous and self._cells.correction is not None:
+            here = self._cells.local(y - self._cells.rest)
+            self._y = y
+            self._against = self._cells.correction.strains(here) - objective.strains_before
+            self._written_rates = self._cells.correction.rates(here, self._cells.local(x))
 
     @cached_property
     def origin(self) -> Tensor:
@@ -161,6 +178,9 @@ class DampingTerms:
         if self._viscous:
             slopes = viscosity.stress_slopes(self._cells, self._change, self._rates)
             total = [-self._rate * slope for slope in slopes]
+            if self._against is not None:
+                more = self._written.products(-self._rate * self._written_rates, self._against)
+                total = [a + b for a, b in zip(total, more, strict=True)]
             for (_, place), slope in zip(self._strains, self._by_strains, strict=True):
                 total = self._with_modes(total, place, slope)
         if self._stiff:
@@ -181,7 +201,11 @@ class DampingTerms:
         """By the strain rate's factor times the viscosity, (B,)."""
         if not self._viscous:
             return self._x.new_zeros(len(self._x))
-        return -2.0 / self._rate * viscosity.energies(self._cells, self._change, self._stress)
+        out = -2.0 / self._rate * viscosity.energies(self._cells, self._change, self._stress)
+        if self._against is None or self._cells.correction is None:
+            return out
+        stress = self._cells.correction.stress(self._against)
+        return out - (self._written_rates * stress).sum(dim=(1, 2))
 
     @property
     def by_mass(self) -> Tensor:
@@ -203,7 +227,13 @@ class DampingTerms:
         found = []
         for a, place in self._strains:
             _, frames = viscosity.stretches(self._cells, place)
-            found.append(a * viscosity.forces(self._cells, frames, self._stress))
+            slope = viscosity.forces(self._cells, frames, self._stress)
+            correction = self._cells.correction
+            if correction is not None:
+                stress = self._rate * correction.stress(self._written_rates)
+                local = self._cells.local(place - self._cells.rest)
+                slope = slope + self._cells.of_corners(correction.pulled(local, stress))
+            found.append(a * slope)
         return found
 
     @cached_property

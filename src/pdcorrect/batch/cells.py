@@ -203,7 +203,7 @@ class CellBatch:
         if self.correction is None:
             return energy, forces
         more, by_cell = self.correction.energy_and_forces(self.local(u))
-        return energy + more, forces + self._of_corners(by_cell)
+        return energy + more, forces + self.of_corners(by_cell)
 
     def linearise(self, y: Tensor, project: bool = False) -> Tangent:
         """The tangent at configurations, for `apply`; ``project`` as in `Points.tangent`."""
@@ -226,9 +226,9 @@ class CellBatch:
         out = self.gathered(self.points.product(tangent[:3], self.gradients(x)))
         if self.correction is None:
             return out
-        return out + self._of_corners(self.correction.apply(tangent[3], self.local(x)))
+        return out + self.of_corners(self.correction.apply(tangent[3], self.local(x)))
 
-    def _of_corners(self, by_cell: Tensor) -> Tensor:
+    def of_corners(self, by_cell: Tensor) -> Tensor:
         """Values (B, C, K, 3) of corners summed, and none for modes, (B, U, 3)."""
         missing = self.sizes.width - by_cell.shape[2]
         return self.summed(torch.nn.functional.pad(by_cell, (0, 0, 0, missing)))

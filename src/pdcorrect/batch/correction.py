@@ -74,23 +74,49 @@ class BatchCorrection:
         conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
         return energy, -self._spread(conjugates)
 
+    def strains(self, local: Tensor) -> Tensor:
+        """z, (B, C, 18)."""
+        return self._state(local).z
+
+    def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
+        """r/2 (z - z') . K (z - z') (B,), and its derivatives by cell (B, C, 8, 3)."""
+        state = self._against(self._state(local), before, rate)
+        energy = 0.5 * ((state.z - before) * state.y).sum(dim=(1, 2))
+        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
+        return energy, self._spread(conjugates)
+
+    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> Tensor:
+        """What `apply` needs of it, with the same rate."""
+        return _kept(self._against(self._state(local), before, rate))
+
+    def rates(self, local: Tensor, x: Tensor) -> Tensor:
+        """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
+        return self._rates(self._state(local), small_products(self._shapes, x))[0]
+
+    def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
+        """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
+        state = self._with(self._state(local), stress)
+        return self._spread(_conjugates(state.R, state.tensor, state.w, state.y))
+
+    def stress(self, z: Tensor) -> Tensor:
+        """K z, (B, C, 18)."""
+        return small_products(self._matrices, z[..., None])[..., 0]
+
     def linearise(self, local: Tensor, project: bool = False) -> Tensor:
         """What `apply` needs, (STATE, B C, 1); ``project`` as in `CellCorrection.tangent`."""
         state = self._state(local)
         if project:
-            kept = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
-        else:
-            kept = state
-        flat = [x.flatten(2).flatten(0, 1) for x in kept]
-        return torch.cat(flat, dim=1).T[..., None].contiguous()
+            state = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
+        return _kept(state)
 
-    def apply(self, kept: Tensor, local: Tensor) -> Tensor:
-        """The second derivative times changes (B, C, 8, 3), by cell."""
+    def apply(self, kept: Tensor, local: Tensor, rate: Tensor | float = 1.0) -> Tensor:
+        """The second derivative times changes (B, C, 8, 3), by cell; ``rate`` multiplies K."""
         scenes, cells = self._sizes.shape
         flat = kept[..., 0].T.reshape(scenes, cells, STATE)
         parts = torch.split(flat, list(_SIZES), dim=2)
         square = [x.reshape(*x.shape[:2], 3, 3) if x.shape[2] == 9 else x for x in parts]
-        return self._spread(self._changes(_State(*square), small_products(self._shapes, local)))
+        changes = self._changes(_State(*square), small_products(self._shapes, local), rate)
+        return self._spread(changes)
 
     def _spread(self, conjugates: Tensor) -> Tensor:
         return small_products(self._shapes.transpose(-1, -2), conjugates)
@@ -110,24 +136,37 @@ class BatchCorrection:
         strain = torch.einsum("nij,bcij->bcn", self._mandel, S - size * identity)
         turned = small_products(v[..., 3:, :], R)
         z = torch.cat([strain, turned.flatten(2)], dim=2)
-        y = small_products(self._matrices, z[..., None])[..., 0]
+        return self._with(_State(R, S, inverse, z, z, S, z), self.stress(z))
+
+    def _with(self, at: _State, y: Tensor) -> _State:
+        """The state with y for K z."""
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
-        w = small_products(inverse, self._torque(S, tensor, turned, _vectors(y))[..., None])
-        return _State(R, S, inverse, z, y, tensor, w[..., 0])
+        torque = self._torque(at.S, tensor, _vectors(at.z), _vectors(y))
+        w = small_products(at.inverse, torque[..., None])[..., 0]
+        return at._replace(y=y, tensor=tensor, w=w)
+
+    def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
+        return self._with(at, rate * self.stress(at.z - before))
 
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
 
-    def _changes(self, at: _State, dv: Tensor) -> Tensor:
-        """See `turned_strains`; (B, C, 7, 3)."""
+    def _rates(self, at: _State, dv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Changes of z, of S and of the strains' vectors, and how the frame turns."""
         back = at.R.transpose(-1, -2)
         D = small_products(back, dv[..., :3, :].transpose(-1, -2))
         turn = small_products(at.inverse, -_axial(D)[..., None])[..., 0]
         dS = D - _cross_columns(turn, at.S)
-        h, y = _vectors(at.z), _vectors(at.y)
+        h = _vectors(at.z)
         dh = small_products(dv[..., 3:, :], at.R) - torch.linalg.cross(turn[..., None, :], h)
         dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dS), dh.flatten(2)], dim=2)
-        dy = small_products(self._matrices, dz[..., None])[..., 0]
+        return dz, dS, dh, turn
+
+    def _changes(self, at: _State, dv: Tensor, rate: Tensor | float) -> Tensor:
+        """See `turned_strains`; (B, C, 7, 3)."""
+        dz, dS, dh, turn = self._rates(at, dv)
+        h, y = _vectors(at.z), _vectors(at.y)
+        dy = rate * self.stress(dz)
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
@@ -140,6 +179,11 @@ class BatchCorrection:
 
 
 _OWN = ("y", "tensor", "w")
+
+
+def _kept(state: _State) -> Tensor:
+    flat = [x.flatten(2).flatten(0, 1) for x in state]
+    return torch.cat(flat, dim=1).T[..., None].contiguous()
 
 
 def _stretch(H: Components) -> list[Components]:

@@ -88,10 +88,14 @@ class BatchMass:
 
 
 class Tangents(NamedTuple):
-    """Of the elastic energy and of viscosity, if there is any, at the same configurations."""
+    """Of the elastic energy and of viscosity, if there is any, at the same configurations.
+
+    The last is that of a learned element's viscosity.
+    """
 
     elastic: Tangent
     viscous: ViscousTangent | None
+    written: Tensor | None = None
 
 
 class BatchObjective:
@@ -113,6 +117,8 @@ class BatchObjective:
         Where damping by stiffness is taken.
     before : (6, B C, Q)
         The stretches from which those of viscosity are counted.
+    strains_before : (B, C, 18)
+        The same of a learned element's strains.
     """
 
     def __init__(self, cells: CellBatch, damping: Damping) -> None:
@@ -133,12 +139,15 @@ class BatchObjective:
                 for i, k in enumerate(cells.tangent_sizes())
             )
         self.before = cells.rest.new_zeros(6 if self.viscous else 0, *points)
+        written = self.viscous and cells.correction is not None
+        n = cells.sizes
+        self.strains_before = cells.rest.new_zeros(n.scenes, n.cells if written else 0, 18)
 
     def narrowed(self, rows: Tensor) -> BatchObjective:
         """Of some scenes, as it is now."""
         cells = self.cells.narrowed(rows)
         mass = self.mass.narrowed(cells, rows)
-        names = ("free", "target", "origin", "forces")
+        names = ("free", "target", "origin", "forces", "strains_before")
         return with_rows(
             self, rows, *names, cells=cells, mass=mass,
             tangent=self.tangent and tuple(self.cells.of_scenes(x, rows) for x in self.tangent),
@@ -185,7 +194,13 @@ class BatchObjective:
         S, frames = viscosity.stretches(self.cells, y)
         stress = self.viscous_stress(S)
         energy = viscosity.energies(self.cells, S - self.before, stress)
-        return energy, viscosity.forces(self.cells, frames, stress)
+        forces, cells = viscosity.forces(self.cells, frames, stress), self.cells
+        if cells.correction is None:
+            return energy, forces
+        more, by_cell = cells.correction.viscous(
+            cells.local(y - cells.rest), self.strains_before, self.factors[3]
+        )
+        return energy + more, forces + cells.of_corners(by_cell)
 
     @property
     def _viscous_weights(self) -> Tensor:
@@ -197,7 +212,12 @@ class BatchObjective:
             return Tangents(self.cells.linearise(y), None)
         S, frames = viscosity.stretches(self.cells, y)
         viscous = ViscousTangent(frames, self.viscous_stress(S), self._viscous_weights)
-        return Tangents(self.cells.linearise(y), viscous)
+        written, cells = None, self.cells
+        if cells.correction is not None:
+            written = cells.correction.linearise_viscous(
+                cells.local(y - cells.rest), self.strains_before, self.factors[3]
+            )
+        return Tangents(cells.linearise(y), viscous, written)
 
     def hessian(self, tangents: Tangents, x: Tensor) -> Tensor:
         """H x on all components."""
@@ -207,6 +227,11 @@ class BatchObjective:
             out = out + self.factors[2] * self.cells.apply(self.tangent, x)
         if tangents.viscous is not None:
             out = out + viscosity.apply(self.cells, tangents.viscous, x)
+        if tangents.written is not None and self.cells.correction is not None:
+            changes = self.cells.correction.apply(
+                tangents.written, self.cells.local(x), self.factors[3]
+            )
+            out = out + self.cells.of_corners(changes)
         return out
 
 

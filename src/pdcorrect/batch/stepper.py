@@ -439,6 +439,12 @@ class BatchStepper:
             objective.before.zero_()
             for a, place in stage.strains:
                 objective.before.add_(stretches(cells, relaxed(cells, place))[0], alpha=a)
+            if cells.correction is not None:
+                nodes = cells.rest[:, : cells.sizes.nodes]
+                parts = [
+                    a * cells.correction.strains(cells.local(x - nodes)) for a, x in stage.strains
+                ]
+                objective.strains_before.copy_(torch.stack(parts).sum(dim=0))
 
     def _make_minimiser(self) -> None:
         """With the first Hessian of a step that goes on, which serves a run's first steps too."""

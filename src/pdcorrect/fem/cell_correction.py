@@ -99,6 +99,19 @@ class CellCorrection:
         )
         return CorrectionTangent(part, out)
 
+    def stress(self, z: Array) -> Array:
+        """K z, (C, 18), N, for strains (C, 18)."""
+        return np.asarray((self.matrices @ z[..., None])[..., 0])
+
+    def pulled(self, u: Array, stress: Array) -> Array:
+        """Derivatives (N or more, 3) of stress . z by the displacements u, for (C, 18)."""
+        without = replace(self, matrices=np.zeros_like(self.matrices))
+        return without.energy_and_forces(u, stress)[1]
+
+    def scaled(self, factor: float) -> CellCorrection:
+        """A multiple of the matrices."""
+        return replace(self, matrices=factor * self.matrices)
+
     def matrix_slopes(self, u: Array, x: Array) -> Array:
         """Derivatives (C, 18, 18) of x . dW/du by the matrices, m2, for (N or more, 3)."""
         return _symmetric_products(self.rates(u, x), self.strains(u))

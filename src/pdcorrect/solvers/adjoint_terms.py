@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes
+from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes, written_slopes
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress, stress_slopes
 from pdcorrect.solvers.damping import Rayleigh, Viscous
 
@@ -135,13 +135,17 @@ class ViscousTerm:
         at_y = Stretches(problem, y)
         self._change, self._rates = damping.change(at_y), at_y.rates(x)
         self._along = damping.rate * small_strain_stress(problem, self._rates)
+        self._y, self._x = y, x
         self._following = [Following(problem, place) for place in damping.places]
 
     @cached_property
     def places(self) -> list[Array]:
         """By each of the earlier positions that stretches are of, (N, 3)."""
         pairs = zip(self._following, self._slopes, strict=True)
-        return [following.reduced(slope) for following, slope in pairs]
+        found = [following.reduced(slope) for following, slope in pairs]
+        if self._damping.written is None:
+            return found
+        return [a + b for a, b in zip(found, self._written[0], strict=True)]
 
     @cached_property
     def weights(self) -> Weights:
@@ -152,12 +156,24 @@ class ViscousTerm:
         for place, following, slope in places:
             more = weight_slopes(self._problem, place, -following.response(slope))
             total = [a + b for a, b in zip(total, more, strict=True)]
+        if self._damping.written is not None:
+            by_matrices = -0.5 * self._damping.rate * self._written[1]
+            more = written_slopes(self._problem, by_matrices)
+            total = [a + b for a, b in zip(total, more, strict=True)]
         return total[0], total[1]
+
+    @cached_property
+    def _written(self) -> tuple[list[Array], Array]:
+        """What a learned element adds, see `WrittenViscous.slopes`."""
+        assert self._damping.written is not None
+        return self._damping.written.slopes(self._y, self._x)
 
     @property
     def by_rate(self) -> float:
         """By the strain rate's factor times the viscosity."""
-        return -float(product(self._change, self._along).sum()) / self._damping.rate
+        out = -float(product(self._change, self._along).sum()) / self._damping.rate
+        written = self._damping.written
+        return out if written is None else out - written.along(self._y, self._x)
 
     @cached_property
     def _slopes(self) -> list[Array]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.fem.cell_correction import CorrectionTangent
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress
@@ -65,6 +66,8 @@ class Rayleigh:
 class Viscous:
     """r/2 (S(y) - S') : C : (S(y) - S'), summed over points, see `fem.viscosity`.
 
+    And the same with the matrices and strains of a learned element, see `fem.turned_strains`.
+
     Attributes
     ----------
     rate : float
@@ -81,6 +84,9 @@ class Viscous:
         factors = [a for a, _ in stage.strains]
         self.parts = [(a, Stretches(problem, x)) for a, x in zip(factors, self.places, strict=True)]
         self._before = sum(a * part.tensor for a, part in self.parts)
+        self.written = None
+        if problem.correction is not None:
+            self.written = WrittenViscous(problem, factors, self.places, self.rate)
 
     def change(self, stretches: Stretches) -> Array:
         """S(y) - S', (C, 6, Q)."""
@@ -95,6 +101,8 @@ class Viscous:
         since = 1.0 / self._strain_rate if len(self.parts) == 1 else h
         change = Stretches(self._problem, y).tensor - self.parts[0][1].tensor
         power = product(change, small_strain_stress(self._problem, change)).sum()
+        if self.written is not None:
+            power += self.written.power(y)
         return self._problem.scene.damping.viscosity * h / since**2 * float(power)
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
@@ -102,12 +110,78 @@ class Viscous:
         stretches = Stretches(self._problem, y)
         stress = self.stress(stretches)
         value = 0.5 * float(product(self.change(stretches), stress).sum())
-        return value, stretches.forces(stress)
+        force = stretches.forces(stress)
+        if self.written is None:
+            return value, force
+        more, added = self.written.value_and_gradient(y)
+        return value + more, force + added
 
     def tangent(self, y: Array, project: bool = False) -> ViscousTangent:
         """The second derivative at y; ``project`` makes it positive semi-definite."""
         stretches = Stretches(self._problem, y)
-        return ViscousTangent(stretches, self.stress(stretches), self.rate, project)
+        written = None if self.written is None else self.written.tangent(y, project)
+        return ViscousTangent(stretches, self.stress(stretches), self.rate, project, written)
+
+
+class WrittenViscous:
+    """r/2 (z(y) - z') . K (z(y) - z'), summed over the cells of a learned element.
+
+    Attributes
+    ----------
+    places : list of (float, (N, 3))
+        What z' is a sum of: factors and displacements.
+    """
+
+    def __init__(
+        self, problem: Problem, factors: list[float], places: list[Array], rate: float
+    ) -> None:
+        assert problem.correction is not None
+        self._rest = problem.positions
+        self.places = [(a, self.displacement(x)) for a, x in zip(factors, places, strict=True)]
+        self.correction = problem.correction
+        self._rated = problem.correction.scaled(rate)
+        parts = [a * self.correction.strains(u) for a, u in self.places]
+        self._before: Array = np.sum(parts, axis=0)
+        self._shift = self._rated.stress(self._before)
+
+    def displacement(self, y: Array) -> Array:
+        """Of the nodes, (N, 3)."""
+        return y[: len(self._rest)] - self._rest
+
+    def change(self, y: Array) -> Array:
+        """z(y) - z', (C, 18)."""
+        return self.correction.strains(self.displacement(y)) - self._before
+
+    def power(self, y: Array) -> float:
+        """Of the change since the last place's strains, over r."""
+        _, last = self.places[0]
+        change = self.correction.strains(self.displacement(y)) - self.correction.strains(last)
+        return float(np.vdot(change, self.correction.stress(change)))
+
+    def value_and_gradient(self, y: Array) -> tuple[float, Array]:
+        """J and N, (N + B, 3)."""
+        value, forces = self._rated.energy_and_forces(self.displacement(y), self._shift)
+        out = np.zeros_like(y)
+        out[: len(forces)] = -forces
+        return value + 0.5 * float(np.vdot(self._before, self._shift)), out
+
+    def tangent(self, y: Array, project: bool) -> CorrectionTangent:
+        """The second derivative."""
+        return self._rated.tangent(self.displacement(y), project, self._shift)
+
+    def slopes(self, y: Array, x: Array) -> tuple[list[Array], Array]:
+        """Of - x . force at y: by the places (N, 3), and by the matrices (C, 18, 18)."""
+        x = x[: len(self._rest)]
+        rates = self.correction.rates(self.displacement(y), x)
+        stress = self._rated.stress(rates)
+        by_places = [a * self.correction.pulled(u, stress) for a, u in self.places]
+        out = rates[:, :, None] * self.change(y)[:, None]
+        return by_places, out + np.swapaxes(out, 1, 2)
+
+    def along(self, y: Array, x: Array) -> float:
+        """X . force at y, over r."""
+        rates = self.correction.rates(self.displacement(y), x[: len(self._rest)])
+        return float(np.vdot(rates, self.correction.stress(self.change(y))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +192,16 @@ class ViscousTangent:
     stress: Array
     rate: float
     project: bool
+    written: CorrectionTangent | None = None
 
     def apply(self, x: Array) -> Array:
         """Times x (N + B, 3)."""
-        return self.stretches.apply(self.stress, self.rate, x, self.project)
+        out = self.stretches.apply(self.stress, self.rate, x, self.project)
+        return out if self.written is None else out + self.written.apply(x)
 
     def blocks(self) -> Array:
         """Of each cell, (C, L, L, 3, 3), N/m."""
-        return self.stretches.blocks(self.stress, self.rate, self.project)
+        out = self.stretches.blocks(self.stress, self.rate, self.project)
+        if self.written is not None:
+            self.written.add_to(out)
+        return out

@@ -91,6 +91,10 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
         at = Stretches(problem, here)
         rate = at.rates(Following(problem, here).lifted(state.velocities))
         out -= damping.viscosity * at.forces(small_strain_stress(problem, rate))[: len(out)]
+        if problem.correction is not None:
+            u = state.positions - problem.positions
+            stress = problem.correction.stress(problem.correction.rates(u, state.velocities))
+            out -= damping.viscosity * problem.correction.pulled(u, stress)
     return out
 
 
