@@ -326,3 +326,38 @@ def test_batches_take_other_materials():
         other = problem.with_material(young=5e5, poisson=0.2)
         single = pc.rollout(pc.ProjectiveDynamics(other, tolerance=1e-10), 1).positions[-1]
         assert after.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-9)
+
+
+def test_batches_have_the_same_forces_and_tangents_where_cells_are_crushed():
+    problems, stepper = batch_of_two({"viscosity": 1e-3})
+    rng = np.random.default_rng(9)
+    y = stepper.cells.rest + 0.003 * torch.as_tensor(
+        rng.normal(size=tuple(stepper.cells.rest.shape))
+    )
+    y[:, : stepper.cells.sizes.nodes] *= torch.as_tensor([0.5, 0.8, 0.9])
+    x = torch.as_tensor(rng.normal(size=tuple(y.shape)))
+    cells = stepper.cells
+    u, local = y - cells.rest, cells.local(y - cells.rest)
+    energy, forces = cells.correction.energy_and_forces(local)
+    rates = cells.correction.rates(local, cells.local(x))
+    products = {
+        p: cells.of_corners(
+            cells.correction.apply(cells.correction.linearise(local, p), cells.local(x))
+        )
+        for p in (False, True)
+    }
+    for i, problem in enumerate(problems):
+        n, count = len(problem.positions), len(problem.cells)
+        own, way = u[i, :n].numpy(), x[i, :n].numpy()
+        value, force = problem.correction.energy_and_forces(own)
+        assert float(energy[i]) == pytest.approx(value, rel=1e-9)
+        found = cells.of_corners(forces)[i, :n].numpy()
+        assert found == pytest.approx(force, abs=1e-9 * np.abs(force).max())
+        expected = problem.correction.rates(own, way)
+        assert rates[i, :count].numpy() == pytest.approx(
+            expected, abs=1e-6 * np.abs(expected).max()
+        )
+        for project, product in products.items():
+            expected = problem.correction.tangent(own, project).apply(way)
+            size = np.abs(expected).max()
+            assert product[i, :n].numpy() == pytest.approx(expected, abs=1e-9 * size)

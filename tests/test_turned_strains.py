@@ -33,12 +33,18 @@ def slope(f, e=1e-4):
     return (8 * (f(e) - f(-e)) - (f(2 * e) - f(-2 * e))) / (12 * e)
 
 
+@pytest.mark.parametrize("squeezed", [1.0, 0.5])
 @pytest.mark.parametrize("shifted", [False, True])
-def test_forces_and_tangent_are_the_derivatives_of_the_potential(cells, shifted):
-    correction, _ = cells
+def test_forces_and_tangent_are_the_derivatives_of_the_potential(cells, shifted, squeezed):
+    """Also where the strains fade."""
+    correction, rest = cells
     rng = np.random.default_rng(2)
     shift = rng.normal(size=(CELLS if shifted else 0, 18))
-    u, x = moved(), 0.05 * rng.normal(size=(8 * CELLS, 3))
+    u, x = 0.5 * moved() + (squeezed - 1.0) * rest, 0.02 * rng.normal(size=(8 * CELLS, 3))
+    if squeezed < 1.0:
+        full = np.abs(correction.strains(0.5 * moved())[:, 6:])
+        faded = np.abs(correction.strains(u)[:, 6:])
+        assert np.count_nonzero((faded > 0.0) & (faded < 0.9 * full)) > 20
 
     def forces(t):
         return correction.energy_and_forces(u + t * x, shift)[1]
@@ -87,3 +93,13 @@ def test_affine_displacements_have_no_other_strains_than_stretch(cells):
     assert z[:, :3] / correction.sizes[:, None] == pytest.approx(
         np.broadcast_to(np.diag(stretch) - 1.0, (CELLS, 3)), abs=1e-12
     )
+
+
+def test_crushed_cells_have_no_strains(cells):
+    correction, rest = cells
+    for F in (np.zeros((3, 3)), np.diag([1.0, 1.0, -0.9])):
+        assert not correction.strains(rest @ F.T - rest).any()
+        energy, forces = correction.energy_and_forces(rest @ F.T - rest)
+        assert energy == 0.0
+        assert not forces.any()
+        assert not correction.tangent(rest @ F.T - rest).matrices.any()

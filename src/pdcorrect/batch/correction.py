@@ -18,20 +18,40 @@ from pdcorrect.batch.points import Components, computed, moved
 from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
+from pdcorrect.fem.turned_strains import FADES, GONE, KINK
 
-_SIZES = (9, 9, 9, 18, 18, 9, 3)
-"""Numbers of R, S, (tr S - S)^-1, z, y, the tensor of y, and w."""
+_SIZES = (9, 9, 9, 18, 18, 18, 9, 3, 3)
+"""Of what `_State` has."""
 STATE = sum(_SIZES)
 
 
 class _State(NamedTuple):
+    """R, S and (tr S - S)^-1; z before it fades, and the derivatives by what is left of it.
+
+    Those by z itself, their tensor, and w; c and its derivatives.
+    """
+
     R: Tensor
     S: Tensor
     inverse: Tensor
     z: Tensor
+    raw: Tensor
     y: Tensor
     tensor: Tensor
     w: Tensor
+    fade: Tensor
+
+    @property
+    def strains(self) -> Tensor:
+        """What is left of z."""
+        return self.fade[..., :1] * self.z
+
+    @property
+    def slope(self) -> Tensor:
+        """Dc/dS."""
+        trace = self.inverse.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+        identity = torch.eye(3, dtype=trace.dtype, device=trace.device)
+        return self.fade[..., 1:2, None] * (trace * identity - self.inverse)
 
 
 class BatchCorrection:
@@ -70,18 +90,18 @@ class BatchCorrection:
     def energy_and_forces(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""
         state = self._state(local)
-        energy = 0.5 * (state.z * state.y).sum(dim=(1, 2))
+        energy = 0.5 * (state.strains * state.raw).sum(dim=(1, 2))
         conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
         return energy, -self._spread(conjugates)
 
     def strains(self, local: Tensor) -> Tensor:
         """z, (B, C, 18)."""
-        return self._state(local).z
+        return self._state(local).strains
 
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """r/2 (z - z') . K (z - z') (B,), and its derivatives by cell (B, C, 8, 3)."""
         state = self._against(self._state(local), before, rate)
-        energy = 0.5 * ((state.z - before) * state.y).sum(dim=(1, 2))
+        energy = 0.5 * ((state.strains - before) * state.raw).sum(dim=(1, 2))
         conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
         return energy, self._spread(conjugates)
 
@@ -91,7 +111,9 @@ class BatchCorrection:
 
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
-        return self._rates(self._state(local), small_products(self._shapes, x))[0]
+        state = self._state(local)
+        dz, dS, _, _ = self._rates(state, small_products(self._shapes, x))
+        return state.fade[..., :1] * dz + _contracted(state.slope, dS) * state.z
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
@@ -136,17 +158,23 @@ class BatchCorrection:
         strain = torch.einsum("nij,bcij->bcn", self._mandel, S - size * identity)
         turned = small_products(v[..., 3:, :], R)
         z = torch.cat([strain, turned.flatten(2)], dim=2)
-        return self._with(_State(R, S, inverse, z, z, S, z), self.stress(z))
+        d = torch.linalg.det(_traced(S)) / (8.0 * self._sizes**3)
+        at = _State(R, S, inverse, z, z, z, S, z, _fade(d))
+        return self._with(at, self.stress(at.strains))
 
-    def _with(self, at: _State, y: Tensor) -> _State:
-        """The state with y for K z."""
+    def _with(self, at: _State, raw: Tensor) -> _State:
+        """The state with derivatives by what is left of z."""
+        along = (raw * at.z).sum(dim=-1)[..., None, None]
+        more = torch.einsum("nij,bcij->bcn", self._mandel, along * at.slope)
+        y = at.fade[..., :1] * raw
+        y = torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
         torque = self._torque(at.S, tensor, _vectors(at.z), _vectors(y))
         w = small_products(at.inverse, torque[..., None])[..., 0]
-        return at._replace(y=y, tensor=tensor, w=w)
+        return at._replace(raw=raw, y=y, tensor=tensor, w=w)
 
     def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
-        return self._with(at, rate * self.stress(at.z - before))
+        return self._with(at, rate * self.stress(at.strains - before))
 
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
@@ -166,7 +194,18 @@ class BatchCorrection:
         """See `turned_strains`; (B, C, 7, 3)."""
         dz, dS, dh, turn = self._rates(at, dv)
         h, y = _vectors(at.z), _vectors(at.y)
-        dy = rate * self.stress(dz)
+        c, slope, bend = torch.split(at.fade, 1, dim=-1)
+        G = at.slope
+        dc = _contracted(G, dS)
+        raw = rate * self.stress(c * dz + dc * at.z)
+        across = (raw * at.z + at.raw * dz).sum(dim=-1)[..., None, None]
+        along = (at.raw * at.z).sum(dim=-1)[..., None, None]
+        changed = at.inverse @ _traced(dS) @ at.inverse  # less the change of (tr S - S)^-1
+        bent = torch.where(slope == 0.0, 0.0, dc * (bend + slope) / (slope * slope))[..., None]
+        dG = bent * G - slope[..., None] * _traced(changed)
+        more = torch.einsum("nij,bcij->bcn", self._mandel, across * G + along * dG)
+        dy = c * raw + dc * at.raw
+        dy = torch.cat([dy[..., :6] + more, dy[..., 6:]], dim=-1)
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
@@ -178,7 +217,28 @@ class BatchCorrection:
         return _conjugates(at.R, dT, dw, torch.cat([dy[..., :6], dy_vectors.flatten(2)], dim=2))
 
 
-_OWN = ("y", "tensor", "w")
+_OWN = ("raw", "y", "tensor", "w")
+
+
+def _traced(A: Tensor) -> Tensor:
+    """tr A - A."""
+    trace = A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    return trace * torch.eye(3, dtype=A.dtype, device=A.device) - A
+
+
+def _contracted(A: Tensor, B: Tensor) -> Tensor:
+    """A : B, (B, C, 1)."""
+    return (A * B).sum(dim=(-2, -1))[..., None]
+
+
+def _fade(d: Tensor) -> Tensor:
+    """c, and d dc/dd and d^2 d2c/dd2, (B, C, 3), see `turned_strains`."""
+    width = FADES - GONE
+    t = ((d - GONE) / width).clamp(0.0, 1.0)
+    first = 30.0 * t * t * (1.0 - t) ** 2 / width
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
+    c = t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+    return torch.stack([c, d * first, d * d * second], dim=-1)
 
 
 def _kept(state: _State) -> Tensor:
@@ -189,7 +249,7 @@ def _kept(state: _State) -> Tensor:
 def _stretch(H: Components) -> list[Components]:
     """R, S and (tr S - S)^-1 of H + I."""
     U, s, V = signed_svd(moved(H))
-    floor = _KINK * s[0]
+    floor = torch.full_like(s[0], KINK)
     sums = [torch.maximum(s[1] + s[2], floor), torch.maximum(s[2] + s[0], floor)]
     sums.append(torch.maximum(s[0] + s[1], floor))
 
@@ -204,10 +264,6 @@ def _stretch(H: Components) -> list[Components]:
         return out
 
     return [product(U, None), product(V, list(s)), product(V, [1.0 / x for x in sums])]
-
-
-_KINK = 1e-9
-"""As in `pdcorrect.fem.turned_strains`."""
 
 
 def _vectors(y: Tensor) -> Tensor:

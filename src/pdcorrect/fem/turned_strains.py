@@ -14,6 +14,11 @@ has the derivatives
 [w] the matrix of the cross product with w, axial(A)_i = e_ijk A_jk: the second part is what the
 frame's turning adds, without which forces would have no potential.  Second derivatives are exact
 too.  Everything here counts S and F times a, so that all numbers of z are lengths.
+
+Where two stretches add up to nothing the frame is not defined.  So z counts times a smooth c(d) of
+d = (s_1 + s_2)(s_2 + s_3)(s_3 + s_1) / 8 = det(tr S - S) / 8, which is 1 for d above `FADES` (a cell
+squeezed evenly to two thirds, or to a tenth along one axis) and 0 below `GONE`: cells that are crushed
+or inside out have the element's own energy alone.
 """
 
 from __future__ import annotations
@@ -31,8 +36,10 @@ Array = NDArray[np.float64]
 _ROOT = np.sqrt(0.5)
 _ROWS = np.array([0, 1, 2, 1, 2, 0])
 _COLUMNS = np.array([0, 1, 2, 2, 0, 1])
-_KINK = 1e-9
-"""Of the largest stretch: sums of two stretches below it count as it."""
+KINK = 1e-9
+"""Of the size: sums of two stretches below it count as it."""
+FADES, GONE = 0.3, 0.05
+"""Values of d between which z fades."""
 
 
 @njit(**OPTIONS)
@@ -114,9 +121,52 @@ def _frames(v, sizes, begin, end, F, U, s, V, B, W):  # type: ignore[no-untyped-
 
 
 @njit(**OPTIONS)
-def _unpack(U, s, V, l, R, S, Y):  # type: ignore[no-untyped-def]
+def _fade(s, l, size):  # type: ignore[no-untyped-def]
+    """c, and d dc/dd and d^2 d2c/dd2, of lane l."""
+    d = (s[0, l] + s[1, l]) * (s[1, l] + s[2, l]) * (s[2, l] + s[0, l]) / (8.0 * size**3)
+    if d >= FADES:
+        return 1.0, 0.0, 0.0
+    if not d > GONE:
+        return 0.0, 0.0, 0.0
+    width = FADES - GONE
+    t = (d - GONE) / width
+    first = 30.0 * t * t * (1.0 - t) ** 2 / width
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
+    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), d * first, d * d * second
+
+
+@njit(**OPTIONS)
+def _fading(Y, slope, G):  # type: ignore[no-untyped-def]
+    """G (3, 3) = dc/dS."""
+    trace = Y[0, 0] + Y[1, 1] + Y[2, 2]
+    for i in range(3):
+        for j in range(3):
+            G[i, j] = slope * ((trace if i == j else 0.0) - Y[i, j])
+
+
+@njit(**OPTIONS)
+def _add_tensor(factor, G, y):  # type: ignore[no-untyped-def]
+    """Add a symmetric tensor to the first six numbers."""
+    for n in range(6):
+        i, j = _ROWS[n], _COLUMNS[n]
+        y[n] += factor * (G[i, j] if i == j else G[i, j] / _ROOT)
+
+
+@njit(**OPTIONS)
+def _faded(z, y, c, G):  # type: ignore[no-untyped-def]
+    """From the derivatives y by c z to those by z; returns y . z."""
+    along = 0.0
+    for n in range(18):
+        along += y[n] * z[n]
+        y[n] *= c
+    _add_tensor(along, G, y)
+    return along
+
+
+@njit(**OPTIONS)
+def _unpack(U, s, V, l, size, R, S, Y):  # type: ignore[no-untyped-def]
     """R, S and (tr S - S)^-1 of lane l."""
-    floor = _KINK * s[0, l]
+    floor = KINK * size
     for i in range(3):
         for j in range(3):
             r, t, y = 0.0, 0.0, 0.0
@@ -165,10 +215,13 @@ def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _change(dv, R, S, Y, T, w, z, y, K, factor, D, A, B, dT, t, turn, dz, dy, dw, out):  # type: ignore[no-untyped-def]
+def _change(  # type: ignore[no-untyped-def]
+    dv, R, S, Y, T, w, z, y, K, factor, fade, raw, G, D, A, B, dT, t, turn, dz, dy, dw, out
+):
     """Out (7, 3): change of `_conjugates` by dv (7, 3); dz (18,) that of z.
 
     Without y's own second part where ``factor`` is 0: then the result is positive where K is.
+    ``fade`` are c and its derivatives, ``raw`` the derivatives by c z, G is dc/dS.
     """
     for i in range(3):
         for j in range(3):
@@ -188,11 +241,36 @@ def _change(dv, R, S, Y, T, w, z, y, K, factor, D, A, B, dT, t, turn, dz, dy, dw
         for i in range(3):
             part[i] = R[0, i] * dv[3 + m, 0] + R[1, i] * dv[3 + m, 1] + R[2, i] * dv[3 + m, 2]
         _add_cross(turn, z[6 + 3 * m : 9 + 3 * m], -1.0, part)
+    c, slope, bend = fade
+    dc = 0.0
+    if slope != 0.0:
+        for i in range(3):
+            for j in range(3):
+                dc += G[i, j] * B[i, j]
     for n in range(18):
         total = 0.0
         for l in range(18):
-            total += K[n, l] * dz[l]
+            total += K[n, l] * (c * dz[l] + dc * z[l])
         dy[n] = total
+    if slope != 0.0:
+        along, across = 0.0, 0.0
+        for n in range(18):
+            along += raw[n] * z[n]
+            across += dy[n] * z[n] + factor * raw[n] * dz[n]
+            dy[n] = c * dy[n] + factor * dc * raw[n]
+        _add_tensor(across, G, dy)
+        if factor != 0.0:  # along dG, with dY = -Y (tr dS - dS) Y
+            trace = B[0, 0] + B[1, 1] + B[2, 2]
+            for i in range(3):
+                for j in range(3):
+                    D[i, j] = (trace if i == j else 0.0) - B[i, j]
+            _product(Y, D, A)
+            _product(A, Y, D)
+            _fading(D, -slope, dT)
+            _add_tensor(along, dT, dy)
+            _add_tensor(along * dc * (bend / slope + 1.0) / slope, G, dy)
+    elif c != 1.0:
+        dy[:] = 0.0
     _tensor(dy, dT)
     t[:] = 0.0
     _product(S, dT, A)
@@ -252,23 +330,29 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
         v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         T, A, out = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
+        G = np.empty((3, 3))
         t, w = np.empty(3), np.empty(3)
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, B, W)
         for c in range(begin, end):
             l = c - begin
-            _unpack(U, s, V, l, R, S, Y)
+            _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
+            fade, slope, _ = _fade(s, l, sizes[c])
             total = 0.0
             for n in range(18):
                 row = 0.0
                 for m in range(18):
                     row += matrices[c, n, m] * z[m]
+                row *= fade
                 less = shift[c, n] if len(shift) else 0.0
-                total += z[n] * (0.5 * row - less)
+                total += fade * z[n] * (0.5 * row - less)
                 y[n] = row - less
             energy[c] = total
+            if fade != 1.0:
+                _fading(Y, slope, G)
+                _faded(z, y, fade, G)
             _turning(z, y, S, Y, T, A, t, w)
             _conjugates(R, T, w, y, A, out)
             _spread(out, shapes[c], -1.0, by_cell[c])
@@ -288,8 +372,11 @@ def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, B, W)
         for c in range(begin, end):
-            _unpack(U, s, V, c - begin, R, S, Y)
+            _unpack(U, s, V, c - begin, sizes[c], R, S, Y)
             _strains(v[c - begin], R, S, sizes[c], out[c])
+            fade, _, _ = _fade(s, c - begin, sizes[c])
+            for n in range(18):
+                out[c, n] *= fade
 
 
 @njit(**PARALLEL)
@@ -310,18 +397,23 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
         D, dT, column = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
         t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
         dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
+        raw, G = np.empty(18), np.zeros((3, 3))
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, W9, W)
         for c in range(begin, end):
             l = c - begin
-            _unpack(U, s, V, l, R, S, Y)
+            _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
+            fade = _fade(s, l, sizes[c])
             for n in range(18):
-                row = -shift[c, n] if len(shift) else 0.0
+                row = 0.0
                 for m in range(18):
                     row += matrices[c, n, m] * z[m]
-                y[n] = row
+                y[n] = raw[n] = fade[0] * row - (shift[c, n] if len(shift) else 0.0)
+            if fade[0] != 1.0:
+                _fading(Y, fade[1], G)
+                _faded(z, y, fade[0], G)
             _turning(z, y, S, Y, T, A, t, w)
             if project:
                 y[:] = 0.0
@@ -329,7 +421,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
                 for i in range(3):
                     dv[a, i] = 1.0
                     _change(
-                        dv, R, S, Y, T, w, z, y, matrices[c], factor,
+                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fade, raw, G,
                         D, A, B, dT, t, turn, dz, dy, dw, column,
                     )  # fmt: skip
                     dv[a, i] = 0.0
