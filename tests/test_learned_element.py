@@ -1,5 +1,7 @@
 """The learned element with any network: what holds by construction, and how solvers take it."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
@@ -23,7 +25,7 @@ def any_network():
     rng = np.random.default_rng(0)
     sizes = (SIZE, 24, 24, OUTPUTS)
     arrays = {}
-    for i, (n, m) in enumerate(zip(sizes, sizes[1:], strict=False)):
+    for i, (n, m) in enumerate(pairwise(sizes)):
         arrays[f"layers.{2 * i}.weight"] = rng.normal(size=(m, n)) / np.sqrt(n)
         arrays[f"layers.{2 * i}.bias"] = rng.normal(size=m)
     network = learned.Network(arrays)

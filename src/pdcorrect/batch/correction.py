@@ -221,7 +221,7 @@ _OWN = ("raw", "y", "tensor", "w")
 
 
 def _traced(A: Tensor) -> Tensor:
-    """tr A - A."""
+    """Tr A - A."""
     trace = A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
     return trace * torch.eye(3, dtype=A.dtype, device=A.device) - A
 

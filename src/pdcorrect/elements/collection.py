@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import time
+import zipfile
+import zlib
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -33,6 +35,8 @@ def generate(
     make_folder(folder)
     deadline = None if seconds is None else time.monotonic() + seconds
     missing = [n for n, path in enumerate(file_paths(folder, count)) if not path.exists()]
+    if workers == 1:
+        return sum(not _write(folder, seed, n, deadline) for n in missing)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         tasks = [pool.submit(_write, folder, seed, n, deadline) for n in missing]
         return sum(not task.result() for task in as_completed(tasks))
@@ -45,7 +49,7 @@ def read_file(path: Path) -> list[Answers]:
             return [
                 Answers(*(data[f"{i}/{name}"] for name in Answers._fields)) for i in range(A_FILE)
             ]
-    except (OSError, KeyError, ValueError) as error:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: {error}. Delete it and generate again.") from None
 
 

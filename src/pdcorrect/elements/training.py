@@ -27,10 +27,11 @@ from pdcorrect.fem.neighbourhood import CELLS, NODES, SIZE
 
 WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
 _CHECKPOINT = "checkpoint.pt"
-_VALIDATION = 200
+_VALIDATION = 0.05
+"""Bodies that judge the network, of those that it learns from."""
 _DECAY = 1e-4
-_WARM_UP = 200
-"""Iterations."""
+_WARM_UP = 0.01
+"""Of the iterations, over which the learning rate rises."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,8 @@ def train(
         return None if seconds is None else max(0.0, seconds - (time.monotonic() - started))
 
     make_folder(folder)
-    sets = {"training": (recipe.bodies, recipe.seed), "validation": (_VALIDATION, recipe.seed + 1)}
+    judges = max(1, round(_VALIDATION * recipe.bodies))
+    sets = {"training": (recipe.bodies, recipe.seed), "validation": (judges, recipe.seed + 1)}
     for name, (count, seed) in sets.items():
         report(f"{name}: {count} bodies")
         if generate(folder / name, count, seed, workers, left()):
@@ -155,7 +157,9 @@ class Trainer:
         recipe, network = self._recipe, self._network
         for group in self._optimiser.param_groups:
             fall = 0.5 + 0.5 * np.cos(np.pi * self.iteration / recipe.iterations)
-            group["lr"] = recipe.rate * min(1.0, (self.iteration + 1) / _WARM_UP) * fall
+            group["lr"] = float(
+                recipe.rate * min(1.0, (self.iteration + 1) / (_WARM_UP * recipe.iterations)) * fall
+            )
         chosen = self._rng.choice(48, recipe.symmetries, replace=False)
         symmetries = torch.as_tensor(chosen, device=self._device)
         value = loss(errors(batch, *network(batch.features, symmetries)), base).mean()
@@ -251,9 +255,10 @@ def _means(found: Sequence[Errors]) -> dict[str, float]:
 def _samples(folder: Path, count: int, workers: int) -> list[Sample]:
     """Prepared bodies, by several processes."""
     paths = file_paths(folder, count)
+    if workers == 1:
+        return [s for path in paths for s in _of_file(path)][:count]
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        every = [s for part in pool.map(_of_file, paths) for s in part]
-    return every[:count]
+        return [s for part in pool.map(_of_file, paths) for s in part][:count]
 
 
 def _of_file(path: Path) -> list[Sample]:

@@ -21,8 +21,9 @@ class Case:
         "pd" or "newton".
     refine : int
     base : {"plain", "enhanced", "learned", "best", "total-mass"}
-        "enhanced", "learned": element and mass of `best_coarse`, `learned_coarse`.  Others as of `coarse_model`: "best" is
-        what correctors were trained on.  "total-mass" is for the coarse mesh only.
+        "enhanced", "learned": element and mass of `best_coarse`, `learned_coarse`.  Others as of
+        `coarse_model`: "best" is what correctors were trained on.  "total-mass" is for the coarse
+        mesh only.
     model : str or None
         Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
     gate : bool

@@ -15,10 +15,10 @@ has the derivatives
 frame's turning adds, without which forces would have no potential.  Second derivatives are exact
 too.  Everything here counts S and F times a, so that all numbers of z are lengths.
 
-Where two stretches add up to nothing the frame is not defined.  So z counts times a smooth c(d) of
-d = (s_1 + s_2)(s_2 + s_3)(s_3 + s_1) / 8 = det(tr S - S) / 8, which is 1 for d above `FADES` (a cell
-squeezed evenly to two thirds, or to a tenth along one axis) and 0 below `GONE`: cells that are crushed
-or inside out have the element's own energy alone.
+Where two stretches add up to nothing the frame is not defined.  So z counts times a smooth c(d)
+of d = (s_1 + s_2)(s_2 + s_3)(s_3 + s_1) / 8 = det(tr S - S) / 8, which is 1 for d above `FADES`
+(a cell squeezed evenly to two thirds, or to a tenth along one axis) and 0 below `GONE`: cells
+that are crushed or inside out have the element's own energy alone.
 """
 
 from __future__ import annotations

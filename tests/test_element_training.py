@@ -1,0 +1,220 @@
+"""What the learned element is trained on, and its training."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+
+import pdcorrect as pc
+from pdcorrect.elements import collection, training
+from pdcorrect.elements.answers import VoxelMesh, answers
+from pdcorrect.elements.bodies import draw, nodes_of
+from pdcorrect.elements.linear import collate, errors, loss, sample
+from pdcorrect.elements.network import ElementNetwork
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError
+from pdcorrect.fem.learned import SCALARS, STRAINS, read_network
+from pdcorrect.fem.neighbourhood import SIZE
+
+
+def small(seed, most=14):
+    """A random body of few cells, and a generator to go on with."""
+    while True:
+        rng = np.random.default_rng(seed)
+        body = draw(rng)
+        if body.solid.sum() <= most:
+            return body, rng
+        seed += 1000
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Bodies with their answers."""
+    pairs = [small(seed) for seed in range(3)]
+    return [(body, answers(body, rng)) for body, rng in pairs]
+
+
+def test_bodies_hang_together_and_are_held():
+    kinds = set()
+    for seed in range(60):
+        body = draw(np.random.default_rng(seed))
+        kinds.add(body.kind)
+        nodes = nodes_of(body.solid)
+        assert 4 <= body.solid.sum() <= 110
+        assert not (body.held & ~nodes).any()
+        assert 4 <= body.held.sum() <= 0.6 * nodes.sum()
+        mesh = VoxelMesh.of(body.solid)
+        steps = np.abs(np.argwhere(body.solid)[:, None] - np.argwhere(body.solid)[None]).sum(axis=2)
+        reach = np.linalg.matrix_power((steps <= 1).astype(float), 60) > 0
+        assert reach.all()
+        assert len(mesh.places) == nodes.sum()
+        again = draw(np.random.default_rng(seed))
+        assert (again.solid == body.solid).all()
+        assert again.poisson == body.poisson
+    assert len(kinds) == 7
+
+
+def test_the_coarse_model_without_corrections_is_the_best_coarse_one(found):
+    """Its errors are those of `pdcorrect.best_coarse` in statics, to the network's eyes too."""
+    body, answer = found[0]
+    scene = pc.Scene(
+        body={"shape": "voxels", "occupancy": body.solid.astype(int).tolist(), "cell_size": 1.0},
+        material={"young": 1.0, "poisson": body.poisson, "density": 1.0},
+        time={"step": 1.0, "frames": 1}, solver={"element": "hex8-enhanced", "mass": "averaged"},
+    )  # fmt: skip
+    problem = pc.discretise(scene)
+    order = np.lexsort(problem.positions.round(6).T[::-1])
+    assert problem.positions[order].round(6) == pytest.approx(answer.places.astype(float))
+    problem = problem.with_material(young=body.young[body.solid], poisson=body.poisson)
+    K = problem.stiffness(problem.positions).toarray()
+    rows = (3 * order[:, None] + np.arange(3)).ravel()
+    K = K[np.ix_(rows, rows)]
+    free = ~np.repeat(answer.held, 3)
+    expected = []
+    for F, U in zip(answer.forces, answer.displacements, strict=True):
+        u = np.where(free, 0.0, U.ravel())
+        u[free] = np.linalg.solve(K[np.ix_(free, free)], (F.ravel() - K @ u)[free])
+        expected.append(((u - U.ravel()) ** 2).sum() / (U**2).sum())
+    got = errors(collate([sample(answer)]), None, None).displacements[0]
+    assert got[: len(expected)].numpy() == pytest.approx(np.array(expected), rel=1e-4)
+
+
+def test_fine_modes_are_orthonormal_and_balance(found):
+    _, answer = found[1]
+    assert (np.diff(answer.squares) >= 0.0).all()
+    assert answer.squares[0] > 0.0
+    base = errors(collate([sample(answer)]), None, None)
+    assert float(base.squares[0, 0]) < 0.2
+
+
+def test_bodies_of_a_batch_do_not_touch(found):
+    samples = [sample(answer) for _, answer in found]
+    together = errors(collate(samples), None, None)
+    for i, one in enumerate(samples):
+        alone = errors(collate([one]), None, None)
+        for a, b in zip(together, alone, strict=True):
+            assert a[i].numpy() == pytest.approx(b[0].numpy(), rel=1e-8, abs=1e-12)
+
+
+def test_the_loss_has_right_derivatives(found):
+    batch = collate([sample(answer) for _, answer in found])
+    base = errors(batch, None, None)
+    rng = np.random.default_rng(3)
+    count = len(batch.features)
+
+    def symmetric(size):
+        x = 0.2 * torch.as_tensor(rng.normal(size=(count, size, size)))
+        return x + x.mT
+
+    N, H, dN, dH = (symmetric(n) for n in (STRAINS, SCALARS, STRAINS, SCALARS))
+    N.requires_grad_()
+    H.requires_grad_()
+    value = loss(errors(batch, N, H), base).sum()
+    assert not torch.isclose(value, loss(base, base).sum())
+    gradients = torch.autograd.grad(value, (N, H))
+    slope = sum(float((g * d).sum()) for g, d in zip(gradients, (dN, dH), strict=True))
+    with torch.no_grad():
+        ahead, behind = (
+            loss(errors(batch, N + e * dN, H + e * dH), base).sum() for e in (1e-5, -1e-5)
+        )
+    assert slope == pytest.approx(float(ahead - behind) / 2e-5, rel=1e-6)
+
+
+def random_network(seed=0, **sizes):
+    torch.manual_seed(seed)
+    network = ElementNetwork(SIZE, **sizes)
+    torch.nn.init.normal_(network.layers[-1].weight, std=0.1)
+    return network
+
+
+def test_inference_without_torch_agrees(tmp_path):
+    network = random_network(width=20, depth=2)
+    save_file(network.state_dict(), tmp_path / "weights.safetensors")
+    x = torch.rand(6, SIZE)
+    with torch.no_grad():
+        expected = network(x)
+    got = read_network(tmp_path / "weights.safetensors")(x.double().numpy())
+    for a, b in zip(got, expected, strict=True):
+        assert a == pytest.approx(b.numpy(), abs=1e-6)
+
+
+def test_files_that_are_no_weights_are_refused(tmp_path):
+    path = tmp_path / "weights.safetensors"
+    with pytest.raises(FileFormatError):
+        read_network(path)
+    save_file(random_network(width=8, depth=1).state_dict(), path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(FileFormatError):
+        read_network(path)
+    torch.manual_seed(0)
+    save_file(ElementNetwork(SIZE - 1, 8, 1).state_dict(), path)
+    with pytest.raises(FileVersionError, match=str(SIZE)):
+        read_network(path)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Two small bodies in a file."""
+    monkeypatch.setattr(collection, "A_FILE", 2)
+    monkeypatch.setattr(collection, "draw", lambda rng: small(int(rng.integers(100)))[0])
+
+
+RECIPE = training.ElementRecipe(bodies=4, width=16, depth=2, iterations=6, batch=2, symmetries=4)
+
+
+def run(recipe, folder, **options):
+    torch.set_num_threads(1)
+    return training.train(recipe, folder, report=lambda _: None, **options)
+
+
+def test_training_learns_and_writes_what_the_element_reads(few, tmp_path):
+    recipe = training.ElementRecipe(**{**vars(RECIPE), "iterations": 30})
+    lines = []
+    assert training.train(recipe, tmp_path, report=lines.append)
+    card = json.loads((tmp_path / training.CARD).read_text())
+    assert card["recipe"]["bodies"] == 4
+    network = read_network(tmp_path / training.WEIGHTS)
+    assert network.shape[0] == SIZE
+    losses = [float(line.split("loss ")[1].split(",")[0]) for line in lines if "loss" in line]
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_an_interrupted_training_goes_on_as_if_it_had_not_been(few, tmp_path, monkeypatch):
+    assert run(RECIPE, tmp_path / "whole")
+    epoch = training.Trainer.epoch
+
+    def stops(self, seconds=None):
+        if self.iteration >= 2:
+            raise KeyboardInterrupt
+        epoch(self, seconds)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(training.Trainer, "epoch", stops)
+        with pytest.raises(KeyboardInterrupt):
+            run(RECIPE, tmp_path / "parts")
+    assert run(RECIPE, tmp_path / "parts")
+    whole, parts = (
+        (tmp_path / name / training.WEIGHTS).read_bytes() for name in ("whole", "parts")
+    )
+    assert whole == parts
+
+
+def test_time_that_is_up_and_other_recipes(few, tmp_path):
+    assert not run(RECIPE, tmp_path, seconds=0.0)
+    assert run(RECIPE, tmp_path)
+    other = training.ElementRecipe(**{**vars(RECIPE), "rate": 1e-4})
+    with pytest.raises(InputError, match="recipe"):
+        run(other, tmp_path)
+
+
+def test_damaged_bodies_are_named(few, tmp_path):
+    assert run(RECIPE, tmp_path)
+    path = collection.file_paths(tmp_path / "training", 4)[1]
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 400] = bytes(400)
+    path.write_bytes(content)
+    (tmp_path / "checkpoint.pt").unlink()
+    with pytest.raises(InputError, match=path.name):
+        run(RECIPE, tmp_path)
