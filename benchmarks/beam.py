@@ -133,6 +133,34 @@ def integrator(
     }
 
 
+def elements(width: str, height: str, length: str, rounds: str = "5") -> dict[str, Any]:
+    """Milliseconds of a set-up and of a step with the best coarse and the learned element.
+
+    By generalised-alpha at the default tolerance; runs of both in turn, the shortest medians.
+    """
+    scene = beam(int(length), "ours", 30).with_changes(
+        body={"cells": [int(length), int(width), int(height)]},
+        time={"integrator": "generalised-alpha"},
+    )
+    kinds = {"best": pc.best_coarse(scene), "learned": pc.learned_coarse(scene)}
+    row: dict[str, Any] = {}
+    for name, kind in kinds.items():
+        pc.discretise(kind)  # compiles
+        row[f"{name}_setup_ms"] = 1e3 * best(lambda kind=kind: pc.discretise(kind), runs=5)
+    steppers = {n: pc.ProjectiveDynamics(pc.discretise(k)).prepare() for n, k in kinds.items()}
+    medians: dict[str, list[float]] = {name: [] for name in kinds}
+    for _ in range(int(rounds)):
+        for name, stepper in steppers.items():
+            run = pc.rollout(stepper)
+            medians[name].append(1e3 * float(np.median(run.stats["seconds"][2:])))
+            row[f"{name}_iterations"] = float(np.mean(run.stats["iterations"][2:]))
+    problem = steppers["best"].problem
+    row = {"nodes": len(problem.positions), "cells": len(problem.cells), **row}
+    for name, found in medians.items():
+        row[f"{name}_ms"] = min(found)
+    return {**row, "ratio": row["learned_ms"] / row["best_ms"]}
+
+
 def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[str, Any]:
     """Milliseconds of one iteration of L-BFGS with a full history, without the error estimate."""
     from pdcorrect.solvers.first_hessian import TrueHessian

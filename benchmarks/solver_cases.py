@@ -197,10 +197,20 @@ def integrators() -> list[dict[str, Any]]:
     return rows
 
 
+def elements() -> list[dict[str, Any]]:
+    """A step with the learned element beside the best coarse one, two threads."""
+    sizes = ((2, 2, 24), (2, 8, 18), (8, 8, 24))
+    return [
+        {"threads": 2, "tolerance": 1e-5, **measure(2, "elements", width=a, height=b, length=c)}
+        for a, b, c in sizes
+    ]
+
+
 CASES: dict[str, Callable[[], Any]] = {
     "kernel": kernel,
     "beam_steps": beam_steps,
     "integrators": integrators,
+    "elements": elements,
     "iteration": iteration,
     "newton": newton,
     "memory": memory,

@@ -211,6 +211,33 @@ def test_viscosity_is_of_the_whole_stiffness():
     assert blocks == pytest.approx(objective.viscous.rate * K, abs=1e-9 * np.abs(blocks).max())
 
 
+@pytest.mark.parametrize(
+    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
+)
+def test_derivatives_by_the_matrices(damping):
+    problem = learned_problem(beam((3, 2, 2), damping=damping))
+    rng = np.random.default_rng(10)
+    start = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 3)
+    state = pc.State(start.positions[-1], start.velocities[-1], 0.0)
+    g = rng.normal(size=problem.positions.shape)
+    own = problem.correction
+    dK = 0.1 * np.abs(own.matrices).max() * rng.normal(size=own.matrices.shape)
+    dM = 0.1 * np.abs(own.masses).max() * rng.normal(size=own.masses.shape)
+    dK, dM = dK + np.swapaxes(dK, 1, 2), dM + np.swapaxes(dM, 1, 2)
+
+    def after(t):
+        changed = problem.with_correction(own.matrices + t * dK, own.masses + t * dM)
+        stepper = pc.ProjectiveDynamics(changed, tolerance=1e-12)
+        return stepper, stepper(state)
+
+    stepper, result = after(0.0)
+    gradients = pc.adjoint(stepper, state, result, g, tolerance=1e-10)
+    expected = np.vdot(gradients.matrices, dK) + np.vdot(gradients.masses, dM)
+    values = [np.vdot(g, after(t)[1].state.positions) for t in (1e-2, -1e-2, 2e-2, -2e-2)]
+    found = (8 * (values[0] - values[1]) - (values[2] - values[3])) / 0.12
+    assert expected == pytest.approx(found, rel=1e-4)
+
+
 def test_modes_are_of_both_corrections():
     problem = learned_problem(beam())
     plain = pc.discretise(pc.best_coarse(beam()))

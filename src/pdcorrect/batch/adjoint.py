@@ -243,21 +243,20 @@ class BatchGradients:
             by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, -self.x)
             more = self._damping.weights
             by_mu, by_omega = by_mu + more[0], by_omega + more[1]
-            if self._stepper.cells.correction is not None:
-                for more in self._written():
-                    by_mu, by_omega = by_mu + more[0], by_omega + more[1]
+            if self._damping.written is not None:
+                more = self._written(self._damping.written)
+                by_mu, by_omega = by_mu + more[0], by_omega + more[1]
             return by_mu * self._rule.has_shear_term, by_omega * self._rule.has_volume_term
 
-    def _written(self) -> list[tuple[Tensor, Tensor]]:
+    def _written(self, written: Written) -> tuple[Tensor, Tensor]:
         """Through what learned elements are written from, by mu and omega, (B, C)."""
-        stage, stepper, written = self._stage, self._stepper, Written(self._stepper)
-        offset = self._factors[0] * (self._y - stage.target)
-        parts = [written.forces(self._y, -self.x), written.inertia(-self._push, offset)]
+        stage, stepper = self._stage, self._stepper
+        written.add_forces(self._y, -self.x)
+        written.add_inertia(-self._push, self._factors[0] * (self._y - stage.target))
         if stepper.objective.damped:
             origin = stepper.staging.extended(stage.origin)
-            offset = self._factors[1] * (self._y - origin)
-            parts.append(written.inertia(-self.x, offset))
-        return parts
+            written.add_inertia(-self.x, self._factors[1] * (self._y - origin))
+        return written.weights(self.x)
 
     @property
     def _rule(self) -> Material:

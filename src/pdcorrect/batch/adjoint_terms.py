@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +14,6 @@ from pdcorrect.batch.modes import Following, relaxed
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.step_equation import BatchStepEquation
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.fem.cell_correction import CellCorrection
 
 Array = NDArray[np.float64]
 
@@ -27,6 +25,8 @@ _PLACES, _FACTORS = (1, -1, 2, -2), (8.0, -8.0, -1.0, 1.0)
 class Written:
     """Derivatives through what learned elements are written from, scene by scene on the CPU.
 
+    Those by matrices and masses are gathered; `weights` pulls them back at once.
+
     Parameters
     ----------
     stepper : BatchStepper
@@ -34,66 +34,53 @@ class Written:
 
     def __init__(self, stepper: BatchStepper) -> None:
         self._stepper = stepper
-        self._corrections = stepper.corrections() if stepper.cells.correction else []
+        self._corrections = stepper.corrections()
         material = stepper.present
         self._mu, self._omega, self._density = (
             m.to("cpu", torch.float64).numpy()
             for m in (material.mu, material.volume_weight, material.density)
         )
+        self._matrices = [np.zeros_like(c.matrices) for c in self._corrections]
+        self._masses = [np.zeros_like(c.masses) for c in self._corrections]
 
-    def forces(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Of x . dW/dy by mu and omega, (B, C), for (B, U, 3)."""
+    def add_forces(self, y: Tensor, x: Tensor) -> None:
+        """Of x . dW/dy, for (B, U, 3)."""
+        for i, c in enumerate(self._corrections):
+            self._matrices[i] += c.matrix_slopes(self._moved(y, i), self._nodal(x, i))
 
-        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
-            return c.matrix_slopes(self._moved(y, i), self._nodal(x, i)), None
-
-        return self._each(y, slopes)
-
-    def inertia(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Of a . M b by mu and omega, (B, C), for (B, U, 3)."""
-
-        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+    def add_inertia(self, a: Tensor, b: Tensor) -> None:
+        """Of a . M b, for (B, U, 3)."""
+        for i, c in enumerate(self._corrections):
             density = self._density[i, : len(c.cells), None, None]
             local = self._nodal(a, i)[c.cells], self._nodal(b, i)[c.cells]
-            return None, density * np.einsum("cki,cli->ckl", *local)
+            self._masses[i] += density * np.einsum("cki,cli->ckl", *local)
 
-        return self._each(a, slopes)
-
-    def products(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """Of a . K b by mu and omega, (B, C), for strains (B, C, 18)."""
-
-        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
+    def add_products(self, a: Tensor, b: Tensor) -> None:
+        """Of a . K b, for strains (B, C, 18)."""
+        for i, c in enumerate(self._corrections):
             left, right = (x[i, : len(c.cells)].to("cpu", torch.float64).numpy() for x in (a, b))
-            return 0.5 * (
-                left[:, :, None] * right[:, None] + right[:, :, None] * left[:, None]
-            ), None
+            both = left[:, :, None] * right[:, None]
+            self._matrices[i] += 0.5 * (both + np.swapaxes(both, 1, 2))
 
-        return self._each(a, slopes)
-
-    def tangents(self, y: Tensor, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Of x . K z, K projected at y: by y (B, U, 3), and by mu and omega, (B, C)."""
+    def add_tangents(self, y: Tensor, x: Tensor, z: Tensor, factor: float) -> Tensor:
+        """Of factor x . K z, K projected at y; without the factor by y, (B, U, 3)."""
         by_y = torch.zeros_like(y)
-
-        def slopes(c: CellCorrection, i: int) -> tuple[Array | None, Array | None]:
-            along, across = self._nodal(x, i), self._nodal(z, i)
-            found, by_matrices = c.tangent_slopes(self._moved(y, i), along, across)
+        for i, c in enumerate(self._corrections):
+            fields = self._moved(y, i), self._nodal(x, i), self._nodal(z, i)
+            found, by_matrices = c.tangent_slopes(*fields)
             by_y[i, : len(found)] = torch.as_tensor(found).to(y)
-            return by_matrices, None
+            self._matrices[i] += factor * by_matrices
+        return by_y
 
-        by_mu, by_omega = self._each(y, slopes)
-        return by_y, by_mu, by_omega
-
-    def _each(
-        self,
-        like: Tensor,
-        slopes: Callable[[CellCorrection, int], tuple[Array | None, Array | None]],
-    ) -> tuple[Tensor, Tensor]:
+    def weights(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """All of them by mu and omega, (B, C)."""
         found = np.zeros((2, *self._mu.shape))
         for i, c in enumerate(self._corrections):
             if c.writer is not None:
                 count = len(c.cells)
-                mu, omega = self._mu[i, :count], self._omega[i, :count]
-                found[:, i, :count] = c.writer.slopes(mu, omega, *slopes(c, i))
+                weights = self._mu[i, :count], self._omega[i, :count]
+                slopes = c.writer.slopes(*weights, self._matrices[i], self._masses[i])
+                found[:, i, :count] = slopes
         by_mu, by_omega = (torch.as_tensor(f).to(like) for f in found)
         return by_mu, by_omega
 
@@ -121,7 +108,7 @@ class DampingTerms:
     ) -> None:
         objective = stepper.objective
         self._stepper, self._cells, self._x = stepper, stepper.cells, x
-        self._written = Written(stepper)
+        self.written = Written(stepper) if stepper.cells.correction is not None else None
         self._stiff, self._viscous = objective.stiff, objective.viscous
         self.has_rayleigh = objective.damped or objective.stiff
         _, _, self._stiffness, self._rate = objective.factors.clone()
@@ -178,9 +165,8 @@ class DampingTerms:
         if self._viscous:
             slopes = viscosity.stress_slopes(self._cells, self._change, self._rates)
             total = [-self._rate * slope for slope in slopes]
-            if self._against is not None:
-                more = self._written.products(-self._rate * self._written_rates, self._against)
-                total = [a + b for a, b in zip(total, more, strict=True)]
+            if self._against is not None and self.written is not None:
+                self.written.add_products(-self._rate * self._written_rates, self._against)
             for (_, place), slope in zip(self._strains, self._by_strains, strict=True):
                 total = self._with_modes(total, place, slope)
         if self._stiff:
@@ -264,10 +250,12 @@ class DampingTerms:
             share = torch.where(unit[term] > 0.0, cells.volumes[term] / unit[term], 0.0)
             found.append((change * share).reshape(n.scenes, n.cells, n.points).sum(dim=2))
         by_place, by_mu, by_omega = cells.gathered(slope / step), found[0], found[1]
-        if cells.correction is None:
-            return by_place, by_mu, by_omega
-        more = self._written.tangents(self._at, self._x, self._offset)
-        return by_place + more[0], by_mu + more[1], by_omega + more[2]
+        if self.written is not None:
+            more = self.written.add_tangents(
+                self._at, self._x, self._offset, -float(self._stiffness)
+            )
+            by_place = by_place + more
+        return by_place, by_mu, by_omega
 
     @staticmethod
     def _difference(function) -> Tensor:  # type: ignore[no-untyped-def]

@@ -228,6 +228,38 @@ class Problem(ElasticBody):
             raise InputError(f"total mass {mass} kg: expected a positive number.")
         return self.with_material(density=mass / self.mass.sum() * self.materials.density)
 
+    def with_correction(
+        self, matrices: Array | None = None, masses: Array | None = None
+    ) -> Problem:
+        """The same problem of element "hex8-learned" with other matrices in its cells.
+
+        Parameters
+        ----------
+        matrices : (C, 18, 18), optional
+            Of 1/2 z . K z, N/m, symmetric, see `pdcorrect.fem.turned_strains`.
+        masses : (C, 8, 8), optional
+            At density 1, m3, symmetric; rows that add up to zero keep the mass of each node.
+
+        Raises
+        ------
+        InputError
+            If the element is another one, or an array has another shape.
+        """
+        own = self.correction
+        if own is None:
+            raise InputError(f"element {self.element!r}: expected 'hex8-learned'.")
+        given = {"matrices": matrices, "masses": masses}
+        found = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
+        for name, array in found.items():
+            if array.shape != getattr(own, name).shape:
+                raise InputError(
+                    f"{name} {array.shape}: expected {getattr(own, name).shape}, one a cell."
+                )
+        correction = replace(own, writer=None, **found)
+        density = self.materials.density[:, None, None]
+        more = summed_cells(self.cells, density * (correction.masses - own.masses), len(self.mass))
+        return replace(self, correction=correction, mass_matrix=self.mass_matrix + more)
+
     def with_loads(self, loads: Sequence[Load | Mapping[str, Any]]) -> Problem:
         """The same problem under other loads, each as in a scene's ``loads``.
 

@@ -26,7 +26,8 @@ for differences of fourth order of tangents."""
 def weight_slopes(body: ElasticBody, configuration: Array, x: Array) -> tuple[Array, Array]:
     """Derivatives of x . dW/dy by each cell's mu and omega, two (C,), N m/Pa.
 
-    ``configuration`` y and x are (N + B, 3).
+    Of the element alone, without what a learned one adds.  ``configuration`` y and x are
+    (N + B, 3).
     """
     quadrature, assembly = body.quadrature, body.assembly
     u = configuration - body.extended(body.positions)
@@ -41,20 +42,7 @@ def weight_slopes(body: ElasticBody, configuration: Array, x: Array) -> tuple[Ar
             np.empty_like(u),
         )  # fmt: skip
         out.append(-np.einsum("cki,cki->c", by_cell, x[assembly.cells]))
-    if body.correction is not None:
-        more = written_slopes(body, body.correction.matrix_slopes(u, x))
-        out = [a + b for a, b in zip(out, more, strict=True)]
     return out[0], out[1]
-
-
-def written_slopes(
-    body: ElasticBody, by_matrices: Array | None, by_masses: Array | None = None
-) -> tuple[Array, Array]:
-    """Derivatives by mu and omega, (C,), through what a learned element was written from."""
-    correction, materials = body.correction, body.materials
-    if correction is None or correction.writer is None:
-        return np.zeros(len(body.cells)), np.zeros(len(body.cells))
-    return correction.writer.slopes(materials.mu, materials.volume_weight, by_matrices, by_masses)
 
 
 def tangent_slopes(
@@ -63,7 +51,8 @@ def tangent_slopes(
     """Derivatives of x . K z, K the projected tangent at y: by y, mu and omega.
 
     (N + B, 3), N; and two (C,), N m/Pa, for x and z (N + B, 3).  By differences at each
-    quadrature point, since projecting is not linear.
+    quadrature point, since projecting is not linear.  Of the element alone, without what a
+    learned one adds.
     """
     cells, gradients = body.space.local, body.quadrature.gradients
     u = configuration - body.extended(body.positions)
@@ -92,12 +81,7 @@ def tangent_slopes(
     by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
     flat = cells.ravel()
     by_shape = [np.bincount(flat, by_cell[..., i].ravel(), minlength=len(x)) for i in range(3)]
-    slopes: Array = np.stack(by_shape, axis=1)
-    if body.correction is not None:
-        more, by_matrices = body.correction.tangent_slopes(u, x, z)
-        written = written_slopes(body, by_matrices)
-        slopes, by_mu, by_omega = slopes + more, by_mu + written[0], by_omega + written[1]
-    return slopes, by_mu, by_omega
+    return np.stack(by_shape, axis=1), by_mu, by_omega
 
 
 def _difference(function) -> Array:  # type: ignore[no-untyped-def]

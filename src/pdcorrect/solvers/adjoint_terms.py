@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes, written_slopes
+from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress, stress_slopes
 from pdcorrect.solvers.damping import Rayleigh, Viscous
 
@@ -117,14 +117,30 @@ class RayleighTerm:
     def _at(self) -> Following:
         return Following(self._problem, self._damping.at)
 
+    @property
+    def matrices(self) -> Array | float:
+        """By a learned element's matrices, (C, 18, 18)."""
+        written = self._damping.stiffness and self._written
+        return -self._damping.stiffness * written[1] if written else 0.0
+
     @cached_property
     def _slopes(self) -> tuple[Array, Array, Array]:
         return tangent_slopes(self._problem, self._damping.at, self._x, self._offset)
 
     @cached_property
+    def _written(self) -> tuple[Array, Array] | None:
+        """What a learned element adds, see `CellCorrection.tangent_slopes`."""
+        problem, correction = self._problem, self._problem.correction
+        if correction is None:
+            return None
+        u = self._damping.at - problem.extended(problem.positions)
+        return correction.tangent_slopes(u, self._x, self._offset)
+
+    @cached_property
     def _by_place(self) -> Array:
         """By the configuration there."""
-        return -self._damping.stiffness * self._slopes[0]
+        slopes = self._slopes[0] if self._written is None else self._slopes[0] + self._written[0]
+        return -self._damping.stiffness * slopes
 
 
 class ViscousTerm:
@@ -156,11 +172,13 @@ class ViscousTerm:
         for place, following, slope in places:
             more = weight_slopes(self._problem, place, -following.response(slope))
             total = [a + b for a, b in zip(total, more, strict=True)]
-        if self._damping.written is not None:
-            by_matrices = -0.5 * self._damping.rate * self._written[1]
-            more = written_slopes(self._problem, by_matrices)
-            total = [a + b for a, b in zip(total, more, strict=True)]
         return total[0], total[1]
+
+    @property
+    def matrices(self) -> Array | float:
+        """By a learned element's matrices, (C, 18, 18)."""
+        written = self._damping.written
+        return 0.0 if written is None else -0.5 * self._damping.rate * self._written[1]
 
     @cached_property
     def _written(self) -> tuple[list[Array], Array]:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.sensitivities import weight_slopes, written_slopes
+from pdcorrect.fem.cell_correction import CellCorrection
+from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
     AdjointOperator,
@@ -215,6 +216,51 @@ class Gradients:
         out -= stage.inertia * mass_slope(problem, x, offset)
         return out if self._rayleigh is None else out + self._rayleigh.density
 
+    @cached_property
+    def matrices(self) -> Array:
+        """By the matrices K of a learned element, (C, 18, 18), m/N.
+
+        The derivatives by the moduli include what it writes from them.
+
+        Raises
+        ------
+        InputError
+            If the problem has none.
+        """
+        correction, problem = self._learned, self._problem
+        u = self._y - problem.extended(problem.positions)
+        out = correction.matrix_slopes(u, -self.x)
+        for term in (self._rayleigh, self._viscous):
+            if term is not None:
+                out = out + term.matrices
+        return out
+
+    @cached_property
+    def masses(self) -> Array:
+        """By its masses at density 1, (C, 8, 8), 1/m3.
+
+        Raises
+        ------
+        InputError
+            If the problem has none.
+        """
+        stage, problem, x = self._objective.stage, self._problem, self._nodal
+        out = np.zeros_like(self._learned.masses)
+        pairs = [(x, stage.inertia * (self._y[: len(x)] - stage.target))]
+        if self._rayleigh is not None:
+            pairs.append((self.x[: len(x)], self._rayleigh.mass_offset))
+        for a, b in pairs:
+            out -= np.einsum("cki,cli->ckl", a[problem.cells], b[problem.cells])
+        return problem.materials.density[:, None, None] * out
+
+    @property
+    def _learned(self) -> CellCorrection:
+        if self._problem.correction is None:
+            raise InputError(
+                f"element {self._problem.element!r}: expected 'hex8-learned', which has matrices."
+            )
+        return self._problem.correction
+
     # --- by damping ---------------------------------------------------------------------
 
     @property
@@ -326,26 +372,14 @@ class Gradients:
         problem = self._problem
         parts = [weight_slopes(problem, self._y, -self.x)]
         parts += [term.weights for term in (self._rayleigh, self._viscous) if term is not None]
-        parts.append(written_slopes(problem, None, self._by_masses))
+        correction, materials = problem.correction, problem.materials
+        if correction is not None and correction.writer is not None:
+            weights = materials.mu, materials.volume_weight
+            parts.append(correction.writer.slopes(*weights, self.matrices, self.masses))
         rule = problem.scene.material
         by_mu = np.sum([part[0] for part in parts], axis=0)
         by_omega = np.sum([part[1] for part in parts], axis=0)
         return by_mu * rule.has_shear_term, by_omega * rule.has_volume_term
-
-    @property
-    def _by_masses(self) -> Array | None:
-        """By the masses that a learned element writes, (C, 8, 8), kg/m3."""
-        problem = self._problem
-        if problem.correction is None:
-            return None
-        stage, x = self._objective.stage, self._nodal
-        pairs = [(x, stage.inertia * (self._y[: len(x)] - stage.target))]
-        if self._rayleigh is not None:
-            pairs.append((self.x[: len(x)], self._rayleigh.mass_offset))
-        out = np.zeros((len(problem.cells), 8, 8))
-        for a, b in pairs:
-            out -= np.einsum("cki,cli->ckl", a[problem.cells], b[problem.cells])
-        return problem.materials.density[:, None, None] * out
 
     @property
     def _moduli_slopes(self) -> tuple[tuple[Array, Array], ...]:
