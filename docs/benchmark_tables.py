@@ -8,9 +8,14 @@ from typing import Any
 from records import Rows, number, read
 
 RESULTS = "benchmarks/results"
-AMD, INTEL, H200 = (
+AMD, INTEL, H200, H100 = (
     f"{RESULTS}/{name}.json"
-    for name in ("amd-epyc-2cores", "intel-r-xeon-r-processor-2cores", "nvidia-h200")
+    for name in (
+        "amd-epyc-2cores",
+        "intel-r-xeon-r-processor-2cores",
+        "nvidia-h200",
+        "nvidia-h100-80gb-hbm3",
+    )
 )
 TOLERANCE = 1e-4
 """Of the cell size, of our steps beside DiffPD's."""
@@ -96,6 +101,31 @@ def batches() -> Rows:
     return head, rows
 
 
+def batch_integrators() -> Rows:
+    """Steps and derivatives of a batch by integrator."""
+    rows = [
+        [
+            row["integrator"], number(row["step_ms"]), number(row["backward_ms"]),
+            number(row["iterations"], 2), number(row["memory_bytes"] / 1e9, 2),
+        ]
+        for row in results_of(H100, "batch integrators")
+    ]  # fmt: skip
+    return ("integrator", "step, ms", "derivative, ms", "iterations", "memory, GB"), rows
+
+
+def elements() -> Rows:
+    """A step with the learned element over one with the best coarse one."""
+    rows = [
+        [
+            str(row["nodes"]), number(row["best_ms"]), number(row["learned_ms"]),
+            number(row["ratio"], 2), number(row["best_setup_ms"]), number(row["learned_setup_ms"]),
+        ]
+        for row in results_of(AMD, "elements")
+    ]  # fmt: skip
+    head = ("nodes", "best coarse, ms", "learned, ms", "ratio", "set-up, ms", "learned, ms")
+    return head, rows
+
+
 def _cell(row: dict[str, Any] | None, key: str) -> str:
     return "" if row is None else number(row[key])
 
@@ -142,5 +172,6 @@ def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "peer": peer, "derivatives": derivatives, "integrators": integrators, "batches": batches,
+        "batch-integrators": batch_integrators, "elements": elements,
         "corrected-steps": corrected_steps, "networks": networks, "reading": reading,
     }.items()  # fmt: skip

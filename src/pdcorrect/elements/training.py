@@ -57,8 +57,8 @@ class ElementRecipe:
     seed: int = 45
     width: int = 256
     depth: int = 3
-    iterations: int = 30_000
-    batch: int = 16
+    iterations: int = 60_000
+    batch: int = 8
     symmetries: int = 8
     rate: float = 2e-3
 
