@@ -14,7 +14,7 @@ from pdcorrect.elements.bodies import draw, nodes_of
 from pdcorrect.elements.linear import collate, errors, loss, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
-from pdcorrect.fem.learned import SCALARS, STRAINS, read_network
+from pdcorrect.fem.element_network import SCALARS, STRAINS, read_network
 from pdcorrect.fem.neighbourhood import SIZE
 
 

@@ -9,7 +9,7 @@ import torch
 import pdcorrect as pc
 from conftest import beam, cross, problem_on
 from pdcorrect.errors import PdcorrectWarning, SceneError
-from pdcorrect.fem import learned
+from pdcorrect.fem import element_network, learned
 from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.neighbourhood import SIZE, permutations
@@ -28,9 +28,9 @@ def any_network():
     for i, (n, m) in enumerate(pairwise(sizes)):
         arrays[f"layers.{2 * i}.weight"] = rng.normal(size=(m, n)) / np.sqrt(n)
         arrays[f"layers.{2 * i}.bias"] = rng.normal(size=m)
-    network = learned.Network(arrays)
+    network = element_network.Network(arrays)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(learned, "released", lambda: network)
+        patch.setattr(element_network, "released", lambda: network)
         yield network
 
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from pdcorrect.fem.learned import SCALARS, STRAINS, halves
+from pdcorrect.fem.element_network import SCALARS, STRAINS, halves
 from pdcorrect.fem.neighbourhood import permutations
 
 

@@ -348,10 +348,11 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
 
 
 def _learned(body: ElasticBody, clamps: Clamps) -> CellCorrection:
-    from pdcorrect.fem import learned  # the network only where it is needed
+    from pdcorrect.fem import element_network  # the network only where it is needed
+    from pdcorrect.fem.learned import ElementWriter
 
     materials = body.materials
-    writer = learned.ElementWriter(learned.released(), body, clamps.free)
+    writer = ElementWriter(element_network.released(), body, clamps.free)
     found = writer.correction(materials.mu, materials.volume_weight)
     count = int((~found.learned).sum())
     if count:
