@@ -199,11 +199,14 @@ class Trainer:
 
     def card(self, device: str) -> dict[str, Any]:
         """What is written beside the weights."""
+        recipe = self._recipe
         return {
             "format": 1,
+            "command": f"pdcorrect train-element --bodies {recipe.bodies} --iterations "
+            f"{recipe.iterations} --seed {recipe.seed}",
             "window": {"cells": CELLS, "nodes": NODES},
             "largest_poisson": LARGEST_POISSON,
-            "recipe": asdict(self._recipe),
+            "recipe": asdict(recipe),
             "validation": self.measured(),
             "device": device,
             "environment": environment(),
