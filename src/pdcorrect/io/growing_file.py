@@ -213,6 +213,13 @@ class GrowingFile:
         with self._reporting():
             self._write(entries)
 
+    @property
+    def complete(self) -> int:
+        """Records that the file has, also where a signal came before the last was counted."""
+        if self._broken or not self._file:
+            return self.records
+        return len(self._file[self._counter])
+
     def close(self) -> None:
         """Finish the file; harmless when repeated."""
         if not self._broken and self._file:

@@ -168,7 +168,7 @@ class TrajectoryWriter:
     @property
     def steps(self) -> int:
         """Steps in the file, the initial state not counted."""
-        return self._file.records - 1
+        return self._file.complete - 1
 
     def __enter__(self) -> TrajectoryWriter:
         return self
