@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
+from torch.nn.functional import silu
+from torch_geometric.nn import RGCNConv
 
 import pdcorrect as pc
 from pdcorrect.elements import collection, training
@@ -15,7 +17,7 @@ from pdcorrect.elements.linear import collate, errors, loss, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.fem.element_network import SCALARS, STRAINS, read_network
-from pdcorrect.fem.neighbourhood import SIZE
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, cell_graph, permutations
 
 
 def small(seed, most=14):
@@ -101,7 +103,7 @@ def test_the_loss_has_right_derivatives(found):
     batch = collate([sample(answer) for _, answer in found])
     base = errors(batch, None, None)
     rng = np.random.default_rng(3)
-    count = len(batch.features)
+    count = len(batch.numbers)
 
     def symmetric(size):
         x = 0.2 * torch.as_tensor(rng.normal(size=(count, size, size)))
@@ -123,18 +125,46 @@ def test_the_loss_has_right_derivatives(found):
 
 def random_network(seed=0, **sizes):
     torch.manual_seed(seed)
-    network = ElementNetwork(SIZE, **sizes)
-    torch.nn.init.normal_(network.layers[-1].weight, std=0.1)
+    network = ElementNetwork(**sizes)
+    torch.nn.init.normal_(network.last.weight, std=0.1)
     return network
 
 
-def test_inference_without_torch_agrees(tmp_path):
-    network = random_network(width=20, depth=2)
-    save_file(network.state_dict(), tmp_path / "weights.safetensors")
-    x = torch.rand(6, SIZE)
+def body_graph(answer):
+    index = answer.places[answer.cells[:, 0]]
+    poisson = np.full(len(index), float(answer.poisson))
+    return cell_graph(index, answer.young, poisson, answer.held[answer.cells].astype(float))
+
+
+def test_a_round_is_a_relational_graph_convolution(found):
+    """That of PyTorch Geometric, with a relation for each place of a neighbour."""
+    network = random_network(width=6, rounds=1).double()
+    graph = body_graph(found[1][1])
+    numbers, neighbours = (torch.as_tensor(x) for x in graph)
+    own, around = (torch.as_tensor(p[5]) for p in permutations())
+    table = neighbours[:, around]
+    target, relation = (table < len(table)).nonzero().T
+    convolution = RGCNConv(6, 6, NEIGHBOURS, aggr="sum", root_weight=False).double()
+    linear = network.rounds[0]
     with torch.no_grad():
-        expected = network(x)
-    got = read_network(tmp_path / "weights.safetensors")(x.double().numpy())
+        convolution.weight.copy_(linear.weight.T.reshape(NEIGHBOURS, 6, 6))
+        convolution.bias.copy_(linear.bias)
+        x = silu(network.first(numbers[:, own]))
+        edges = torch.stack([table[target, relation], target])
+        expected = x + silu(convolution(network.norms[0](x), edges, relation))
+        kept = []
+        network.hidden.register_forward_hook(lambda _, given, out: kept.append(given[0][:, 0, :6]))
+        network(numbers, neighbours, torch.tensor([5]))
+    assert kept[0].numpy() == pytest.approx(expected.numpy(), abs=1e-12)
+
+
+def test_inference_without_torch_agrees(found, tmp_path):
+    network = random_network(width=20, rounds=2)
+    save_file(network.state_dict(), tmp_path / "weights.safetensors")
+    graph = body_graph(found[0][1])
+    with torch.no_grad():
+        expected = network(*(torch.as_tensor(x) for x in (graph.numbers.astype("f4"), graph[1])))
+    got = read_network(tmp_path / "weights.safetensors")(graph)
     for a, b in zip(got, expected, strict=True):
         assert a == pytest.approx(b.numpy(), abs=1e-6)
 
@@ -143,12 +173,14 @@ def test_files_that_are_no_weights_are_refused(tmp_path):
     path = tmp_path / "weights.safetensors"
     with pytest.raises(FileFormatError):
         read_network(path)
-    save_file(random_network(width=8, depth=1).state_dict(), path)
+    save_file(random_network(width=8, rounds=1).state_dict(), path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(FileFormatError):
         read_network(path)
     torch.manual_seed(0)
-    save_file(ElementNetwork(SIZE - 1, 8, 1).state_dict(), path)
+    network = ElementNetwork(8, 1)
+    network.first = torch.nn.Linear(SIZE - 1, 8)
+    save_file(network.state_dict(), path)
     with pytest.raises(FileVersionError, match=str(SIZE)):
         read_network(path)
 
@@ -160,7 +192,7 @@ def few(monkeypatch):
     monkeypatch.setattr(collection, "draw", lambda rng: small(int(rng.integers(100)))[0])
 
 
-RECIPE = training.ElementRecipe(bodies=4, width=16, depth=2, iterations=6, batch=2, symmetries=4)
+RECIPE = training.ElementRecipe(bodies=4, width=8, rounds=2, iterations=6, batch=2, symmetries=4)
 
 
 def run(recipe, folder, **options):

@@ -1,7 +1,5 @@
 """The learned element with any network: what holds by construction, and how solvers take it."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,7 @@ from pdcorrect.errors import PdcorrectWarning, SceneError
 from pdcorrect.fem import element_network, learned
 from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
-from pdcorrect.fem.neighbourhood import SIZE, permutations
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, CellGraph, cell_graph, permutations
 from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.step import StepObjective
 
@@ -23,11 +21,12 @@ OUTPUTS = 171 + 28
 def any_network():
     """Weights at random, with answers as large as bounds allow."""
     rng = np.random.default_rng(0)
-    sizes = (SIZE, 24, 24, OUTPUTS)
-    arrays = {}
-    for i, (n, m) in enumerate(pairwise(sizes)):
-        arrays[f"layers.{2 * i}.weight"] = rng.normal(size=(m, n)) / np.sqrt(n)
-        arrays[f"layers.{2 * i}.bias"] = rng.normal(size=m)
+    sizes = {"first": (SIZE, 12), "hidden": (24, 24), "last": (24, OUTPUTS)}
+    sizes |= {f"rounds.{n}": (NEIGHBOURS * 12, 12) for n in range(2)}
+    arrays = {f"norms.{n}.weight": 1.0 + 0.1 * rng.normal(size=12) for n in range(2)}
+    for name, (n, m) in sizes.items():
+        arrays[f"{name}.weight"] = rng.normal(size=(m, n)) / np.sqrt(n)
+        arrays[f"{name}.bias"] = rng.normal(size=m)
     network = element_network.Network(arrays)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(element_network, "released", lambda: network)
@@ -45,8 +44,16 @@ def u_shape():
     return solid
 
 
+def seen(solid, seed=3):
+    """The graph of a body with nodes held here and there."""
+    index = np.argwhere(solid)
+    rng = np.random.default_rng(seed)
+    young, poisson = 10.0 ** rng.uniform(-0.5, 0.5, len(index)), rng.uniform(0.0, 0.49, len(index))
+    return cell_graph(index, young, poisson, rng.integers(0, 2, (len(index), 8)).astype(float))
+
+
 def test_the_corrections_are_large_enough_to_test(any_network):
-    N, H = any_network(np.random.default_rng(1).normal(size=(5, SIZE)))
+    N, H = any_network(seen(u_shape()))
     S = learned.bounded(np, N)
     assert 0.2 < np.abs(np.linalg.eigvalsh(S)).max() < learned.BOUND + 1e-12
     assert np.abs(np.linalg.eigvalsh(learned.bounded(np, H))).max() > 0.2
@@ -54,14 +61,28 @@ def test_the_corrections_are_large_enough_to_test(any_network):
 
 @pytest.mark.parametrize("g", [3, 17, 40])
 def test_answers_turn_with_the_cube(any_network, g):
-    x = np.random.default_rng(2).normal(size=(4, SIZE))
+    graph = seen(u_shape())
+    turned = CellGraph(*(x[:, places[g]] for x, places in zip(graph, permutations(), strict=True)))
     for answer, moved, moves in zip(
-        any_network(x), any_network(x[:, permutations()[g]]), (on_strains(), on_scalars()),
-        strict=True,
-    ):  # fmt: skip
+        any_network(graph), any_network(turned), (on_strains(), on_scalars()), strict=True
+    ):
         R = np.zeros((answer.shape[1],) * 2)
         R[range(len(R)), moves.places[g]] = moves.signs[g]
         assert moved == pytest.approx(R @ answer @ R.T, abs=1e-6)
+
+
+def test_answers_depend_on_what_is_in_reach(any_network):
+    """And no further: three cells away with two rounds."""
+    index = np.stack([np.arange(9), np.zeros(9, int), np.zeros(9, int)], axis=1)
+    held, poisson = np.zeros((9, 8)), np.full(9, 0.3)
+    young = np.ones(9)
+    young[8] = 2.0
+    same, other = (
+        any_network(cell_graph(index, e, poisson, held))[0] for e in (0 * young + 1, young)
+    )
+    changed = np.abs(same - other).max(axis=(1, 2)) > 1e-9
+    assert changed.tolist() == [False] * 5 + [True] * 4
+    assert any_network.reach == 3
 
 
 @pytest.mark.parametrize("g", [5, 22, 43])
@@ -291,9 +312,10 @@ def test_second_order_under_refinement():
         scene = scene.with_changes(solver={"element": element, "mass": "averaged"})
         return pc.modes(pc.discretise(scene), 7).frequencies[-1]
 
-    right = frequency(10, "hex8-enhanced")
-    coarse, fine = (right - frequency(k, "hex8-learned") for k in (4, 8))
-    assert np.log2(coarse / fine) > 1.8
+    half, whole = (frequency(k, "hex8-enhanced") for k in (6, 12))
+    right = whole + (whole - half) / 3.0
+    coarse, fine = (right - frequency(k, "hex8-learned") for k in (6, 12))
+    assert np.log2(coarse / fine) > 1.85
 
 
 def batch_of_two(damping):

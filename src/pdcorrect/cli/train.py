@@ -105,7 +105,7 @@ def _tell(at: Progress, row: Mapping[str, Any]) -> None:
 def train_element(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
     bodies: Annotated[int, typer.Option(help="Random bodies to learn from.", min=1)] = 4000,
-    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 60_000,
+    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 15_500,
     seed: Annotated[int, typer.Option(help="Of bodies, weights and order.", min=0)] = 45,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     workers: Annotated[int, typer.Option(help="Processes that compute answers.", min=1)] = 1,

@@ -15,7 +15,7 @@ from pdcorrect.elements.answers import Answers
 from pdcorrect.fem.cell_correction import cell_shapes
 from pdcorrect.fem.learned import bounded, own_mass, own_stiffness, root, scalar_map, strain_map
 from pdcorrect.fem.mesh import VTK_CORNERS
-from pdcorrect.fem.neighbourhood import neighbourhoods
+from pdcorrect.fem.neighbourhood import cell_graph
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,8 @@ _LOADS, _MODES = 8, 12
 FLOORS = (0.01, 0.01, 0.01, 0.003)
 """Below which errors hardly count: of displacements, energies, shapes and squared frequencies."""
 WEIGHTS = (1.0, 1.0, 1.0, 3.0)
+_SMALLEST = 1e-4
+"""Added to squared ratios before their root."""
 
 
 @lru_cache(maxsize=1)
@@ -34,7 +36,8 @@ def unit_strains() -> Array:
 class Sample(NamedTuple):
     """One body: what the network sees, and what its answers are judged by; arrays of NumPy."""
 
-    features: Array
+    numbers: Array
+    neighbours: NDArray[np.int64]
     near: Array
     K: Array
     M: Array
@@ -58,10 +61,11 @@ def sample(body: Answers) -> Sample:
     count = len(body.cells)
     index = body.places[body.cells[:, 0]]
     corners = body.held[body.cells].astype(float)
-    x = neighbourhoods(index, body.young, np.full(count, poisson), corners)
+    graph = cell_graph(index, body.young, np.full(count, poisson), corners)
     rows = (3 * body.cells[:, :, None] + np.arange(3)).reshape(count, 24)
     return Sample(
-        x.astype(np.float32), corners.any(axis=1).astype(float), K, M,
+        graph.numbers.astype(np.float32), graph.neighbours,
+        corners.any(axis=1).astype(float), K, M,
         root(own_stiffness(K, unit_strains())), root(own_mass(M)),
         body.young, body.density, rows, ~np.repeat(body.held, 3),
         body.forces.reshape(len(body.forces), -1).astype(float),
@@ -75,7 +79,7 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    features : (C, F), near : (C,)
+    numbers : (C, 37), neighbours : (C, 27), near : (C,)
     owner : (C,)
         Body of each cell.
     K : (B, 24, 24), M : (B, 8, 8), stiff_root : (B, 18, 18), heavy_root : (B, 7, 7)
@@ -93,7 +97,8 @@ class Batch(NamedTuple):
     modes : (B, M, n)
     """
 
-    features: Tensor
+    numbers: Tensor
+    neighbours: Tensor
     near: Tensor
     owner: Tensor
     K: Tensor
@@ -140,8 +145,15 @@ def collate(samples: Sequence[Sample]) -> Batch:
     }
     joined = {
         name: np.concatenate([getattr(s, name) for s in samples])
-        for name in ("features", "near", "young", "density", "rows")
+        for name in ("numbers", "near", "young", "density", "rows")
     }
+    ends = np.cumsum([len(s.rows) for s in samples])
+    joined["neighbours"] = np.concatenate(
+        [
+            np.where(s.neighbours == len(s.rows), ends[-1], s.neighbours + end - len(s.rows))
+            for s, end in zip(samples, ends, strict=True)
+        ]
+    )
     owner = np.repeat(np.arange(size), [len(s.rows) for s in samples])
     arrays = dict(
         **stacked, **joined, owner=owner, solve=np.concatenate(solve), places=places,
@@ -186,7 +198,7 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
     A = A.index_add(0, flat.flatten(), K.flatten()).reshape(size, m + 1, m + 1)[:, :m, :m]
     n = batch.forces.shape[2] - 1
     A = A + torch.diag_embed((batch.places == n).to(K))
-    factor = torch.linalg.cholesky(A)
+    factor = torch.linalg.cholesky_ex(A).L  # positive by construction: no look at its success
 
     def times(matrices: Tensor, x: Tensor) -> Tensor:
         """Cell matrices (C, 24, 24) times fields (B, L, n + 1)."""
@@ -224,7 +236,7 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
 
 
 def loss(found: Errors, base: Errors) -> Tensor:
-    """Of each body, (B,): mean squared errors over those without learning, with floors.
+    """Of each body, (B,): errors over those without learning, with floors.
 
     Lower modes count more: motions are mostly made of them.
     """
@@ -233,7 +245,6 @@ def loss(found: Errors, base: Errors) -> Tensor:
     for errors, without, floor, weight in zip(found, base, FLOORS, WEIGHTS, strict=True):
         of_modes = errors is found.shapes or errors is found.squares
         part = lower if of_modes else torch.ones_like(errors[0])
-        total = total + weight * (errors @ part.to(errors)) / (
-            without @ part.to(errors) + floor**2 * part.sum()
-        )
+        ratio = errors @ part.to(errors) / (without @ part.to(errors) + floor**2 * part.sum())
+        total = total + weight * (ratio + _SMALLEST).sqrt()
     return total / sum(WEIGHTS)

@@ -2,45 +2,63 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import silu
 
-from pdcorrect.fem.element_network import SCALARS, STRAINS, halves
-from pdcorrect.fem.neighbourhood import permutations
+from pdcorrect.fem.element_network import EPSILON, SCALARS, STRAINS, halves
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, permutations
 
 
 class ElementNetwork(nn.Module):
-    """From neighbourhoods to symmetric matrices N of stiffness and mass, see `fem.learned`.
+    """From a graph of cells to symmetric matrices N of stiffness and mass, see `fem.learned`.
 
-    The mean over the cube's symmetries of a perceptron's answers, each turned back.
+    The mean over the cube's symmetries of the answers of a graph network with one relation for
+    each of the 27 places of a neighbour (Schlichtkrull et al. 2018), each turned back.
 
     Parameters
     ----------
-    inputs : int
-        Numbers of a neighbourhood.
-    width, depth : int
-        Of the hidden layers, and how many.
+    width : int
+        Features of a cell.
+    rounds : int
+        Of messages between neighbours.
+    head : int
+        Width of the layer before the answers.
     """
 
-    def __init__(self, inputs: int, width: int = 256, depth: int = 3) -> None:
-        super().__init__()
-        sizes = [inputs, *[width] * depth]
-        layers: list[nn.Module] = []
-        for before, after in pairwise(sizes):
-            layers += [nn.Linear(before, after), nn.SiLU()]
-        last = nn.Linear(width, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS)))
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        self.layers = nn.Sequential(*layers, last)
+    own: Tensor
+    around: Tensor
 
-    def forward(self, x: Tensor, symmetries: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """N (C, 18, 18) and (C, 7, 7) for neighbourhoods (C, F), by some of the symmetries."""
+    def __init__(self, width: int = 48, rounds: int = 3, head: int = 128) -> None:
+        super().__init__()
+        self.first = nn.Linear(SIZE, width)
+        self.rounds = nn.ModuleList(nn.Linear(NEIGHBOURS * width, width) for _ in range(rounds))
+        self.norms = nn.ModuleList(nn.RMSNorm(width, eps=EPSILON) for _ in range(rounds))
+        self.hidden = nn.Linear(2 * width, head)
+        self.last = nn.Linear(head, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS)))
+        own, around = permutations()
+        self.register_buffer("own", torch.as_tensor(own), persistent=False)
+        self.register_buffer("around", torch.as_tensor(around), persistent=False)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(
+        self, numbers: Tensor, neighbours: Tensor, symmetries: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """N (C, 18, 18) and (C, 7, 7) for cells' numbers (C, 37), by some of the symmetries.
+
+        ``neighbours`` (C, 27) has C where there is none.
+        """
         if symmetries is None:
-            symmetries = torch.arange(48, device=x.device)
-        moved = torch.as_tensor(permutations(), device=x.device)[symmetries]
-        found = self.layers(x[:, moved])  # (C, G, .)
+            symmetries = torch.arange(48, device=numbers.device)
+        first = silu(self.first(numbers[:, self.own[symmetries]]))  # (C, G, width)
+        table = neighbours[:, self.around[symmetries]]
+        orientation = torch.arange(len(symmetries), device=numbers.device)[:, None]
+        x = first
+        for convolution, norm in zip(self.rounds, self.norms, strict=True):
+            padded = nn.functional.pad(norm(x), (0, 0, 0, 0, 0, 1))
+            x = x + silu(convolution(padded[table, orientation].flatten(2)))
+        found = self.last(silu(self.hidden(torch.cat([x, first], dim=2))))
         split = halves(STRAINS).places.shape[1]
         return (
             _mean(found[..., :split], STRAINS, symmetries),

@@ -1,4 +1,4 @@
-"""The perceptron that writes the learned element's matrices, by NumPy, and its file."""
+"""The graph network that writes the learned element's matrices, by NumPy, and its file."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import FileFormatError, FileVersionError
 from pdcorrect.fem.cube_symmetry import on_scalars, on_strains
-from pdcorrect.fem.neighbourhood import SIZE, permutations
+from pdcorrect.fem.neighbourhood import SIZE, CellGraph, permutations
 
 Array = NDArray[np.float64]
 
 STRAINS, SCALARS = 18, 7
 """Rows of the matrices of stiffness and of mass."""
 MODEL = Path(__file__).parent / "hex8_learned.safetensors"
+EPSILON = 1e-6
+"""Of the mean square that features are divided by."""
 _DIGEST = 16
-_DIGITS = 6
-"""Of two random sums over a neighbourhood: cells that differ by less are alike."""
+_DIGITS = 1e6
+"""Numbers of cells that differ by less than its inverse are alike."""
+_ROWS = 4096
+"""Of a convolution at a time."""
 
 
 class Network:
-    """The perceptron that writes N, by NumPy, in the precision of its weights.
+    """The graph network that writes N, by NumPy, in the precision of its weights.
 
     Parameters
     ----------
@@ -38,61 +43,149 @@ class Network:
     ----------
     digest : str
     shape : (int, int)
-        Numbers of a neighbourhood, and of an answer.
+        Numbers of a cell, and of an answer.
+    reach : int
+        How many cells away an answer depends on, along each axis.
     """
 
     def __init__(self, arrays: dict[str, NDArray[Any]], digest: str = "") -> None:
         self.digest = digest
-        numbers = sorted({int(name.split(".")[1]) for name in arrays})
-        self._layers = [
-            (arrays[f"layers.{n}.weight"].T, arrays[f"layers.{n}.bias"]) for n in numbers
+        self._first, self._hidden, self._last = (
+            _Linear(arrays[f"{name}.weight"], arrays[f"{name}.bias"])
+            for name in ("first", "hidden", "last")
+        )
+        count = sum(name.startswith("norms.") for name in arrays)
+        self._rounds = [
+            (
+                _Linear(arrays[f"rounds.{n}.weight"], arrays[f"rounds.{n}.bias"]),
+                arrays[f"norms.{n}.weight"],
+            )
+            for n in range(count)
         ]
-        self._type = self._layers[0][0].dtype
-        self.shape = len(self._layers[0][0]), self._layers[-1][0].shape[1]
+        self._type = self._first.weight.dtype
+        self.shape = len(self._first.weight), self._last.weight.shape[1]
+        self.reach = count + 1
 
-    def __call__(self, x: Array) -> tuple[Array, Array]:
-        """N (C, 18, 18) and (C, 7, 7) for neighbourhoods (C, F), averaged over the symmetries."""
-        first, inverse, turns = _alike_up_to_symmetry(x)
-        distinct = np.take_along_axis(x[first], permutations()[turns[first]], axis=1)
-        found = self._layered(self._turned(distinct))[-1].reshape(len(first), 48, -1)
+    def __call__(self, graph: CellGraph) -> tuple[Array, Array]:
+        """N (C, 18, 18) and (C, 7, 7), averaged over the symmetries.
+
+        Cells in one of the 48 orientations that look alike as far as a round sees have the same
+        features, which are evaluated once.
+        """
+        own, around = permutations()
+        whole = np.round(_DIGITS * graph.numbers).astype(np.int64).astype(np.uint64)
+        keys = _hashed(whole, own)
+        _, seen, kind = np.unique(keys, return_index=True, return_inverse=True)
+        turn, cell = np.divmod(seen, len(graph.numbers))
+        x = graph.numbers.astype(self._type)[cell[:, None], own[turn]]
+        features = first = _silu(self._first(x))
+        for convolution, scale in self._rounds:
+            before = np.append(kind.reshape(48, -1), np.full((48, 1), len(features)), axis=1)
+            keys = _hashed(before, graph.neighbours[:, around].transpose(1, 0, 2))
+            _, seen, kind = np.unique(keys, return_index=True, return_inverse=True)
+            turn, cell = np.divmod(seen, len(graph.numbers))
+            table = before[turn[:, None], graph.neighbours[cell[:, None], around[turn]]]
+            self_ = before[turn, cell]
+            normed = np.append(_normed(features) * scale, np.zeros_like(features[:1]), axis=0)
+            sums = [
+                convolution(normed[table[i : i + _ROWS]].reshape(len(table[i : i + _ROWS]), -1))
+                for i in range(0, len(table), _ROWS)
+            ]
+            features = features[self_] + _silu(np.concatenate(sums))
+            first = first[self_]
+        found = self._last(_silu(self._hidden(np.concatenate([features, first], axis=1))))
+        found = found[kind].reshape(48, len(graph.numbers), -1)
         split = halves(STRAINS).places.shape[1]
-        answers = []
-        for part, size in ((found[..., :split], STRAINS), (found[..., split:], SCALARS)):
-            half = halves(size)
-            mean = _mean(part, half)[inverse]
-            turned = np.take_along_axis(mean, half.places[turns], axis=1) * half.signs[turns]
-            answers.append(turned[:, half.number])
-        N, H = answers
+        N, H = (
+            _mean(part, halves(size))[:, halves(size).number]
+            for part, size in ((found[..., :split], STRAINS), (found[..., split:], SCALARS))
+        )
         return N, H
 
-    def slopes(self, x: Array, by_N: Array, by_H: Array) -> Array:
-        """Derivatives (C, F) of a function by the neighbourhoods, from those by N and H."""
-        layered = self._layered(self._turned(x))
-        parts = (_mean_transposed(part, halves(part.shape[1])) for part in (by_N, by_H))
-        back = np.concatenate(list(parts), axis=2).reshape(len(layered[-1]), -1)
-        for i, (weight, _) in reversed(list(enumerate(self._layers))):
-            back = back @ weight.T
-            if i:
-                before = layered[2 * i - 1]  # the sum that went into this layer's SiLU
-                share = 1.0 / (1.0 + np.exp(-before))
-                back *= share * (1.0 + before * (1.0 - share))
-        turned = back.reshape(len(x), 48, -1)
-        out = np.zeros(x.shape)
-        for g, places in enumerate(permutations()):
-            out[:, places] += turned[:, g]
+    def slopes(self, graph: CellGraph, by_N: Array, by_H: Array) -> Array:
+        """Derivatives (C, 37) of a function by the graph's numbers, from those by N and H."""
+        back = np.concatenate(
+            [_mean_transposed(part, halves(part.shape[1])) for part in (by_N, by_H)], axis=2
+        )
+        own, around = permutations()
+        count = len(graph.numbers)
+        out = np.zeros((count, SIZE))
+        for g in range(48):
+            table = graph.neighbours[:, around[g]]
+            source = sp.csr_matrix(
+                (np.ones(table.size), (np.arange(table.size), table.ravel())),
+                shape=(table.size, count + 1),
+            )[:, :count]
+            out[:, own[g]] += self._turned_slopes(graph.numbers[:, own[g]], source, back[g])
         return out
 
-    def _turned(self, x: Array) -> NDArray[Any]:
-        return x.astype(self._type)[:, permutations()].reshape(-1, x.shape[1])
+    def _turned_slopes(self, x: Array, source: sp.csr_matrix, back: Array) -> Array:
+        """The same in one orientation; ``source`` (27 C, C) takes each cell's neighbours."""
+        count = len(x)
+        sums: list[Array] = [self._first(x)]
+        features = first = _silu(sums[0])
+        stages = [features]
+        for convolution, scale in self._rounds:
+            normed = _normed(features) * scale
+            sums.append(convolution((source @ normed).reshape(count, -1)))
+            features = features + _silu(sums[-1])
+            stages.append(features)
+        hidden = self._hidden(np.concatenate([features, first], axis=1))
+        slopes = (back @ self._last.weight.T) * _silu_slope(hidden) @ self._hidden.weight.T
+        slopes, by_first = np.split(slopes, 2, axis=1)
+        for n, (convolution, scale) in reversed(list(enumerate(self._rounds))):
+            messages = (slopes * _silu_slope(sums[n + 1])) @ convolution.weight.T
+            by_normed = (source.T @ messages.reshape(-1, features.shape[1])) * scale
+            slopes = slopes + _normed_transposed(stages[n], by_normed)
+        return np.asarray(((slopes + by_first) * _silu_slope(sums[0])) @ self._first.weight.T)
 
-    def _layered(self, x: NDArray[Any]) -> list[NDArray[Any]]:
-        """Input, then for each layer the sum and what SiLU makes of it; the answers last."""
-        out = [x]
-        for weight, bias in self._layers[:-1]:
-            total = out[-1] @ weight + bias
-            out += [total, total / (1.0 + np.exp(-total))]
-        weight, bias = self._layers[-1]
-        return [*out, out[-1] @ weight + bias]
+
+class _Linear:
+    """x W + b, for W^T (outputs, inputs) as torch keeps it."""
+
+    def __init__(self, weight: NDArray[Any], bias: NDArray[Any]) -> None:
+        self.weight, self._bias = weight.T, bias
+
+    def __call__(self, x: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(x @ self.weight + self._bias)
+
+
+def _silu(x: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(x / (1.0 + np.exp(-x)))
+
+
+def _silu_slope(x: NDArray[Any]) -> NDArray[Any]:
+    share = 1.0 / (1.0 + np.exp(-x))
+    return np.asarray(share * (1.0 + x * (1.0 - share)))
+
+
+def _normed(x: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(x / np.sqrt((x * x).mean(axis=1, keepdims=True) + EPSILON))
+
+
+def _normed_transposed(x: Array, slopes: Array) -> Array:
+    size = np.sqrt((x * x).mean(axis=1, keepdims=True) + EPSILON)
+    along = (x * slopes).mean(axis=1, keepdims=True)
+    return np.asarray(slopes / size - x * along / size**3)
+
+
+def _hashed(values: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """A number for each row of ``values[places]``, alike for rows alike and for no others.
+
+    Of whole numbers (C, F) and places (48, F); or of (48, C + 1) and places (48, C, F), row g of
+    one with row g of the other.  Out (48 C,).  Two rows out of n fall together by chance with
+    n^2 / 2^65.
+    """
+    factors = np.random.default_rng(0).integers(1, 2**63, size=places.shape[-1], dtype=np.uint64)
+    factors |= np.uint64(1)
+    out = []
+    for g in range(48):
+        rows = values[:, places[g]] if places.ndim == 2 else values[g][places[g]]
+        mixed = rows.astype(np.uint64) + np.uint64(1)
+        mixed = (mixed ^ (mixed << np.uint64(13))) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+        out.append((mixed * factors).sum(axis=1, dtype=np.uint64))
+    return np.concatenate(out)
 
 
 class Halves(NamedTuple):
@@ -124,47 +217,23 @@ def halves(size: int) -> Halves:
     return Halves(number, places, signs[:, rows] * signs[:, columns])
 
 
-@lru_cache(maxsize=1)
-def _probes() -> Array:
-    """Two numbers of any neighbourhood in each of the cube's 48 orientations, (F, 48, 2)."""
-    numbers = np.random.default_rng(0).normal(size=(SIZE, 2))
-    out = np.empty((SIZE, 48, 2))
-    for g, places in enumerate(permutations()):
-        out[places, g] = numbers
-    return out
-
-
-def _alike_up_to_symmetry(
-    x: Array,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Cells that stand for others, and for each cell its number among them, (C,).
-
-    And the symmetry g for which x[permutations()[g]] is the same for all that are alike, (C,).
-    """
-    probed = np.tensordot(x, _probes(), axes=1)  # (C, 48, 2)
-    lowest = probed[..., 0].argmin(axis=1)
-    key = np.take_along_axis(probed, lowest[:, None, None], axis=1)[:, 0].round(_DIGITS)
-    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return first, inverse.ravel(), lowest
-
-
 def _mean(lower: NDArray[Any], half: Halves) -> Array:
-    """The mean (C, h) of lower halves (C, 48, h), turned back."""
-    total = np.zeros((len(lower), lower.shape[2]))
-    for g, (places, signs) in enumerate(zip(half.places, half.signs, strict=True)):
-        total += lower[:, g, places] * signs
+    """The mean (C, h) of lower halves (48, C, h), turned back."""
+    total = np.zeros(lower.shape[1:])
+    for turned, places, signs in zip(lower, half.places, half.signs, strict=True):
+        total += turned[:, places] * signs
     return total / 48.0
 
 
 def _mean_transposed(slopes: Array, half: Halves) -> Array:
-    """Derivatives (C, 48, h) by the lower halves, from those (C, n, n) by the mean."""
+    """Derivatives (48, C, h) by the lower halves, from those (C, n, n) by the mean."""
     count = len(slopes)
     lower = np.zeros((count, half.places.shape[1]))
     for entry, place in enumerate(half.number.ravel()):
         lower[:, place] += slopes.reshape(count, -1)[:, entry]
-    out = np.zeros((count, *half.places.shape))
-    for g, (places, signs) in enumerate(zip(half.places, half.signs, strict=True)):
-        out[:, g, places] = lower * signs / 48.0
+    out = np.zeros((48, *lower.shape))
+    for turned, places, signs in zip(out, half.places, half.signs, strict=True):
+        turned[:, places] = lower * signs / 48.0
     return out
 
 
@@ -188,7 +257,7 @@ def read_network(path: Path) -> Network:
     FileFormatError
         If the file is missing or damaged.
     FileVersionError
-        If the network sees other neighbourhoods, or answers otherwise.
+        If the network sees other numbers, or answers otherwise.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load

@@ -9,7 +9,7 @@ Its energy gains
 C the cell's own stiffness of z and k < 1: the eigenvalues of S lie between -k and k, so C + K is
 positive.  Mass likewise, on the seven patterns of a scalar without its mean, so that the mass of
 a cell stays the same, and what a translation feels.  The symmetric matrices N come from a
-perceptron that sees the cell's `neighbourhood`.  Strains are corrected in cells with a held
+network on the graph of cells, see `neighbourhood`.  Strains are corrected in cells with a held
 corner only; elsewhere affine deformations stay exact.
 
 A cell keeps the element without learning where the network was not trained: off a grid, beside
@@ -35,9 +35,10 @@ from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.element_network import STRAINS, Network
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.neighbourhood import (
-    CELLS,
-    neighbourhood_slopes,
-    neighbourhoods,
+    CellGraph,
+    cell_graph,
+    cell_graph_slopes,
+    contrasts,
     on_grid,
 )
 
@@ -49,8 +50,8 @@ STIFFEST = 3.0
 """Of the shear stiffness: the most that counts of that to changes of volume."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
-_CONTRAST = 0.85
-"""Of 2 E'/(E + E'): how far from 1 a neighbour's may be."""
+_CONTRAST = 12.0
+"""Of the moduli that the network sees."""
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
 
@@ -136,11 +137,11 @@ class ElementWriter:
     def correction(self, mu: Array, omega: Array) -> CellCorrection:
         """For weights (C,) of the energy's two terms, Pa."""
         young, poisson = effective_moduli(mu, omega)
-        x, learned = self._neighbourhoods(young, poisson)
-        count = len(x)
+        graph, learned = self._seen(young, poisson)
+        count = len(learned)
         matrices, masses = np.zeros((count, STRAINS, STRAINS)), np.zeros((count, 8, 8))
         if learned.any():
-            S, R = self._shares(x[learned], learned)
+            S, R = (bounded(np, N) for N in self._answers(graph, learned))
             stiff, heavy = self._roots(mu, omega)
             stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
             matrices[learned] = stiff @ S @ stiff
@@ -167,18 +168,18 @@ class ElementWriter:
         network's answers by the chain rule.
         """
         young, poisson = effective_moduli(mu, omega)
-        x, learned = self._neighbourhoods(young, poisson)
-        nothing = np.zeros(len(x))
+        graph, learned = self._seen(young, poisson)
+        nothing = np.zeros(len(learned))
         if not learned.any():
             return nothing, nothing
         G, J = self._in_order(by_matrices, by_masses, learned)
-        N, H = self._answers(x[learned], learned)
+        N, H = self._answers(graph, learned)
         S, R = bounded(np, N), bounded(np, H)
 
         def own(mu: Array, omega: Array) -> Array:
             stiff, heavy = self._roots(mu, omega)
             stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
-            out = np.zeros(len(x))
+            out = np.zeros(len(learned))
             out[learned] = np.einsum("cij,cij->c", G, stiff @ S @ stiff)
             out[learned] += np.einsum("cij,cij->c", J, np.swapaxes(heavy, 1, 2) @ R @ heavy)
             return out
@@ -190,14 +191,12 @@ class ElementWriter:
         ]
         stiff, heavy = self._roots(mu, omega)
         stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
-        by_N = _bounded_transposed(N, stiff @ G @ stiff)
-        by_N[self._inside[learned], :6] = by_N[self._inside[learned], :, :6] = 0.0
-        by_H = _bounded_transposed(H, heavy @ J @ np.swapaxes(heavy, 1, 2))
-        by_x = np.zeros(x.shape)
-        by_x[learned] = self._network.slopes(x[learned], by_N, by_H)
-        by_young, by_poisson = neighbourhood_slopes(
-            self._grid.place, young, poisson.clip(0.0), by_x
-        )
+        by_N, by_H = np.zeros((len(learned), *N.shape[1:])), np.zeros((len(learned), *H.shape[1:]))
+        by_N[learned] = _bounded_transposed(N, stiff @ G @ stiff)
+        by_N[self._inside, :6] = by_N[self._inside, :, :6] = 0.0
+        by_H[learned] = _bounded_transposed(H, heavy @ J @ np.swapaxes(heavy, 1, 2))
+        by_numbers = self._network.slopes(graph, by_N, by_H)
+        by_young, by_poisson = cell_graph_slopes(graph, young, poisson.clip(0.0), by_numbers)
         for which, moved in enumerate(_moduli_slopes(mu, omega)):
             found[which] = found[which] + by_young * moved[0] + by_poisson * moved[1]
         return found[0], found[1]
@@ -215,24 +214,22 @@ class ElementWriter:
         by_masses = by_masses[cell, order[:, :, None], order[:, None, :]]
         return by_matrices[learned], by_masses[learned]
 
-    def _neighbourhoods(self, young: Array, poisson: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def _seen(self, young: Array, poisson: Array) -> tuple[CellGraph, NDArray[np.bool_]]:
         """What the network sees of all cells, and which it was trained for."""
         learned = self._fits & (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
-        x = neighbourhoods(self._grid.place, young, poisson.clip(0.0), self._held)
-        window = x[:, : CELLS**3]
-        alike = np.abs(window - 1.0) <= _CONTRAST
-        return x, np.asarray(learned & (alike | (window == 0.0)).all(axis=1))
+        found = contrasts(self._grid.place, np.nan_to_num(young, nan=np.inf), self._network.reach)
+        known = np.where(np.isfinite(young), young, 0.0), np.nan_to_num(poisson).clip(0.0)
+        with np.errstate(invalid="ignore"):
+            graph = cell_graph(self._grid.place, *known, self._held)
+        numbers = np.nan_to_num(graph.numbers)
+        return CellGraph(numbers, graph.neighbours), np.asarray(learned & (found <= _CONTRAST))
 
-    def _answers(self, x: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def _answers(self, graph: CellGraph, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
         """N and H of the learned cells, strains uncorrected away from held corners."""
-        N, H = self._network(x)
+        N, H = (x[learned] for x in self._network(graph))
         inside = self._inside[learned]
         N[inside, :6], N[inside, :, :6] = 0.0, 0.0
         return N, H
-
-    def _shares(self, x: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
-        N, H = self._answers(x, learned)
-        return bounded(np, N), bounded(np, H)
 
     def _roots(self, mu: Array, omega: Array) -> tuple[Array, Array]:
         """C^1/2 of stiffness (C, 18, 18) and of mass (C, 7, 7); like cells share the work."""

@@ -1,8 +1,8 @@
-"""What the learned element sees of a cell: its neighbours, held nodes and Poisson's ratio.
+"""What the learned element sees of a body: a graph of its cells, which lie on a grid.
 
-Cells lie on a grid.  A window of 7 x 7 x 7 cells about each has 2 E' / (E + E') for the modulus
-E' of a neighbour and the cell's own E: 0 where there is none, 1 for the same, 2 for rigid.  A
-window of 6 x 6 x 6 nodes has 1 where a node is held.
+A cell's own numbers are 2 E' / (E + E') for its modulus E and that of each of the 3 x 3 x 3 cells
+about it, E': 0 where there is none, 1 for the same, 2 for rigid; 1 for each of its corners that is
+held; and two of Poisson's ratio.  Its neighbours are those 27, itself among them.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy.ndimage as ndi
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cube_symmetry import on_window
@@ -18,14 +19,32 @@ from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 Array = NDArray[np.float64]
 
-CELLS, NODES = 7, 6
-"""Widths of the windows."""
-SIZE = CELLS**3 + NODES**3 + 2
-"""Numbers of a neighbourhood."""
+NEIGHBOURS = 27
+"""Cells about a cell, itself in the middle."""
+SIZE = NEIGHBOURS + 8 + 2
+"""Numbers of a cell."""
 _OFF_GRID = 0.02
 """Of the spacing: how far corners may lie from a grid of cubes."""
+_AROUND = np.stack(np.unravel_index(np.arange(NEIGHBOURS), (3, 3, 3)), axis=1) - 1
+_IN_WINDOW = np.argsort(VTK_CORNERS.astype(np.int64) @ [4, 2, 1])
+"""Of the corners, in the order of `on_window`."""
 _FLOOR = 0.01
 """Added to 1 - 2 nu, whose logarithm is a feature."""
+
+
+class CellGraph(NamedTuple):
+    """What the network sees.
+
+    Attributes
+    ----------
+    numbers : (C, 37)
+        Of each cell: of its neighbours, of its corners, of Poisson's ratio.
+    neighbours : (C, 27) int
+        Cells about each; C where there is none.
+    """
+
+    numbers: Array
+    neighbours: NDArray[np.int64]
 
 
 class Grid(NamedTuple):
@@ -69,8 +88,8 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     return Grid(np.take_along_axis(cells, order, axis=1), order, index, regular)
 
 
-def neighbourhoods(index: NDArray[np.int64], young: Array, poisson: Array, held: Array) -> Array:
-    """Neighbourhoods (C, F) of cells on a grid.
+def cell_graph(index: NDArray[np.int64], young: Array, poisson: Array, held: Array) -> CellGraph:
+    """The graph of cells on a grid.
 
     Parameters
     ----------
@@ -80,49 +99,50 @@ def neighbourhoods(index: NDArray[np.int64], young: Array, poisson: Array, held:
     held : (C, 8)
         1 where a corner is held, VTK order.
     """
-    index = index - index.min(axis=0)
-    reach = CELLS // 2
-    stiffness = np.zeros(index.max(axis=0) + 1 + 2 * reach)
-    stiffness[tuple((index + reach).T)] = young
-    around = _windows(stiffness, index, CELLS)
-    share = 2.0 * around / (young[:, None] + around)
-    beside = (NODES - 2) // 2
-    nodes = np.zeros(index.max(axis=0) + 2 + 2 * beside)
-    places = (index[:, None] + VTK_CORNERS.astype(int) + beside).reshape(-1, 3)
-    np.maximum.at(nodes, tuple(places.T), held.ravel())
+    count = len(index)
+    index = index - index.min(axis=0) + 1
+    cells = np.full(index.max(axis=0) + 2, count)
+    cells[tuple(index.T)] = np.arange(count)
+    neighbours = cells[tuple(np.moveaxis(index[:, None] + _AROUND, -1, 0))]
+    other = np.append(young, 0.0)[neighbours]
+    share = 2.0 * other / (young[:, None] + other)
     values = np.stack([4.0 * poisson - 1.0, 0.5 * np.log(1.0 - 2.0 * poisson + _FLOOR)], axis=1)
-    return np.concatenate([share, _windows(nodes, index, NODES), values], axis=1)
+    return CellGraph(np.concatenate([share, held[:, _IN_WINDOW], values], axis=1), neighbours)
 
 
-def neighbourhood_slopes(
-    index: NDArray[np.int64], young: Array, poisson: Array, slopes: Array
+def cell_graph_slopes(
+    graph: CellGraph, young: Array, poisson: Array, slopes: Array
 ) -> tuple[Array, Array]:
-    """Derivatives by young and poisson, (C,), of a function that has these by neighbourhoods."""
-    index = index - index.min(axis=0) + CELLS // 2
-    stiffness = np.zeros(index.max(axis=0) + 1 + CELLS // 2)
-    stiffness[tuple(index.T)] = young
-    low = index - CELLS // 2
-    around = _windows(stiffness, low, CELLS)
-    by_share = 2.0 * slopes[:, : CELLS**3] / (young[:, None] + around) ** 2
-    by_young = -(by_share * around).sum(axis=1)
-    offsets = np.stack(np.unravel_index(np.arange(CELLS**3), (CELLS,) * 3), axis=1)
-    places = low[:, None] + offsets
-    total = np.zeros(stiffness.shape)
-    np.add.at(total, tuple(places.reshape(-1, 3).T), (by_share * young[:, None]).ravel())
-    by_young += total[tuple(index.T)]
+    """Derivatives by young and poisson, (C,), of a function that has these by a graph's numbers."""
+    other = np.append(young, 0.0)[graph.neighbours]
+    by_share = 2.0 * slopes[:, :NEIGHBOURS] / (young[:, None] + other) ** 2
+    by_other = np.bincount(
+        graph.neighbours.ravel(), (by_share * young[:, None]).ravel(), len(young) + 1
+    )
+    by_young = by_other[:-1] - (by_share * other).sum(axis=1)
     by_poisson = 4.0 * slopes[:, -2] - slopes[:, -1] / (1.0 - 2.0 * poisson + _FLOOR)
     return by_young, by_poisson
 
 
-def _windows(grid: Array, index: NDArray[np.int64], width: int) -> Array:
-    """Cubes of numbers (C, width^3) with their low corner at ``index``."""
-    every = np.lib.stride_tricks.sliding_window_view(grid, (width,) * 3)
-    return every[tuple(index.T)].reshape(len(index), -1)
+def contrasts(index: NDArray[np.int64], young: Array, reach: int) -> Array:
+    """Largest modulus over smallest, (C,), of the cells at most ``reach`` away along each axis."""
+    index = index - index.min(axis=0)
+    shape = index.max(axis=0) + 1
+    size = 2 * reach + 1
+    extremes = []
+    for fill, extreme in ((0.0, ndi.maximum_filter), (np.inf, ndi.minimum_filter)):
+        grid = np.full(shape, fill)
+        grid[tuple(index.T)] = young
+        extremes.append(extreme(grid, size, mode="constant", cval=fill)[tuple(index.T)])
+    return np.asarray(extremes[0] / extremes[1])
 
 
 @lru_cache(maxsize=1)
-def permutations() -> NDArray[np.int64]:
-    """Places (48, F) with y = x[places] for the neighbourhood of the turned body."""
-    cells, nodes = on_window(CELLS), on_window(NODES)
+def permutations() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Places (48, 37) with y = x[places] for the numbers of a cell of the turned body.
+
+    And (48, 27), the same for its neighbours.
+    """
+    cells = on_window(3)
     rest = np.broadcast_to(np.arange(SIZE - 2, SIZE), (48, 2))
-    return np.concatenate([cells, CELLS**3 + nodes, rest], axis=1)
+    return np.concatenate([cells, NEIGHBOURS + on_window(2), rest], axis=1), cells
