@@ -18,7 +18,7 @@ from pdcorrect.cli.evaluate import evaluate
 from pdcorrect.cli.export import export
 from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
-from pdcorrect.cli.train import train, train_element
+from pdcorrect.cli.train import train, train_element, tune_element
 from pdcorrect.cli.validate import validate
 from pdcorrect.errors import (
     EXTRAS,
@@ -41,6 +41,7 @@ for command in (
     export,
     train,
     train_element,
+    tune_element,
     evaluate,
     validate,
     doctor,

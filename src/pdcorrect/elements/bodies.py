@@ -50,12 +50,12 @@ def draw(rng: np.random.Generator) -> VoxelBody:
     kinds = sorted(_SHAPES)
     while True:
         kind = kinds[rng.integers(len(kinds))]
-        solid = _connected(_SHAPES[kind](rng))
+        solid = connected(_SHAPES[kind](rng))
         if not _FEWEST <= solid.sum() <= _MOST:
             continue
         solid = _trimmed(solid.transpose(rng.permutation(3)))
         held = _held(solid, rng)
-        if _holds(held, nodes_of(solid)):
+        if holds(held, nodes_of(solid)):
             break
     young, density = _materials(solid, rng)
     low, high = (0.45, 0.495) if rng.random() < _NEARLY_INCOMPRESSIBLE else (0.0, 0.45)
@@ -160,12 +160,12 @@ def _neighbours(solid: Grid) -> Grid:
     return out
 
 
-def _connected(solid: Grid) -> Grid:
-    """The part with the first cell that hangs together by faces."""
+def connected(solid: Grid, start: tuple[int, ...] | None = None) -> Grid:
+    """The part with a cell, by default the first one, that hangs together by faces."""
     if not solid.any():
         return solid
     part = np.zeros_like(solid)
-    part[tuple(np.argwhere(solid)[0])] = True
+    part[tuple(np.argwhere(solid)[0]) if start is None else start] = True
     while True:
         grown = _neighbours(part) & solid
         if (grown == part).all():
@@ -210,7 +210,7 @@ def _on_side(
     return region
 
 
-def _holds(held: Grid, nodes: Grid) -> bool:
+def holds(held: Grid, nodes: Grid) -> bool:
     """Whether a whole face of a cell is held, and enough is not."""
     whole = 0
     for axis in range(3):

@@ -248,3 +248,14 @@ def loss(found: Errors, base: Errors) -> Tensor:
         ratio = errors @ part.to(errors) / (without @ part.to(errors) + floor**2 * part.sum())
         total = total + weight * (ratio + _SMALLEST).sqrt()
     return total / sum(WEIGHTS)
+
+
+def means(found: Sequence[Errors]) -> dict[str, float]:
+    """Relative errors, mean over bodies."""
+    count = [(e.displacements > 0.0).sum(dim=1).clamp_min(1) for e in found]
+    u = [(e.displacements.sum(dim=1) / n).sqrt() for e, n in zip(found, count, strict=True)]
+    return {
+        "displacements": float(torch.cat(u).mean()),
+        "first frequency": float(torch.cat([0.5 * e.squares[:, 0].sqrt() for e in found]).mean()),
+        "frequencies": float(torch.cat([0.5 * e.squares.sqrt().mean(dim=1) for e in found]).mean()),
+    }

@@ -19,7 +19,8 @@ from torch import Tensor
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, replacing, write_bytes, write_text
 from pdcorrect.elements.collection import file_paths, generate, read_file
-from pdcorrect.elements.linear import Batch, Errors, Sample, collate, errors, loss, sample
+from pdcorrect.elements.descent import Descent
+from pdcorrect.elements.linear import Batch, Errors, Sample, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import InputError
 from pdcorrect.fem.learned import LARGEST_POISSON
@@ -28,11 +29,6 @@ WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
 _CHECKPOINT = "checkpoint.pt"
 _VALIDATION = 0.05
 """Bodies that judge the network, of those that it learns from."""
-_DECAY, _MUON_DECAY = 1e-4, 1e-2
-_ADAM = 0.2
-"""AdamW's learning rate over Muon's."""
-_WARM_UP = 0.01
-"""Of the iterations, over which the learning rate rises."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +47,7 @@ class ElementRecipe:
     symmetries : int
         Of the cube's 48, drawn anew in each step.
     rate : float
-        Largest learning rate of the matrices inside, by Muon (Jordan et al. 2024); it falls as a
-        cosine.  A fifth of it is AdamW's, for the other weights.
+        Largest learning rate, see `Descent`.
     """
 
     bodies: int = 4000
@@ -131,14 +126,7 @@ class Trainer:
         torch.manual_seed(recipe.seed)
         self._rng = np.random.default_rng(recipe.seed)
         self._network = network = ElementNetwork(recipe.width, recipe.rounds).to(device)
-        inside = {
-            id(p): p for p in network.parameters() if p.ndim == 2 and p is not network.last.weight
-        }
-        others_ = [p for p in network.parameters() if id(p) not in inside]
-        self._optimisers = {
-            1.0: torch.optim.Muon(inside.values(), lr=recipe.rate, weight_decay=_MUON_DECAY),
-            _ADAM: torch.optim.AdamW(others_, lr=_ADAM * recipe.rate, weight_decay=_DECAY),
-        }
+        self._descent = Descent(network, recipe.rate, recipe.iterations)
         self._batches, self._validation = (
             _batches(samples, recipe.batch, device) for samples in (known, others)
         )
@@ -162,20 +150,11 @@ class Trainer:
 
     def _step(self, batch: Batch, base: Errors) -> Tensor:
         recipe, network = self._recipe, self._network
-        fall = 0.5 + 0.5 * np.cos(np.pi * self.iteration / recipe.iterations)
-        rise = min(1.0, (self.iteration + 1) / (_WARM_UP * recipe.iterations))
-        for share, optimiser in self._optimisers.items():
-            for group in optimiser.param_groups:
-                group["lr"] = float(share * recipe.rate * rise * fall)
         chosen = self._rng.choice(48, recipe.symmetries, replace=False)
         symmetries = torch.as_tensor(chosen, device=self._device)
         found = network(batch.numbers, batch.neighbours, symmetries)
         value = loss(errors(batch, *found), base).mean()
-        network.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        for optimiser in self._optimisers.values():
-            optimiser.step()
+        self._descent.step(value, self.iteration)
         self.iteration += 1
         return value.detach()
 
@@ -187,8 +166,8 @@ class Trainer:
             judged = torch.cat([loss(a, b) for a, b in pairs]).mean()
         return {
             "loss": float(judged),
-            **{f"{k}, learned": v for k, v in _means(found).items()},
-            **{f"{k}, without": v for k, v in _means(self._without).items()},
+            **{f"{k}, learned": v for k, v in means(found).items()},
+            **{f"{k}, without": v for k, v in means(self._without).items()},
         }
 
     def line(self) -> str:
@@ -226,7 +205,7 @@ class Trainer:
             "recipe": asdict(self._recipe),
             "iteration": self.iteration,
             "network": self._network.state_dict(),
-            "optimisers": [o.state_dict() for o in self._optimisers.values()],
+            "descent": self._descent.state(),
             "rng": self._rng.bit_generator.state,
         }
         with replacing(path) as part:
@@ -248,20 +227,8 @@ class Trainer:
             )
         self.iteration = state["iteration"]
         self._network.load_state_dict(state["network"])
-        for optimiser, kept in zip(self._optimisers.values(), state["optimisers"], strict=True):
-            optimiser.load_state_dict(kept)
+        self._descent.restore(state["descent"])
         self._rng.bit_generator.state = state["rng"]
-
-
-def _means(found: Sequence[Errors]) -> dict[str, float]:
-    """Relative errors, mean over bodies."""
-    count = [(e.displacements > 0.0).sum(dim=1).clamp_min(1) for e in found]
-    u = [(e.displacements.sum(dim=1) / n).sqrt() for e, n in zip(found, count, strict=True)]
-    return {
-        "displacements": float(torch.cat(u).mean()),
-        "first frequency": float(torch.cat([0.5 * e.squares[:, 0].sqrt() for e in found]).mean()),
-        "frequencies": float(torch.cat([0.5 * e.squares.sqrt().mean(dim=1) for e in found]).mean()),
-    }
 
 
 def _samples(folder: Path, count: int, workers: int) -> list[Sample]:

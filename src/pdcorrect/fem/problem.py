@@ -331,7 +331,7 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     space, quadrature, materials = body.space, body.quadrature, body.materials
     selector = Selector(body.mesh, space.positions, body.cell_size)
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
-    correction = _learned(body, clamps) if scene.solver.element == "hex8-learned" else None
+    correction = _learned(scene, body, clamps) if scene.solver.element == "hex8-learned" else None
     matrix = mass_matrix(scene.solver.mass, space, materials.density)
     if correction is not None:
         matrix = matrix + summed_cells(
@@ -347,12 +347,14 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     )  # fmt: skip
 
 
-def _learned(body: ElasticBody, clamps: Clamps) -> CellCorrection:
+def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
     from pdcorrect.fem import element_network  # the network only where it is needed
     from pdcorrect.fem.learned import ElementWriter
 
     materials = body.materials
-    writer = ElementWriter(element_network.released(), body, clamps.free)
+    path = scene.solver.weights
+    network = element_network.released() if path is None else element_network.read_network(path)
+    writer = ElementWriter(network, body, clamps.free)
     found = writer.correction(materials.mu, materials.volume_weight)
     count = int((~found.learned).sum())
     if count:

@@ -80,6 +80,9 @@ class Solver(Strict):
         being too soft.  "hex8-learned": that one with corrections by a network
         (`pdcorrect.fem.learned`); its mass is "averaged".  "hex27": triquadratic, 3x3x3
         Gauss points.
+    weights
+        Of "hex8-learned": a file as ``pdcorrect tune-element`` writes; by default those of the
+        package.  Other elements have none.
     tolerance
         Largest accepted estimate of a node's distance from the step's exact
         solution, as a fraction of the coarse cell size.
@@ -90,6 +93,7 @@ class Solver(Strict):
         "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex8-learned",
         "hex27",
     ] = "hex8"  # fmt: skip
+    weights: Path | None = None
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
 
     @model_validator(mode="before")
@@ -167,6 +171,9 @@ class Scene(TomlConfig):
         if isinstance(scene.body, MeshFile):  # relative to the scene file, from now on absolute
             found = (Path(path).parent / scene.body.path).resolve()
             scene = scene.with_changes(body={"path": found})
+        if scene.solver.weights is not None:
+            found = (Path(path).parent / scene.solver.weights).resolve()
+            scene = scene.with_changes(solver={"weights": found})
         return scene
 
     def with_changes(self, **sections: Any) -> Scene:

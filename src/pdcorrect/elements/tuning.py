@@ -1,0 +1,187 @@
+"""Tune the learned element to one body: the network learns that body's own linear answers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load, save
+
+from pdcorrect._environment import environment
+from pdcorrect._files import write_bytes, write_text
+from pdcorrect.elements.answers import answers
+from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
+from pdcorrect.elements.descent import Descent
+from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
+from pdcorrect.elements.network import ElementNetwork
+from pdcorrect.errors import InputError
+from pdcorrect.fem.element_network import MODEL, read_network
+from pdcorrect.fem.neighbourhood import on_grid
+from pdcorrect.fem.problem import Problem
+
+RATE = 2e-3
+_CELLS = 110
+"""Of a part of the body; a smaller body is learned whole."""
+_PARTS = 6
+_DRAWS = 2
+"""Sets of random loads on a body that is learned whole."""
+_SYMMETRIES = 6
+
+Report = Callable[[str], None]
+
+
+class Tuned(NamedTuple):
+    """Errors of the body's linear answers, as `means` has them: of its coarse model without
+    learning, with the weights that were there, and tuned.
+    """
+
+    without: dict[str, float]
+    before: dict[str, float]
+    after: dict[str, float]
+
+
+def tune(
+    problem: Problem,
+    path: Path,
+    *,
+    iterations: int = 120,
+    seed: int = 0,
+    report: Report = print,
+) -> Tuned:
+    """Write weights that are best for one body, and a card beside them.
+
+    They start from those of the scene (``solver.weights``), or from the released ones.  A body of
+    more than 110 cells is learned by parts of it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the coarse mesh, whatever its element.
+    path : Path
+        Of the weights; the card has the same name and the ending json.
+
+    Raises
+    ------
+    InputError
+        If cells are off the grid, no face of a cell is held, or there are several Poisson's
+        ratios.
+    """
+    body = own_body(problem)
+    rng = np.random.default_rng(seed)
+    whole = int(body.solid.sum()) <= _CELLS
+    bodies = [body] * _DRAWS if whole else [part(body, rng) for _ in range(_PARTS)]
+    report(f"linear answers of {'the body' if whole else f'{_PARTS} parts of the body'}")
+    samples = [sample(answers(b, rng)) for b in bodies]
+    batches = [collate(samples)] if whole else [collate([s]) for s in samples]
+    base = [errors(batch, None, None) for batch in batches]
+    nothing = [Errors(*(torch.zeros_like(e) for e in found)) for found in base]
+    torch.manual_seed(seed)
+    given = problem.scene.solver.weights
+    network = _network(MODEL if given is None else given)
+    before = means(_found(network, batches))
+    descent = Descent(network, RATE, iterations)
+    for i in range(iterations):
+        which = i % len(batches)
+        batch = batches[which]
+        symmetries = torch.as_tensor(rng.choice(48, _SYMMETRIES, replace=False))
+        found = network(batch.numbers, batch.neighbours, symmetries)
+        descent.step(loss(errors(batch, *found), nothing[which]).mean(), i)  # over the floors
+    tuned = Tuned(means(base), before, means(_found(network, batches)))
+    write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
+    card = {
+        "format": 1,
+        "scene": problem.scene.name,
+        "from": "released" if given is None else str(given),
+        "iterations": iterations,
+        "seed": seed,
+        **tuned._asdict(),
+        "environment": environment(),
+    }
+    write_text(path.with_suffix(".json"), json.dumps(card, indent=1) + "\n")
+    return tuned
+
+
+def own_body(problem: Problem) -> VoxelBody:
+    """A problem's body in cells of size 1, its first cell's modulus and density 1.
+
+    Raises
+    ------
+    InputError
+        See `tune`.
+    """
+    grid = on_grid(problem.positions, problem.cells)
+    poisson = np.unique(problem.materials.poisson)
+    if not grid.regular.all():
+        raise InputError(
+            f"{int((~grid.regular).sum())} of {len(grid.regular)} cells are off the grid: expected "
+            "cubic cells on one grid."
+        )
+    if len(poisson) > 1:
+        raise InputError(f"poisson = {', '.join(map(str, poisson))}: expected one for the body.")
+    places = grid.place - grid.place.min(axis=0)
+    shape = places.max(axis=0) + 1
+    solid, young, density = np.zeros(shape, dtype=bool), np.ones(shape), np.ones(shape)
+    at = tuple(places.T)
+    solid[at] = True
+    young[at] = problem.materials.young / problem.materials.young[0]
+    density[at] = problem.materials.density / problem.materials.density[0]
+    held = np.zeros(shape + 1, dtype=bool)
+    clamped = ~problem.free.any(axis=1)
+    corners = (problem.positions - problem.positions.min(axis=0)) / problem.cell_size
+    held[tuple(np.round(corners[clamped]).astype(int).T)] = True
+    if not holds(held, nodes_of(solid)):
+        raise InputError("no face of a cell is held, or nearly all nodes are: expected some.")
+    return VoxelBody("own", solid, held, young, density, float(poisson[0]))
+
+
+def part(body: VoxelBody, rng: np.random.Generator) -> VoxelBody:
+    """A box of the body with at most 110 cells, held where the body is, or at a side."""
+    places = np.argwhere(body.solid)
+    start = places[rng.integers(len(places))]
+    low, high = start.copy(), start + 1
+    while True:
+        grown = []
+        for side, axis in np.ndindex(2, 3):
+            a, b = low.copy(), high.copy()
+            a[axis], b[axis] = a[axis] - (1 - side), b[axis] + side
+            inside = a[axis] >= 0 and b[axis] <= body.solid.shape[axis]
+            if inside and body.solid[_box(a, b)].sum() <= _CELLS:
+                grown.append((a, b))
+        if not grown:
+            break
+        low, high = grown[rng.integers(len(grown))]
+    box = _box(low, high)
+    solid = connected(body.solid[box], tuple(start - low))
+    nodes = nodes_of(solid)
+    held: Grid = body.held[_box(low, high + 1)] & nodes
+    while not holds(held, nodes):
+        region = np.zeros_like(nodes)
+        np.moveaxis(region, int(rng.integers(3)), 0)[-int(rng.integers(2))] = True
+        held = region & nodes
+    return VoxelBody("part", solid, held, body.young[box], body.density[box], body.poisson)
+
+
+def _box(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, ...]:
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
+def _network(path: Path) -> ElementNetwork:
+    read_network(path)  # refuses what is no network
+    arrays = load(Path(path).read_bytes())
+    network = ElementNetwork(
+        len(arrays["first.bias"]),
+        sum(name.startswith("norms.") for name in arrays),
+        len(arrays["hidden.bias"]),
+    )
+    network.load_state_dict({name: value.float() for name, value in arrays.items()})
+    return network
+
+
+def _found(network: ElementNetwork, batches: list[Batch]) -> list[Errors]:
+    with torch.no_grad():
+        return [errors(b, *network(b.numbers, b.neighbours)) for b in batches]
