@@ -20,7 +20,7 @@ def scene(**changes):
 
 
 def test_a_body_is_learned_and_the_scene_reads_its_weights(tmp_path):
-    """Its two lowest frequencies come nearer to those of 4 x 4 x 4 cells; other scenes keep theirs."""
+    """Its two lowest frequencies come nearer to those of 4 x 4 x 4 cells."""
     own = scene()
     path = tmp_path / "own.safetensors"
     found = tune(pc.discretise(own), path, iterations=40, report=lambda _: None)

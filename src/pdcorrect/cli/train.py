@@ -134,7 +134,7 @@ def train_element(
 def tune_element(
     scene: Annotated[Path, typer.Argument(help="Scene, TOML.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="File of weights, *.safetensors.")],
-    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 120,
+    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 200,
     seed: Annotated[int, typer.Option(help="Of loads and order.", min=0)] = 0,
 ) -> None:
     """Tune the learned element to the body of one scene, in a minute (extra 'learn').

@@ -49,7 +49,7 @@ def tune(
     problem: Problem,
     path: Path,
     *,
-    iterations: int = 120,
+    iterations: int = 200,
     seed: int = 0,
     report: Report = print,
 ) -> Tuned:
@@ -79,19 +79,18 @@ def tune(
     samples = [sample(answers(b, rng)) for b in bodies]
     batches = [collate(samples)] if whole else [collate([s]) for s in samples]
     base = [errors(batch, None, None) for batch in batches]
-    nothing = [Errors(*(torch.zeros_like(e) for e in found)) for found in base]
     torch.manual_seed(seed)
     given = problem.scene.solver.weights
     network = _network(MODEL if given is None else given)
-    before = means(_found(network, batches))
+    started = _found(network, batches)
     descent = Descent(network, RATE, iterations)
     for i in range(iterations):
         which = i % len(batches)
         batch = batches[which]
         symmetries = torch.as_tensor(rng.choice(48, _SYMMETRIES, replace=False))
         found = network(batch.numbers, batch.neighbours, symmetries)
-        descent.step(loss(errors(batch, *found), nothing[which]).mean(), i)  # over the floors
-    tuned = Tuned(means(base), before, means(_found(network, batches)))
+        descent.step(loss(errors(batch, *found), started[which]).mean(), i)
+    tuned = Tuned(means(base), means(started), means(_found(network, batches)))
     write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
     card = {
         "format": 1,
