@@ -21,7 +21,8 @@ def scene(**changes):
 
 def test_a_body_is_learned_and_the_scene_reads_its_weights(tmp_path):
     """Its two lowest frequencies come nearer to those of 4 x 4 x 4 cells."""
-    own = scene()
+    ends = [{"region": {"plane": "x", "at": end}} for end in ("min", "max")]
+    own = beam((8, 2, 2), clamps=ends, solver={"element": "hex8-enhanced", "mass": "averaged"})
     path = tmp_path / "own.safetensors"
     found = tune(pc.discretise(own), path, iterations=40, report=lambda _: None)
     assert found.after["frequencies"] < 0.7 * found.before["frequencies"]
@@ -32,7 +33,7 @@ def test_a_body_is_learned_and_the_scene_reads_its_weights(tmp_path):
         np.abs(pc.modes(pc.discretise(s), 2).frequencies / right - 1.0).mean()
         for s in (pc.learned_coarse(own), tuned)
     ]
-    assert errors[1] < 0.75 * errors[0], errors
+    assert errors[1] < 0.5 * errors[0], errors
     runs = [
         pc.rollout(pc.ProjectiveDynamics(pc.discretise(s)), 1)
         for s in (pc.learned_coarse(own), tuned)
@@ -97,8 +98,12 @@ def test_bodies_that_cannot_be_learned_are_refused(changes, message):
         own_body(pc.discretise(scene(**changes)))
 
 
-def test_cells_off_the_grid_are_refused():
+def test_other_names_of_the_file_are_refused(tmp_path):
+    with pytest.raises(InputError, match="safetensors"):
+        tune(pc.discretise(scene()), tmp_path / "own.json")
 
+
+def test_cells_off_the_grid_are_refused():
     mesh = voxel_mesh(np.ones((3, 2, 2), dtype=bool), (0, 0, 0), 0.1)
     x = mesh.positions.copy()
     x[-1] += 0.03

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safetensors.torch import load, save
 
 from pdcorrect._environment import environment
-from pdcorrect._files import write_bytes, write_text
+from pdcorrect._files import make_folder, write_bytes, write_text
 from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
 from pdcorrect.elements.descent import Descent
@@ -68,10 +68,13 @@ def tune(
     Raises
     ------
     InputError
-        If cells are off the grid, no face of a cell is held, or there are several Poisson's
-        ratios.
+        If cells are off the grid, no face of a cell is held, there are several Poisson's
+        ratios, or the file's name does not end with safetensors.
     """
+    if path.suffix != ".safetensors":
+        raise InputError(f"{path}: expected a name that ends with .safetensors.")
     body = own_body(problem)
+    make_folder(path.parent)
     rng = np.random.default_rng(seed)
     whole = int(body.solid.sum()) <= _CELLS
     bodies = [body] * _DRAWS if whole else [part(body, rng) for _ in range(_PARTS)]

@@ -85,14 +85,14 @@ class Network:
             _, seen, kind = np.unique(keys, return_index=True, return_inverse=True)
             turn, cell = np.divmod(seen, len(graph.numbers))
             table = before[turn[:, None], graph.neighbours[cell[:, None], around[turn]]]
-            self_ = before[turn, cell]
+            itself = before[turn, cell]
             normed = np.append(_normed(features) * scale, np.zeros_like(features[:1]), axis=0)
             sums = [
                 convolution(normed[table[i : i + _ROWS]].reshape(len(table[i : i + _ROWS]), -1))
                 for i in range(0, len(table), _ROWS)
             ]
-            features = features[self_] + _silu(np.concatenate(sums))
-            first = first[self_]
+            features = features[itself] + _silu(np.concatenate(sums))
+            first = first[itself]
         found = self._last(_silu(self._hidden(np.concatenate([features, first], axis=1))))
         found = found[kind].reshape(48, len(graph.numbers), -1)
         split = halves(STRAINS).places.shape[1]

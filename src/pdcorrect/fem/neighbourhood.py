@@ -134,7 +134,8 @@ def contrasts(index: NDArray[np.int64], young: Array, reach: int) -> Array:
         grid = np.full(shape, fill)
         grid[tuple(index.T)] = young
         extremes.append(extreme(grid, size, mode="constant", cval=fill)[tuple(index.T)])
-    return np.asarray(extremes[0] / extremes[1])
+    with np.errstate(invalid="ignore"):  # only cells of no modulus in reach
+        return np.asarray(extremes[0] / extremes[1])
 
 
 @lru_cache(maxsize=1)
