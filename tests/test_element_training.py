@@ -54,7 +54,7 @@ def test_bodies_hang_together_and_are_held():
         again = draw(np.random.default_rng(seed))
         assert (again.solid == body.solid).all()
         assert again.poisson == body.poisson
-    assert len(kinds) == 7
+    assert len(kinds) == 8
 
 
 def test_the_coarse_model_without_corrections_is_the_best_coarse_one(found):

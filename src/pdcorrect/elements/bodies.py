@@ -11,7 +11,9 @@ Array = NDArray[np.float64]
 Grid = NDArray[np.bool_]
 
 _LARGEST = (12, 6, 6)
-"""Cells along the axes of the box that a body lies in, before its axes are permuted."""
+"""Cells along the axes of the box that most bodies lie in, before its axes are permuted."""
+_LONGEST = 24
+"""Cells along a member: long ones part what its ends do from what its middle does."""
 _FEWEST, _MOST = 4, 110
 """Cells of a body."""
 _MOST_HELD = 0.6
@@ -75,8 +77,18 @@ def nodes_of(cells: Grid) -> Grid:
 
 
 def _beam(rng: np.random.Generator) -> Grid:
-    thick = rng.integers(1, 5, size=2)
-    return np.ones((rng.integers(3, _LARGEST[0] + 1), *thick), dtype=bool)
+    return np.ones((rng.integers(3, _LONGEST + 1), *rng.integers(1, 5, size=2)), dtype=bool)
+
+
+def _elbow(rng: np.random.Generator) -> Grid:
+    """Two members at right angles; the second leaves the first at its end or elsewhere."""
+    long, other = rng.integers(4, 13, size=2)
+    first, second, depth = rng.integers(1, 4, size=3)
+    solid = np.zeros((long, first + other, depth), dtype=bool)
+    solid[:, :first] = True
+    start = rng.integers(0, max(1, long - second + 1)) if rng.random() < 0.5 else 0
+    solid[start : start + second, :, : rng.integers(1, depth + 1)] = True
+    return solid
 
 
 def _plate(rng: np.random.Generator) -> Grid:
@@ -100,7 +112,7 @@ def _holed(rng: np.random.Generator) -> Grid:
 
 
 def _frame(rng: np.random.Generator) -> Grid:
-    a, b, depth = rng.integers(4, 9), rng.integers(4, 8), rng.integers(1, 4)
+    a, b, depth = rng.integers(4, 12), rng.integers(4, 10), rng.integers(1, 4)
     wall = rng.integers(1, 3)
     solid = np.ones((a, b, depth), dtype=bool)
     solid[wall : a - wall, wall : b - wall] = False
@@ -132,6 +144,7 @@ def _random(rng: np.random.Generator) -> Grid:
 
 _SHAPES = {
     "beam": _beam,
+    "elbow": _elbow,
     "plate": _plate,
     "union": _union,
     "holed": _holed,
@@ -186,9 +199,13 @@ def _held(solid: Grid, rng: np.random.Generator) -> Grid:
     """Nodes of one or two faces of the body's box, or of parts of them; seldom an edge besides."""
     nodes = nodes_of(solid)
     held = np.zeros_like(nodes)
+    long = int(np.argmax(solid.shape))
+    axis, side = long if rng.random() < 0.4 else int(rng.integers(3)), int(rng.integers(2))
     for _ in range(1 if rng.random() < 0.7 else 2):
-        axis, side = int(rng.integers(3)), int(rng.integers(2))
         held |= _on_side(nodes, axis, side, rng, least=2 if rng.random() < 0.35 else None)
+        side = 1 - side
+        if rng.random() < 0.5:
+            axis, side = int(rng.integers(3)), int(rng.integers(2))
     if rng.random() < 0.1:
         held |= _on_side(nodes, int(rng.integers(3)), int(rng.integers(2)), rng, least=1)
     return held & nodes

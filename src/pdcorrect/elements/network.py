@@ -29,7 +29,7 @@ class ElementNetwork(nn.Module):
     own: Tensor
     around: Tensor
 
-    def __init__(self, width: int = 48, rounds: int = 3, head: int = 128) -> None:
+    def __init__(self, width: int = 96, rounds: int = 3, head: int = 128) -> None:
         super().__init__()
         self.first = nn.Linear(SIZE, width)
         self.rounds = nn.ModuleList(nn.Linear(NEIGHBOURS * width, width) for _ in range(rounds))

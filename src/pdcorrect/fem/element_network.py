@@ -30,7 +30,7 @@ _ROWS = 4096
 
 
 class Network:
-    """The graph network that writes N, by NumPy, in the precision of its weights.
+    """The graph network that writes N, by NumPy, in the precision of its weights or single.
 
     Parameters
     ----------
@@ -50,6 +50,9 @@ class Network:
 
     def __init__(self, arrays: dict[str, NDArray[Any]], digest: str = "") -> None:
         self.digest = digest
+        arrays = {
+            k: a.astype(np.float32) if a.dtype == np.float16 else a for k, a in arrays.items()
+        }
         self._first, self._hidden, self._last = (
             _Linear(arrays[f"{name}.weight"], arrays[f"{name}.bias"])
             for name in ("first", "hidden", "last")
