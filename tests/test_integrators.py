@@ -406,3 +406,41 @@ def test_so_it_is_in_batches(name, before):
     expected = stepper(stepper.state([replace(state, memory={})])).state
     assert found.positions.equal(expected.positions)
     assert set(found.memory) == set(expected.memory)
+
+
+@pytest.mark.parametrize("integrator", ["generalised-alpha", "bdf2", "midpoint", "backward-euler"])
+def test_substeps_are_shorter_steps_of_which_frames_are_kept(integrator):
+    scene = beam(time={"step": 0.02, "frames": 3, "substeps": 4, "integrator": integrator})
+    run = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
+    short = scene.with_changes(time={"step": 0.005, "frames": 12, "substeps": 1})
+    every = pc.rollout(pc.ProjectiveDynamics(pc.discretise(short)))
+    assert (run.positions == every.positions[::4]).all()
+    assert (run.velocities == every.velocities[::4]).all()
+    assert run.times == pytest.approx(0.02 * np.arange(4))
+    for name in ("iterations", "external_work", "evaluations"):
+        assert run.stats[name] == pytest.approx(every.stats[name].reshape(3, 4).sum(axis=1))
+    for name in ("residual", "error_estimate"):
+        assert (run.stats[name] == every.stats[name].reshape(3, 4).max(axis=1)).all()
+    assert (run.stats["elastic_energy"] == every.stats["elastic_energy"][3::4]).all()
+    left, expected = (pc.metrics.energy_balance(r).dissipation for r in (run, every))
+    assert left == pytest.approx(expected[::4], abs=1e-9 * np.abs(expected).max())
+
+
+def test_a_run_of_substeps_goes_on_from_a_frame():
+    scene = beam(time={"step": 0.02, "frames": 4, "substeps": 3})
+    stepper = pc.ProjectiveDynamics(pc.discretise(scene))
+    whole = pc.rollout(stepper)
+    first = pc.rollout(stepper, 2)
+    rest = pc.rollout(stepper, 2, state=first.state(-1))
+    assert (rest.positions[1:] == whole.positions[3:]).all()
+
+
+def test_a_frame_whose_substep_fails_is_named():
+    scene = beam(time={"step": 0.02, "frames": 4, "substeps": 2})
+    stepper = pc.ProjectiveDynamics(pc.discretise(scene), max_iterations=1, recover=False)
+    with pytest.raises(pc.errors.ConvergenceError, match="frame 1 "):
+        pc.rollout(stepper)
+    assert len(pc.rollout(stepper, on_failure="stop")) == 0
+    run = pc.rollout(stepper, on_failure="continue")
+    assert len(run) == 4
+    assert set(run.stats["status"]) == {"ITERATION_LIMIT"}

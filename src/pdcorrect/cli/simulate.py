@@ -194,7 +194,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
     say(
-        f"{ran} of {stepper.describe()['time_step']} s on {len(problem.positions)} nodes "
+        f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
         f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
         f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
     )
@@ -212,7 +212,7 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
         f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
     )
-    say(inverted_frames(stats, problem.time_step))
+    say(inverted_frames(stats, problem.scene.time.step))
     if problem.scene.time.integrator != "quasi-static":
         say(gained_energy(stats))
 

@@ -269,6 +269,10 @@ def hybrid_of(
     if loaded.base not in BASES:
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
     _check_integrator(scene.time.integrator, loaded.integrator, name)
+    if scene.time.substeps > 1:
+        raise InputError(
+            f"{name}: time.substeps = {scene.time.substeps}: expected 1, it corrects whole frames."
+        )
     chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
     if problem is None:
         problem = coarse_model(scene, loaded.base)

@@ -268,8 +268,8 @@ def _in_step(scene: Scene, time_step: float) -> tuple[Scene, float]:
     """A scene and a time step (s) that agree: where they nearly do, by the scene's."""
     check_scene(scene)
     if math.isclose(time_step, scene.time.step, rel_tol=1e-6):
-        return scene, scene.time.step
-    return scene.with_changes(time={"step": time_step}), time_step
+        time_step = scene.time.step
+    return scene.with_changes(time={"step": time_step, "substeps": 1}), time_step
 
 
 def _stepper(scene: Scene, mesh: HexMesh, body: dict[str, Array]) -> ProjectiveDynamics:

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from pdcorrect._environment import cache_folder, code_digest
 from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect._version import __version__
 from pdcorrect.errors import FileFormatError
-from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import discretise
 from pdcorrect.metrics import relative_error
 from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.solvers.rollout import march, run_attributes
-from pdcorrect.state import Status, StepResult
+from pdcorrect.solvers.rollout import restrict, rollout
+from pdcorrect.state import StepResult
 from pdcorrect.trajectory import Trajectory
 
 REFINE, DIVISOR = 4, 4
@@ -43,9 +41,9 @@ def converged(
     """The motion that a scene tends to as mesh and time step are refined.
 
     Computed with the element and mass of `best_coarse` on 4x4x4 cells for each coarse one, by
-    generalised-alpha of spectral radius 0.8 at a quarter of the scene's step; quasi-static scenes
-    at their own steps.  The run is kept in `cache_folder`, under a hash of the scene, its mesh
-    file and the code that computes it.
+    generalised-alpha of spectral radius 0.8 at a quarter of the scene's step, or at half its
+    substeps if those are shorter; quasi-static scenes at their own steps.  The run is kept in
+    `cache_folder`, under a hash of the scene, its mesh file and the code that computes it.
 
     Parameters
     ----------
@@ -87,55 +85,36 @@ def converged(
 
 
 def _computed(scene: Scene, refine: int, divisor: int, on_step: OnStep | None) -> Trajectory:
-    divisor = 1 if scene.time.integrator == "quasi-static" else divisor
     problem = discretise(_refined_in_time(best_coarse(scene), divisor), refine)
     coarse = discretise(best_coarse(scene))
-    nodes = coincident_nodes(problem.positions, coarse.positions, 1e-6 * problem.cell_size)
     stepper = ProjectiveDynamics(problem).prepare()
-    states, steps, rows = [problem.initial_state()], [], []
-    name = f"{refine}x{refine}x{refine} cells, step / {divisor}"
-    for number, (result, seconds) in enumerate(march(stepper), 1):
-        steps.append((result, seconds))
-        if number % divisor == 0:
-            states.append(result.state)
-            rows.append(_of_frame(steps))
-            steps.clear()
-            if on_step:
-                on_step(name, len(rows), scene.time.frames)
-    return Trajectory(
-        positions=np.stack([s.positions[nodes] for s in states]),
-        velocities=np.stack([s.velocities[nodes] for s in states]),
-        times=np.array([s.time for s in states]),
-        stats={key: np.array([row[key] for row in rows]) for key in rows[0]},
-        points=coarse.positions,
-        cells=coarse.cells,
+    name = f"{refine}x{refine}x{refine} cells, step / {problem.scene.time.substeps}"
+    count = itertools.count(1)
+
+    def told(_: StepResult, seconds: float) -> None:
+        if on_step:
+            on_step(name, next(count), scene.time.frames)
+
+    run = restrict(rollout(stepper, on_step=told), coarse)
+    return replace(
+        run,
         scene_toml=scene.to_toml(),
-        attributes={**run_attributes(stepper), "restricted": "to the nodes of the coarse mesh"},
+        attributes={**run.attributes, "restricted": "to the nodes of the coarse mesh"},
     )
 
 
 def _refined_in_time(scene: Scene, divisor: int) -> Scene:
-    """Errors of ``divisor`` times as many steps add up, so each is held the smaller."""
+    """With ``divisor`` substeps, or two to each of the scene's if those are more.
+
+    Errors of so many steps add up, so each is held the smaller.
+    """
     if scene.time.integrator == "quasi-static":
         return scene
-    step, frames = scene.time.step / divisor, scene.time.frames * divisor
+    substeps = max(divisor, divisor // 2 * scene.time.substeps)
     return scene.with_changes(
-        time={"step": step, "frames": frames, **_INTEGRATOR},
-        solver={"tolerance": scene.solver.tolerance / divisor**2},
+        time={"substeps": substeps, **_INTEGRATOR},
+        solver={"tolerance": scene.solver.tolerance / substeps**2},
     )
-
-
-def _of_frame(steps: list[tuple[StepResult, float]]) -> dict[str, str | int | float]:
-    """Statistics of the steps to a frame."""
-    results = [result for result, _ in steps]
-    unusual = [r.status for r in results if r.status is not Status.CONVERGED]
-    return {
-        "status": (unusual[0] if unusual else Status.CONVERGED).name,
-        "iterations": sum(r.iterations for r in results),
-        "residual": max(r.residual for r in results),
-        "error_estimate": max(r.error_estimate for r in results),
-        "seconds": sum(seconds for _, seconds in steps),
-    }
 
 
 def _own_error(scene: Scene, run: Trajectory, on_step: OnStep | None) -> dict[str, str]:

@@ -111,8 +111,8 @@ class Problem(ElasticBody):
 
     @property
     def time_step(self) -> float:
-        """The scene's step, s."""
-        return self.scene.time.step
+        """Of an integrator, s: the scene's step over its substeps."""
+        return self.scene.time.step / self.scene.time.substeps
 
     def rest_state(self) -> State:
         """Rest positions, no velocity, time zero."""
@@ -142,7 +142,7 @@ class Problem(ElasticBody):
                 PdcorrectWarning,
                 stacklevel=3,
             )
-        h = self.scene.time.step
+        h = self.time_step
         driven = (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
         return np.where(self.free, wanted, driven)
 

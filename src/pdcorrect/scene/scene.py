@@ -24,6 +24,8 @@ class Time(Strict):
 
     Attributes
     ----------
+    substeps
+        Of equal length, that a frame is made of instead of one step; a stepper's call is one.
     integrator
         "generalised-alpha" (second order, damps what the step is too long for), "bdf2"
         and "midpoint" (second order), "backward-euler" (the thesis's; first order,
@@ -34,6 +36,7 @@ class Time(Strict):
 
     step: Positive
     frames: PositiveCount
+    substeps: PositiveCount = 1
     integrator: Integrator = "generalised-alpha"
     spectral_radius: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.8
 

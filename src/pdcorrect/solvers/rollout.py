@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +17,7 @@ from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.implicit import whole
-from pdcorrect.state import State, StepResult
+from pdcorrect.state import State, Status, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
 
 Array = NDArray[np.float64]
@@ -35,9 +36,10 @@ def march(
     forces: Callable[[State], Array] | None = None,
     on_failure: OnFailure = "raise",
 ) -> Iterator[tuple[StepResult, float]]:
-    """Apply a stepper again and again, keeping nothing: yields each result and its seconds.
+    """Apply a stepper again and again, keeping nothing: yields each frame and its seconds.
 
-    Parameters are those of `rollout`.
+    Parameters are those of `rollout`.  A frame of several substeps has the state after them, the
+    sums of their iterations, works and losses, and the largest of their errors.
 
     Raises
     ------
@@ -51,15 +53,39 @@ def march(
     frames = whole("frames", problem.scene.time.frames if frames is None else frames)
     current = problem.initial_state() if state is None else state
     for frame in range(1, frames + 1):
-        started = time.perf_counter()
-        result = stepper(current, forces(current) if forces else None)
-        elapsed = time.perf_counter() - started
-        if not result.status.ok and on_failure != "continue":
-            if on_failure == "stop":
-                return
-            raise ConvergenceError(_failure(frame, result), result=result)
-        current = result.state
-        yield result, elapsed
+        started, results = time.perf_counter(), []
+        for _ in range(problem.scene.time.substeps):
+            result = stepper(current, forces(current) if forces else None)
+            if not result.status.ok and on_failure != "continue":
+                if on_failure == "stop":
+                    return
+                raise ConvergenceError(_failure(frame, result), result=result)
+            current = result.state
+            results.append(result)
+        yield _of_frame(results), time.perf_counter() - started
+
+
+_SUMMED = ("evaluations", "external_work", "clamp_work", "damping_loss")
+_LEAST = ("smallest_volume_ratio",)
+
+
+def _of_frame(results: list[StepResult]) -> StepResult:
+    """One result of all substeps."""
+    last = results[-1]
+    if len(results) == 1:
+        return last
+    unusual = [r.status for r in results if r.status is not Status.CONVERGED]
+    columns = {name: [r.stats[name] for r in results if name in r.stats] for name in last.stats}
+    joined = {name: sum(columns[name]) for name in _SUMMED if name in columns}
+    joined |= {name: min(columns[name]) for name in _LEAST if name in columns}
+    return replace(
+        last,
+        status=unusual[0] if unusual else Status.CONVERGED,
+        iterations=sum(r.iterations for r in results),
+        residual=max(r.residual for r in results),
+        error_estimate=max(r.error_estimate for r in results),
+        stats={**last.stats, **joined},
+    )
 
 
 def rollout(
@@ -79,13 +105,13 @@ def rollout(
         Projective dynamics, Newton, or anything that maps a state to a
         `StepResult`.
     frames : int, optional
-        Steps to take; the scene's by default.
+        To compute, each of the scene's substeps; the scene's by default.
     state : State, optional
         Where to start; `Problem.initial_state` by default.
     forces : callable, optional
         Extra nodal forces (N, 3), N, for the step from a state.
     on_step : callable, optional
-        Called with each `StepResult` and its wall-clock seconds: for progress.
+        Called with each frame's `StepResult` and its wall-clock seconds: for progress.
     on_failure : {"raise", "stop", "continue"}
         What to do after a step that failed: raise `ConvergenceError` (which
         carries the frames so far), return the frames so far, or go on from the
