@@ -251,26 +251,12 @@ def trainings(*studies: str) -> Rows:
     return ("training", "Ω mean", "median", "worst"), rows
 
 
-def other_bodies() -> Rows:
-    """Bodies of other sizes and families that the gate lets pass."""
-    rows = [
-        [
-            f"`{each['model']}`", each["bodies"], each["nodes"], percent(each["omega_base"]),
-            percent(each["omega"]), ", ".join(number(x, 2) for x in each["error_over_base"]),
-        ]
-        for each in read("models/withdrawn.json")["other_bodies"]
-    ]  # fmt: skip
-    head = ("model", "bodies", "nodes", "base: Ω", "corrected: Ω", "error over base's, each")
-    return head, rows
-
-
 def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "models": released, "recipes": recipes, "results": results, "losses": losses,
         "time-error": time_error,
         "further-splits": further_splits, "baselines": baselines, "withdrawn": withdrawn,
-        "other-bodies": other_bodies,
         "recipes-compared": partial(trainings, "recipes"),
         "changes-one-by-one": partial(trainings, "ablation"),
         "bodies-and-seeds": partial(trainings, "seeds", "bodies"),

@@ -43,6 +43,14 @@ def simulate(
     learned: Annotated[
         bool, typer.Option("--learned", help="With the learned element, whatever the scene's own.")
     ] = False,
+    estimate_error: Annotated[
+        bool,
+        typer.Option(
+            "--estimate-error",
+            help="Also how far the run is from the converged motion, by a finer one that takes "
+            "about ten times as long.",
+        ),
+    ] = False,
     frames: Frames = None,
     vtu: Annotated[
         Optional[Path],
@@ -79,6 +87,8 @@ def simulate(
         _summary(log.arrays(), stepper, before)
         _corrections(log.arrays(), getattr(stepper, "trained_step", ""))
         say(f"wrote {output}")
+    if estimate_error:
+        say(_estimated(load_trajectory(output)))
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
@@ -86,6 +96,22 @@ def simulate(
             load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
         )
         say(f"wrote {series}")
+
+
+def _estimated(run: Trajectory) -> str:
+    """The estimated error of a run, over all nodes and frames."""
+    import numpy as np
+
+    from pdcorrect.cli.common import progress_bar
+    from pdcorrect.evaluation.error_estimate import error_estimate
+    from pdcorrect.metrics import rms_error
+
+    with progress_bar() as progress:
+        task = progress.add_task("finer run", total=len(run))
+        found = error_estimate(run, on_step=lambda *_: progress.advance(task))
+    rest = np.broadcast_to(run.points, run.positions.shape)
+    error, size = 1e3 * np.sqrt((found[1:] ** 2).mean()), 1e3 * rms_error(run, rest)
+    return f"estimated error {error:.3g} mm of {size:.3g} mm (RMS over nodes and frames)"
 
 
 def _learned(scene: Scene, model: str | None) -> Scene:
