@@ -226,21 +226,6 @@ def _omega(found: Mapping[str, float] | None) -> str:
     return "" if found is None else f"{percent(found['mean'])}, {percent(found['smallest'])}"
 
 
-def withdrawn() -> Rows:
-    """Models that are no more."""
-    rows = [
-        [
-            f"`{model['name']}`", f"`{model['data']}`", percent(model["omega"]["mean"]),
-            interval(model["omega"]["interval"]), percent(model["omega"]["smallest"]),
-            percent(model["omega_base"]), number(model["stress_error"], 2),
-        ]
-        for model in read("models/withdrawn.json")["models"]
-    ]  # fmt: skip
-    head = ("model", "evaluation split of", "Ω mean", "95 %", "worst", "base alone",
-            "stress error, %")  # fmt: skip
-    return head, rows
-
-
 def trainings(*studies: str) -> Rows:
     """Other trainings of some studies."""
     found = [t for t in read("models/withdrawn.json")["trainings"] if t["study"] in studies]
@@ -256,7 +241,7 @@ def tables() -> Iterable[tuple[str, Any]]:
     yield from {
         "models": released, "recipes": recipes, "results": results, "losses": losses,
         "time-error": time_error,
-        "further-splits": further_splits, "baselines": baselines, "withdrawn": withdrawn,
+        "further-splits": further_splits, "baselines": baselines,
         "recipes-compared": partial(trainings, "recipes"),
         "changes-one-by-one": partial(trainings, "ablation"),
         "bodies-and-seeds": partial(trainings, "seeds", "bodies"),

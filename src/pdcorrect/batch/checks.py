@@ -73,7 +73,9 @@ def check_problems(
             values = (getattr(damping, name) for damping in (scene.damping, other.damping))
             pairs.append((f"damping.{name}", *values))
         if time_step is None:
-            pairs.append(("time step", problem.time_step, first.time_step))
+            for name in ("step", "substeps"):
+                mine, theirs = (getattr(s.time, name) for s in (scene, other))
+                pairs.append((f"time.{name}", mine, theirs))
         if integrator is None:
             pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
         name = other.time.integrator if integrator is None else integrator
