@@ -7,6 +7,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam, cross
+from pdcorrect.fem.element_network import MODEL
 
 
 def rms(x):
@@ -49,6 +50,11 @@ def test_of_statics_and_finer_meshes_and_files(tmp_path):
     pc.save_trajectory(tmp_path / "run.h5", coarse)
     again = pc.error_estimate(pc.load_trajectory(tmp_path / "run.h5"))
     assert (again == pc.error_estimate(coarse)).all()
+    tuned = pc.learned_coarse(scene).with_changes(solver={"weights": MODEL})
+    learned, same = (
+        pc.rollout(pc.Newton(pc.discretise(s))) for s in (pc.learned_coarse(scene), tuned)
+    )
+    assert (pc.error_estimate(learned) == pc.error_estimate(same)).all()
     hex27 = scene.with_changes(solver={"element": "hex27", "mass": "consistent"})
     run = pc.rollout(pc.Newton(pc.discretise(hex27)))
     assert pc.error_estimate(run).shape == run.positions.shape[:2]

@@ -55,7 +55,8 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> Array:
 
 
 def _finer(scene: Scene, refine: int) -> Problem:
-    """The scene as the estimate computes it."""
+    """The scene as the estimate computes it; weights tuned to a body do not know finer cells."""
+    scene = scene.with_changes(solver={"weights": None})
     if scene.time.integrator != "quasi-static":
         scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **_INTEGRATOR})
     return discretise(learned_coarse(scene), FINER * refine)
