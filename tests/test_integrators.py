@@ -444,3 +444,17 @@ def test_a_frame_whose_substep_fails_is_named():
     run = pc.rollout(stepper, on_failure="continue")
     assert len(run) == 4
     assert set(run.stats["status"]) == {"ITERATION_LIMIT"}
+
+
+def test_a_frame_has_the_status_of_the_substep_that_failed():
+    problem = pc.discretise(beam(time={"step": 0.02, "frames": 2, "substeps": 3}))
+    told = iter(
+        ["RECOVERED", "ITERATION_LIMIT", "CONVERGED", "CONVERGED", "RECOVERED", "CONVERGED"]
+    )
+
+    def stepper(state, forces=None):
+        return pc.StepResult(state, pc.Status[next(told)], 1, 0.0, 0.0)
+
+    stepper.problem = problem
+    statuses = [result.status.name for result, _ in pc.march(stepper, on_failure="continue")]
+    assert statuses == ["ITERATION_LIMIT", "RECOVERED"]

@@ -75,6 +75,7 @@ def _of_frame(results: list[StepResult]) -> StepResult:
     if len(results) == 1:
         return last
     unusual = [r.status for r in results if r.status is not Status.CONVERGED]
+    unusual.sort(key=lambda status: status.ok)  # what failed counts most
     columns = {name: [r.stats[name] for r in results if name in r.stats] for name in last.stats}
     joined = {name: sum(columns[name]) for name in _SUMMED if name in columns}
     joined |= {name: min(columns[name]) for name in _LEAST if name in columns}
