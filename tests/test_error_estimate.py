@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 import pdcorrect as pc
 from conftest import beam, cross
@@ -50,11 +51,12 @@ def test_of_statics_and_finer_meshes_and_files(tmp_path):
     pc.save_trajectory(tmp_path / "run.h5", coarse)
     again = pc.error_estimate(pc.load_trajectory(tmp_path / "run.h5"))
     assert (again == pc.error_estimate(coarse)).all()
-    tuned = pc.learned_coarse(scene).with_changes(solver={"weights": MODEL})
-    learned, same = (
-        pc.rollout(pc.Newton(pc.discretise(s))) for s in (pc.learned_coarse(scene), tuned)
-    )
-    assert (pc.error_estimate(learned) == pc.error_estimate(same)).all()
+    weights = {name: (0.5 * array).astype(array.dtype) for name, array in load_file(MODEL).items()}
+    save_file(weights, tmp_path / "tuned.safetensors")
+    tuned = {"solver": {"weights": tmp_path / "tuned.safetensors"}}
+    known = pc.rollout(pc.Newton(pc.discretise(pc.learned_coarse(scene))))
+    told = pc.learned_coarse(scene).with_changes(**tuned).to_toml()
+    assert (pc.error_estimate(known) == pc.error_estimate(replace(known, scene_toml=told))).all()
     hex27 = scene.with_changes(solver={"element": "hex27", "mass": "consistent"})
     run = pc.rollout(pc.Newton(pc.discretise(hex27)))
     assert pc.error_estimate(run).shape == run.positions.shape[:2]
@@ -65,8 +67,12 @@ def test_refuses_runs_that_their_scene_does_not_tell(tmp_path):
     run = pc.rollout(pc.ProjectiveDynamics(problem))
     with pytest.raises(pc.errors.InputError, match="expected a Trajectory"):
         pc.error_estimate(run.positions)
-    with pytest.raises(pc.errors.InputError, match="begins with another state"):
-        pc.error_estimate(pc.rollout(pc.ProjectiveDynamics(problem), state=run.state(-1)))
+    for other in ({"time_step": 0.005}, {"integrator": "quasi-static"}):
+        with pytest.raises(pc.errors.InputError, match="not at the times of its scene"):
+            pc.error_estimate(pc.rollout(pc.ProjectiveDynamics(problem, **other)))
+    later = pc.rollout(pc.ProjectiveDynamics(problem), state=run.state(-1))
+    with pytest.raises(pc.errors.InputError, match="not at the times of its scene"):
+        pc.error_estimate(later)
     moving = replace(problem.initial_state(), velocities=1.0 * problem.free)
     with pytest.raises(pc.errors.InputError, match="begins with another state"):
         pc.error_estimate(pc.rollout(pc.ProjectiveDynamics(problem), state=moving))

@@ -458,3 +458,11 @@ def test_a_frame_has_the_status_of_the_substep_that_failed():
     stepper.problem = problem
     statuses = [result.status.name for result, _ in pc.march(stepper, on_failure="continue")]
     assert statuses == ["ITERATION_LIMIT", "RECOVERED"]
+
+
+def test_a_lagged_hessian_and_correctors_refuse_substeps():
+    problem = pc.discretise(beam(time={"step": 0.02, "frames": 2, "substeps": 3}))
+    with pytest.raises(pc.errors.InputError, match="'lagged' with time.substeps = 3"):
+        pc.ProjectiveDynamics(problem, first_hessian="lagged")
+    with pytest.raises(pc.errors.InputError, match="time.substeps = 3"):
+        pc.HybridStepper(pc.ProjectiveDynamics(problem), None)

@@ -48,7 +48,7 @@ def simulate(
         typer.Option(
             "--estimate-error",
             help="Also how far the run is from the converged motion, by a finer one that takes "
-            "about ten times as long.",
+            "10 to 20 times as long.",
         ),
     ] = False,
     frames: Frames = None,
@@ -87,8 +87,6 @@ def simulate(
         _summary(log.arrays(), stepper, before)
         _corrections(log.arrays(), getattr(stepper, "trained_step", ""))
         say(f"wrote {output}")
-    if estimate_error:
-        say(_estimated(load_trajectory(output)))
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
@@ -96,6 +94,8 @@ def simulate(
             load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
         )
         say(f"wrote {series}")
+    if estimate_error:
+        say(_estimated(load_trajectory(output)))
 
 
 def _estimated(run: Trajectory) -> str:

@@ -113,6 +113,9 @@ class HybridStepper:
                 "ProjectiveDynamics(problem) or Newton(problem)."
             )
         self.coarse, self.problem = coarse_stepper, coarse_stepper.problem
+        substeps = self.problem.scene.time.substeps
+        if substeps > 1:
+            raise InputError(f"time.substeps = {substeps}: expected 1, frames are corrected whole.")
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate, corrector)
@@ -269,10 +272,6 @@ def hybrid_of(
     if loaded.base not in BASES:
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
     _check_integrator(scene.time.integrator, loaded.integrator, name)
-    if scene.time.substeps > 1:
-        raise InputError(
-            f"{name}: time.substeps = {scene.time.substeps}: expected 1, it corrects whole frames."
-        )
     chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
     if problem is None:
         problem = coarse_model(scene, loaded.base)

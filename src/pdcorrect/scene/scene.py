@@ -20,7 +20,7 @@ Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", 
 
 
 class Time(Strict):
-    """Step size (s), number of frames (one frame is one step), and the integrator.
+    """Step size (s), number of frames (one step each, or its substeps), and the integrator.
 
     Attributes
     ----------

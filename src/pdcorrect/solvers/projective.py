@@ -91,6 +91,11 @@ class ProjectiveDynamics(ImplicitStepper):
             general = backend in ("cholespy", "splu")
             self.first_hessian = "G" if plain else "G-scaled" if general else "rest"
         self._true: TrueHessian | None = None
+        if self.first_hessian == "lagged" and problem.scene.time.substeps > 1:
+            raise InputError(
+                f"first_hessian = 'lagged' with time.substeps = {problem.scene.time.substeps}: "
+                "expected 1, for it is resumed from the states of all its steps."
+            )
         if self.first_hessian in ("rest", "lagged"):
             tangents = TangentFactory(problem, backend)
             self._true = TrueHessian(tangents, lagged=self.first_hessian == "lagged")
