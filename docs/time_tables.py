@@ -50,12 +50,15 @@ def errors() -> Rows:
 
 
 def unlike_bodies() -> Rows:
-    """Errors of all runs on unlike bodies, and their times."""
+    """Errors of all runs on unlike bodies, and their times; of runs with equal errors the first."""
     heads, rows = table_of("unlike_bodies", "Errors, % of the RMS displacement")
     short = [head.replace(", backward-euler", ", BE").replace(", generalised-alpha", ", gen.-α")
              for head in heads]  # fmt: skip
-    cells = [[row[0], *("" if x == "" else number(x, 2) for x in row[2:])] for row in rows]
-    return (short[0], *short[2:]), cells
+    rows = [[row[0], *("" if x == "" else number(x, 2) for x in row[2:])] for row in rows]
+    errors = [tuple(row[k] for row in rows[:-1]) for k in range(len(rows[0]))]
+    kept = [k for k, column in enumerate(errors) if column not in errors[:k]]
+    heads = (short[0], *short[2:])
+    return tuple(heads[k] for k in kept), [[row[k] for k in kept] for row in rows]
 
 
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:

@@ -27,7 +27,7 @@ REFINE, DIVISOR = 4, 4
 TIME_ERROR, MESH_ERROR, MESH_CHECK = "time_error", "mesh_error", "mesh_error_from"
 """Attributes of runs whose own error was asked for."""
 
-_INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
+INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
 _MOST_CELLS = 60_000
 """Of a mesh that is only for the estimate of another's error."""
 
@@ -112,7 +112,7 @@ def _refined_in_time(scene: Scene, divisor: int) -> Scene:
         return scene
     substeps = max(divisor, divisor // 2 * scene.time.substeps)
     return scene.with_changes(
-        time={"substeps": substeps, **_INTEGRATOR},
+        time={"substeps": substeps, **INTEGRATOR},
         solver={"tolerance": scene.solver.tolerance / substeps**2},
     )
 

@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.evaluation.converged import INTEGRATOR
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, learned_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.solvers.rollout import DENSITY_CHANGED, OnStep, restrict, rollout
+from pdcorrect.solvers.rollout import OWN_MATERIAL, OnStep, restrict, rollout
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
 FINER = 2
 """Times as many cells along each axis, and substeps."""
-_INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
 _SAME = 1e-9
 """Of the cell size, for states that are the same."""
 
@@ -64,7 +64,7 @@ def _finer(scene: Scene, refine: int) -> Problem:
     """The scene as the estimate computes it; weights tuned to a body do not know finer cells."""
     scene = scene.with_changes(solver={"weights": None})
     if scene.time.integrator != "quasi-static":
-        scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **_INTEGRATOR})
+        scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **INTEGRATOR})
     return discretise(learned_coarse(scene), FINER * refine)
 
 
@@ -80,8 +80,8 @@ def _check_steps(run: Trajectory, scene: Scene) -> None:
 
 
 def _check_begin(run: Trajectory, problem: Problem) -> None:
-    material = run.attributes.get("material", "")
-    if material in ("changed after the scene", DENSITY_CHANGED):
+    material = run.attributes.get("material", OWN_MATERIAL)
+    if material != OWN_MATERIAL:
         raise InputError(f"the run's material is {material}: expected that of its scene.")
     begin = problem.initial_state()
     start = restrict(

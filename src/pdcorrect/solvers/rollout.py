@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 OnStep = Callable[[StepResult, float], None]
 DENSITY_CHANGED = "the scene's but for its density"
 """Attribute "material" of runs of `Problem.with_total_mass`."""
+OWN_MATERIAL = "the scene's"
+"""The same of most runs."""
 
 OnFailure = Literal["raise", "stop", "continue"]
 
@@ -247,7 +249,7 @@ def _material(problem: Problem) -> str:
     """Whether it is the scene's; a density that was changed alone is told, for stress has none."""
     if problem.material_changed:
         return "changed after the scene"
-    return DENSITY_CHANGED if problem.density_changed else "the scene's"
+    return DENSITY_CHANGED if problem.density_changed else OWN_MATERIAL
 
 
 def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
