@@ -1,14 +1,15 @@
-"""Measure what needs no network beside a data set's reference: elements, mass, a fitted stiffness.
+"""Measure what needs no training beside a data set's reference: elements, mass, fitted stiffness.
 
 python models/baselines.py DATA -o OUTPUT [--split evaluation] [--device cuda] [--batch 60]
     [--workers 2] [--fit 40] [--fit-split validation]
 
-The plain coarse mesh is stepped again with other elements, with the consistent mass, and with
-Young's modulus times one factor for the whole data set, which makes the mean Omega of the first
-``--fit`` simulations of ``--fit-split`` largest (by default of the training split, or, with a note,
-of the split itself where there is none).  They are measured like correctors, by
-`pdcorrect.evaluation.evaluate`, beside the stored runs; OUTPUT gets the same files as by
-``pdcorrect evaluate``.  Scenes of mesh files cannot be discretised again and are refused.
+The plain coarse mesh is stepped again with other elements, the learned one among them, with the
+consistent mass, and, unless ``--fit`` is 0, with Young's modulus times one factor for the whole
+data set, which makes the mean Omega of the first ``--fit`` simulations of ``--fit-split`` largest
+(by default of the training split, or, with a note, of the split itself where there is none).  They
+are measured like correctors, by `pdcorrect.evaluation.evaluate`, beside the stored runs; OUTPUT
+gets the same files as by ``pdcorrect evaluate``.  Scenes of mesh files cannot be discretised again
+and are refused.
 """
 
 from __future__ import annotations
@@ -126,13 +127,20 @@ def main() -> None:
     split = options.fit_split or TRAINING
     if options.fit_split is None and not (options.data / TRAINING).is_dir():
         split = options.split
-    cases = read_cases(options.data, split, skip_damaged=False).cases[: options.fit]
-    factor = fitted(cases, options.device, options.batch)
     changes = {
         **{name: with_solver(element=name) for name in ELEMENTS},
+        "hex8-learned": with_solver(element="hex8-learned", mass="averaged"),
         "consistent mass": with_solver(mass="consistent"),
-        "fitted stiffness": with_stiffness(factor),
     }
+    notes, more = [], {}
+    if options.fit:
+        cases = read_cases(options.data, split, skip_damaged=False).cases[: options.fit]
+        factor = fitted(cases, options.device, options.batch)
+        changes["fitted stiffness"], more["stiffness_factor"] = with_stiffness(factor), factor
+        notes.append(
+            f"Young's modulus times {factor:.3f}, fitted to {len(cases)} simulations of {split}"
+            + (", the split itself: too good" if split == options.split else "")
+        )
     candidates = [
         Candidate(name, PLAIN, lambda stepper, change=change: Uncorrected(stepper, change))
         for name, change in changes.items()
@@ -141,12 +149,8 @@ def main() -> None:
         candidates, options.data, options.split, device=options.device, batch=options.batch,
         workers=options.workers,
     )  # fmt: skip
-    notes = [
-        f"Young's modulus times {factor:.3f}, fitted to {len(cases)} simulations of {split}"
-        + (", the split itself: too good" if split == options.split else "")
-    ]
     print(markdown(found), *notes, sep="\n")
-    record = {**origin(), "stiffness_factor": factor, "notes": notes}
+    record = {**origin(), **more, "notes": notes}
     for path in write_evaluation(found, options.output, record, notes):
         print(f"wrote {path}")
 

@@ -6,8 +6,11 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, cross, problem_on
+from pdcorrect.elements.answers import unit_cell
+from pdcorrect.elements.linear import unit_strains
 from pdcorrect.errors import PdcorrectWarning, SceneError
 from pdcorrect.fem import element_network, learned
+from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
 from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, CellGraph, cell_graph, permutations
@@ -57,6 +60,15 @@ def test_the_corrections_are_large_enough_to_test(any_network):
     S = learned.bounded(np, N)
     assert 0.2 < np.abs(np.linalg.eigvalsh(S)).max() < learned.BOUND + 1e-12
     assert np.abs(np.linalg.eigvalsh(learned.bounded(np, H))).max() > 0.2
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.495])
+def test_the_stiffness_to_changes_of_volume_changes_within_its_bound(poisson):
+    """By no more than 30 %, or the bound times three times the shear stiffness."""
+    C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
+    shear, own = 1.0 / (1.0 + poisson), 1.0 / (1.0 - 2.0 * poisson)
+    most = max(min(own, 3.0 * shear) * learned.BOUND, 0.3 * own)
+    assert learned.BOUND * np.linalg.eigvalsh(C[:6, :6]).max() == pytest.approx(most, rel=1e-6)
 
 
 @pytest.mark.parametrize("g", [3, 17, 40])
@@ -130,6 +142,28 @@ def test_strains_are_corrected_at_held_corners_only():
     held = ~problem.free.any(axis=1)[problem.cells]
     assert (strains[held.any(axis=1)] > 0.0).all()
     assert (strains[~held.any(axis=1)] == 0.0).all()
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.48, 0.495])
+def test_no_correction_makes_a_drawn_out_cell_burst(poisson):
+    """With all that may be taken away the energy is positive to twice the size, and grows beyond."""
+    mesh = voxel_mesh(np.ones((1, 1, 1), dtype=bool), (0, 0, 0), 1.0)
+    plain = problem_on(mesh, "hex8-enhanced", material={"young": 1.0, "poisson": poisson})
+    C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
+    shapes, sizes = cell_shapes(mesh.positions[mesh.cells])
+    less = CellCorrection(
+        mesh.cells, shapes, sizes, -learned.BOUND * C[None], np.zeros((1, 8, 8)), np.array([True])
+    )
+    rng = np.random.default_rng(8)
+
+    def energy(stretches):
+        V = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        x = mesh.positions @ V @ np.diag(stretches) @ V.T
+        return plain.energy(x) + less.energy_and_forces(x - mesh.positions)[0]
+
+    assert min(energy(s) for s in np.exp(rng.uniform(-0.8, 0.8, (60, 3)))) > 0.0
+    for far in ([2.0, 1.0, 1.0], [2.0, 2.0, 1.0], [2.0, 2.0, 2.0]):
+        assert energy(10.0 * np.array(far)) > energy(5.0 * np.array(far)) > 0.0
 
 
 def test_what_the_matrices_depend_on_has_no_units():

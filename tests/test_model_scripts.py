@@ -22,6 +22,7 @@ from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
 from pdcorrect.evaluation.measures import read_cases  # noqa: E402
+from pdcorrect.fem.neighbourhood import cell_graph  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 TINY = ROOT / "datasets" / "tiny"
@@ -174,6 +175,29 @@ def test_baselines_are_steps_of_changed_problems():
     same = baselines.with_solver(element="hex8-bubble-mean", mass="averaged")
     assert omega(same) == pytest.approx(np.mean(best), abs=0.1)
     assert omega(baselines.with_stiffness(0.5)) < -50
+
+
+def test_studies_of_the_element_leave_out_what_they_say():
+    studies = script("models/element_studies.py")
+    rng = np.random.default_rng(0)
+    solid = np.argwhere(np.ones((2, 2, 1)))
+    graph = cell_graph(solid, np.ones(4), np.full(4, 0.3), rng.integers(0, 2, (4, 8)).astype(float))
+    seen = torch.as_tensor(graph.numbers).float(), torch.as_tensor(graph.neighbours)
+    answers = {}
+    for kind in (studies.ElementNetwork, studies.WithoutMass, studies.OneOrientation):
+        torch.manual_seed(0)
+        network = kind(8, 1)
+        torch.nn.init.normal_(network.last.weight)
+        with torch.no_grad():
+            answers[kind] = network(*seen)
+    full, without, one = answers.values()
+    assert torch.equal(without[0], full[0])
+    assert not without[1].any()
+    assert full[1].any()
+    first = torch.zeros(1, dtype=torch.int64)
+    assert not torch.allclose(one[0], full[0])
+    with torch.no_grad():
+        assert torch.equal(network(*seen, torch.arange(48))[0], network(*seen, first)[0])
 
 
 @pytest.mark.slow

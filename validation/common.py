@@ -28,9 +28,12 @@ ELEMENT_STYLES = {
     "hex8-bubble-mean": ("#d55e00", "^"),
     "hex8-enhanced": ("#cc79a7", "P"),
     "hex27": ("#009e73", "v"),
+    "hex8-learned": ("#56b4e9", "X"),
 }
 """Colour and mark of each element in pictures."""
 ELEMENTS = tuple(ELEMENT_STYLES)
+OFF_GRIDS = tuple(name for name in ELEMENTS if name != "hex8-learned")
+"""For cells that are no cubes; the learned element is `hex8-enhanced` there."""
 STATIC = {"step": 1.0, "frames": 1, "integrator": "quasi-static"}
 SMALL = 1e-4
 """Deflection over length at which the geometric nonlinearity is far below 0.1 %."""

@@ -31,6 +31,9 @@ SLIDING = [
 ]
 
 
+MASS = {"hex8-learned": "averaged"}
+
+
 def beam(element: str, across: int, length: float = LENGTH, **settings: Any) -> pc.Problem:
     """Cubic cells, ``across`` of them through the thickness; the axis is y = z = 0."""
     size = SIDE / across
@@ -41,10 +44,9 @@ def beam(element: str, across: int, length: float = LENGTH, **settings: Any) -> 
         "origin": [0.0, -SIDE / 2, -SIDE / 2],
     }
     material = {"young": YOUNG, "poisson": POISSON, "density": DENSITY}
-    scene = pc.Scene(
-        body=body, material=material, time=common.STATIC, solver={"mass": "consistent"}, **settings
-    )
-    return pc.discretise(scene, element=element)
+    solver = {"element": element, "mass": MASS.get(element, "consistent")}
+    scene = pc.Scene(body=body, material=material, time=common.STATIC, solver=solver, **settings)
+    return pc.discretise(scene)
 
 
 def end_shear(element: str, across: int, clamps: list[dict[str, Any]]) -> float:

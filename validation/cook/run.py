@@ -93,7 +93,7 @@ PROBLEMS = {
 
 def compute(
     problems: Sequence[str] = tuple(PROBLEMS),
-    elements: Sequence[str] = common.ELEMENTS,
+    elements: Sequence[str] = common.OFF_GRIDS,
     sizes: Sequence[int] = SIZES,
 ) -> common.Figures:
     """Lifts by problem, element and cells along an edge."""
@@ -118,7 +118,8 @@ def draw(record: common.Record, path: Path) -> None:
     """Lifts against cells along an edge, a panel a problem, with the published values."""
     figure, panels = common.panels(12, 3.7, len(PROBLEMS))
     for axis, problem in zip(panels, PROBLEMS, strict=True):
-        for element, (colour, mark) in common.ELEMENT_STYLES.items():
+        for element in common.OFF_GRIDS:
+            colour, mark = common.ELEMENT_STYLES[element]
             lifts = [record.figures[f"{problem}, {element}, {n}x{n}"] for n in SIZES]
             values = [np.nan if lift is None else lift for lift in lifts]
             axis.plot(SIZES, values, color=colour, marker=mark, markersize=5, label=element)

@@ -110,7 +110,7 @@ def draw(record: common.Record, path: Path) -> None:
         values = [figures[f"shear, L/h {s}, {element}"] for s in SLENDERNESSES]
         middle.semilogx(SLENDERNESSES, values, **style)
         values = [figures[f"distortion, {s}, in plane, {element}"] for s in SHAPES]
-        right.bar(np.arange(3) + 0.14 * (k - 2.5), values, 0.13, color=colour)
+        right.bar(np.arange(3) + 0.12 * (k - 3), values, 0.11, color=colour)
     left.invert_xaxis()
     left.set_xticks([1 - 2 * nu for nu in POISSONS], [f"{nu:g}" for nu in POISSONS])
     middle.set_xticks(SLENDERNESSES, [str(s) for s in SLENDERNESSES])

@@ -20,20 +20,22 @@ from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
 from pdcorrect.fem.turned_strains import FADES, GONE, KINK
 
-_SIZES = (9, 9, 9, 18, 18, 18, 9, 3, 3)
+_SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 3)
 """Of what `_State` has."""
 STATE = sum(_SIZES)
 
 
 class _State(NamedTuple):
-    """R, S and (tr S - S)^-1; z before it fades, and the derivatives by what is left of it.
+    """R, S, (tr S - S)^-1 and Q = d(tr E)/dS / 3 - I/3; z before it fades, and the derivatives by
+    what is left of it.
 
-    Those by z itself, their tensor, and w; c and its derivatives.
+    Those by S and the vectors of z, their tensor, and w; c and its derivatives.
     """
 
     R: Tensor
     S: Tensor
     inverse: Tensor
+    volume: Tensor
     z: Tensor
     raw: Tensor
     y: Tensor
@@ -155,18 +157,22 @@ class BatchCorrection:
 
         R, S, inverse = matrices(R), size * matrices(S), matrices(inverse) / size
         identity = torch.eye(3, dtype=v.dtype, device=v.device)
-        strain = torch.einsum("nij,bcij->bcn", self._mandel, S - size * identity)
+        g, Q = _volume(S, size)
+        trace = S.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+        E = S + (g - trace) / 3.0 * identity
+        strain = torch.einsum("nij,bcij->bcn", self._mandel, E)
         turned = small_products(v[..., 3:, :], R)
         z = torch.cat([strain, turned.flatten(2)], dim=2)
         d = torch.linalg.det(_traced(S)) / (8.0 * self._sizes**3)
-        at = _State(R, S, inverse, z, z, z, S, z, _fade(d))
+        at = _State(R, S, inverse, Q, z, z, z, S, z, _fade(d))
         return self._with(at, self.stress(at.strains))
 
     def _with(self, at: _State, raw: Tensor) -> _State:
         """The state with derivatives by what is left of z."""
         along = (raw * at.z).sum(dim=-1)[..., None, None]
-        more = torch.einsum("nij,bcij->bcn", self._mandel, along * at.slope)
         y = at.fade[..., :1] * raw
+        trace = y[..., :3].sum(dim=-1)[..., None, None]
+        more = torch.einsum("nij,bcij->bcn", self._mandel, along * at.slope + trace * at.volume)
         y = torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
         torque = self._torque(at.S, tensor, _vectors(at.z), _vectors(y))
@@ -180,14 +186,16 @@ class BatchCorrection:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
 
     def _rates(self, at: _State, dv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Changes of z, of S and of the strains' vectors, and how the frame turns."""
+        """Changes of z, of S and of z's vectors, and how the frame turns."""
         back = at.R.transpose(-1, -2)
         D = small_products(back, dv[..., :3, :].transpose(-1, -2))
         turn = small_products(at.inverse, -_axial(D)[..., None])[..., 0]
         dS = D - _cross_columns(turn, at.S)
         h = _vectors(at.z)
         dh = small_products(dv[..., 3:, :], at.R) - torch.linalg.cross(turn[..., None, :], h)
-        dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dS), dh.flatten(2)], dim=2)
+        identity = torch.eye(3, dtype=dS.dtype, device=dS.device)
+        dE = dS + _contracted(at.volume, dS)[..., None] * identity
+        dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dE), dh.flatten(2)], dim=2)
         return dz, dS, dh, turn
 
     def _changes(self, at: _State, dv: Tensor, rate: Tensor | float) -> Tensor:
@@ -203,8 +211,11 @@ class BatchCorrection:
         changed = at.inverse @ _traced(dS) @ at.inverse  # less the change of (tr S - S)^-1
         bent = torch.where(slope == 0.0, 0.0, dc * (bend + slope) / (slope * slope))[..., None]
         dG = bent * G - slope[..., None] * _traced(changed)
-        more = torch.einsum("nij,bcij->bcn", self._mandel, across * G + along * dG)
         dy = c * raw + dc * at.raw
+        own, change = (x[..., :3].sum(dim=-1)[..., None, None] for x in (c * at.raw, dy))
+        size = self._sizes[..., None, None]
+        dQ = change * at.volume + own * _volume_change(at.S, dS, size)
+        more = torch.einsum("nij,bcij->bcn", self._mandel, across * G + along * dG + dQ)
         dy = torch.cat([dy[..., :6] + more, dy[..., 6:]], dim=-1)
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
@@ -224,6 +235,35 @@ def _traced(A: Tensor) -> Tensor:
     """Tr A - A."""
     trace = A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
     return trace * torch.eye(3, dtype=A.dtype, device=A.device) - A
+
+
+def _adjugates(A: Tensor, B: Tensor) -> Tensor:
+    """Half the change of A's adjugate by B; A's own where B is A; both symmetric."""
+    a, b = (x.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] for x in (A, B))
+    identity = torch.eye(3, dtype=A.dtype, device=A.device)
+    both = A @ B
+    trace = both.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    return 0.5 * (both + both.transpose(-1, -2) - a * B - b * A + (a * b - trace) * identity)
+
+
+def _volume(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """The trace that E has instead of S - I, and Q; see `turned_strains`."""
+    A = _adjugates(S, S)
+    J = (S * A).sum(dim=(-2, -1))[..., None, None] / (3.0 * size**3)
+    below = J * J + 2.0
+    identity = torch.eye(3, dtype=S.dtype, device=S.device)
+    Q = 3.0 * J / (below * size) ** 2 * A - identity / 3.0
+    return 1.5 * size * (J * J - 1.0) / below, Q
+
+
+def _volume_change(S: Tensor, dS: Tensor, size: Tensor) -> Tensor:
+    """Change of Q."""
+    A, half = _adjugates(S, S), _adjugates(S, dS)
+    J = (S * A).sum(dim=(-2, -1))[..., None, None] / (3.0 * size**3)
+    dJ = (A * dS).sum(dim=(-2, -1))[..., None, None] / size**3
+    below = J * J + 2.0
+    first = 6.0 * J / (below * size) ** 2
+    return first * half + 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**2) * dJ * A
 
 
 def _contracted(A: Tensor, B: Tensor) -> Tensor:

@@ -104,8 +104,13 @@ def _tell(at: Progress, row: Mapping[str, Any]) -> None:
 
 def train_element(
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
-    bodies: Annotated[int, typer.Option(help="Random bodies to learn from.", min=1)] = 4000,
-    iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 15_500,
+    bodies: Annotated[
+        Optional[int],
+        typer.Option(help="Random bodies to learn from; as released by default.", min=1),
+    ] = None,
+    iterations: Annotated[
+        Optional[int], typer.Option(help="Steps of the optimiser; as released by default.", min=1)
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of bodies, weights and order.", min=0)] = 45,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     workers: Annotated[int, typer.Option(help="Processes that compute answers.", min=1)] = 1,
@@ -122,7 +127,8 @@ def train_element(
     from pdcorrect.elements.training import ElementRecipe
     from pdcorrect.elements.training import train as train_network
 
-    recipe = ElementRecipe(bodies=bodies, iterations=iterations, seed=seed)
+    given = {"bodies": bodies, "iterations": iterations}
+    recipe = ElementRecipe(seed=seed, **{k: v for k, v in given.items() if v is not None})
     tell_of_compiling()
     if not train_network(
         recipe, output, device=device, workers=workers, seconds=seconds, report=typer.echo

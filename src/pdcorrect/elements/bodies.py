@@ -14,7 +14,7 @@ _LARGEST = (12, 6, 6)
 """Cells along the axes of the box that most bodies lie in, before its axes are permuted."""
 _LONGEST = 24
 """Cells along a member: long ones part what its ends do from what its middle does."""
-_FEWEST, _MOST = 4, 110
+_FEWEST, _MOST = 4, 150
 """Cells of a body."""
 _MOST_HELD = 0.6
 """Share of the nodes."""
@@ -91,6 +91,16 @@ def _elbow(rng: np.random.Generator) -> Grid:
     return solid
 
 
+def _prism(rng: np.random.Generator) -> Grid:
+    """A section that grew cell by cell, along a straight line."""
+    section = np.zeros((1, 4, 4), dtype=bool)
+    section[0, rng.integers(4), rng.integers(4)] = True
+    for _ in range(rng.integers(1, 9)):
+        places = np.argwhere(_neighbours(section) & ~section)
+        section[tuple(places[rng.integers(len(places))])] = True
+    return np.repeat(section, rng.integers(4, _LONGEST + 1), axis=0)
+
+
 def _plate(rng: np.random.Generator) -> Grid:
     return np.ones((*rng.integers(3, 9, size=2), rng.integers(1, 3)), dtype=bool)
 
@@ -145,6 +155,7 @@ def _random(rng: np.random.Generator) -> Grid:
 _SHAPES = {
     "beam": _beam,
     "elbow": _elbow,
+    "prism": _prism,
     "plate": _plate,
     "union": _union,
     "holed": _holed,

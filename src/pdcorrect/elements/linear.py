@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from pdcorrect.fem.neighbourhood import cell_graph
 
 Array = NDArray[np.float64]
 
-_LOADS, _MODES = 8, 12
+_LOADS, _MODES = 12, 12
 FLOORS = (0.01, 0.01, 0.01, 0.003)
 """Below which errors hardly count: of displacements, energies, shapes and squared frequencies."""
 WEIGHTS = (1.0, 1.0, 1.0, 3.0)
@@ -173,6 +173,27 @@ class Errors(NamedTuple):
     squares: Tensor
 
 
+class _Solved(torch.autograd.Function):
+    """X of A X = B (..., m, m) and (..., m, L), A symmetric and positive.
+
+    One factorisation serves X and its derivatives; `torch.linalg.solve` would differentiate
+    through it at several times the cost.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, A: Tensor, B: Tensor) -> Tensor:
+        factor = torch.linalg.cholesky_ex(A).L  # positive by construction: no look at its success
+        X = torch.cholesky_solve(B, factor)
+        ctx.save_for_backward(factor, X)
+        return X
+
+    @staticmethod
+    def backward(ctx: Any, slopes: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        factor, X = ctx.saved_tensors
+        by_B = torch.cholesky_solve(slopes, factor)
+        return -by_B @ X.mT, by_B
+
+
 def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
     """Of the coarse models with matrices N (C, 18, 18) and H (C, 7, 7); without learning if None.
 
@@ -198,7 +219,6 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
     A = A.index_add(0, flat.flatten(), K.flatten()).reshape(size, m + 1, m + 1)[:, :m, :m]
     n = batch.forces.shape[2] - 1
     A = A + torch.diag_embed((batch.places == n).to(K))
-    factor = torch.linalg.cholesky_ex(A).L  # positive by construction: no look at its success
 
     def times(matrices: Tensor, x: Tensor) -> Tensor:
         """Cell matrices (C, 24, 24) times fields (B, L, n + 1)."""
@@ -209,27 +229,18 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
         where = line[:, :, None] * (n + 1) + places
         return out.flatten().index_add(0, where.flatten(), local.flatten()).reshape(x.shape)
 
-    index = batch.places[:, None]
-
-    def solved(x: Tensor) -> Tensor:
-        """K^-1 x on the free components, zero elsewhere."""
-        right = torch.gather(x, 2, index.expand(-1, x.shape[1], -1))
-        found = torch.cholesky_solve(right.mT, factor).mT
-        return torch.zeros_like(x).scatter(2, index.expand(-1, x.shape[1], -1), found)
-
-    held = batch.displacements.scatter(2, index.expand(-1, _LOADS, -1), 0.0)
-    u = held + solved(batch.forces - times(K, held))
-    u = torch.cat([u[..., :n], torch.zeros_like(u[..., n:])], dim=2)
+    spread = (M[:, :, None, :, None] * torch.eye(3).to(K)[:, None]).reshape(-1, 24, 24)
+    inertia = times(spread, batch.modes)
+    index = batch.places[:, None].expand(-1, _LOADS + _MODES, -1)
+    held = batch.displacements.scatter(2, index[:, :_LOADS], 0.0)
+    right = torch.cat([batch.forces - times(K, held), inertia], dim=1)
+    answers = _Solved.apply(A, torch.gather(right, 2, index).mT).mT  # type: ignore[no-untyped-call]
+    answers = torch.zeros_like(right).scatter(2, index, answers)
+    answers = torch.cat([answers[..., :n], torch.zeros_like(answers[..., n:])], dim=2)
+    u, v = held + answers[:, :_LOADS], batch.squares[:, :, None] * answers[:, _LOADS:]
     size_u = (batch.displacements**2).sum(dim=2) + 1e-30
     by_load = ((u - batch.displacements) ** 2).sum(dim=2) / size_u * batch.loaded
     energy = ((u * times(K, u)).sum(dim=2) / batch.energies - 1.0) ** 2 * batch.loaded
-    full = torch.kron(torch.eye(1, dtype=K.dtype, device=K.device), M)
-    spread = (full[:, :, None, :, None] * torch.eye(3).to(K)[None, None, :, None]).reshape(
-        -1, 24, 24
-    )
-    inertia = times(spread, batch.modes)
-    v = batch.squares[:, :, None] * solved(inertia)
-    v = torch.cat([v[..., :n], torch.zeros_like(v[..., n:])], dim=2)
     shapes = ((v - batch.modes) ** 2).sum(dim=2) / (batch.modes**2).sum(dim=2)
     ratio = (batch.modes * inertia).sum(dim=2) / (v * inertia).sum(dim=2)
     return Errors(by_load, energy, shapes, (ratio - 1.0) ** 2)
@@ -238,15 +249,17 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
 def loss(found: Errors, base: Errors) -> Tensor:
     """Of each body, (B,): errors over those without learning, with floors.
 
-    Lower modes count more: motions are mostly made of them.
+    Loads count alike, and of modes the lower ones more: motions are mostly made of them.
     """
-    lower = 1.0 / (1.0 + torch.arange(_MODES, device=found.squares.device) / 2.0)
+    modes = torch.arange(_MODES, device=found.squares.device)
+    lower = (1.0 / (1.0 + modes / 2.0)).to(found.squares)
     total = torch.zeros_like(found.squares[:, 0])
-    for errors, without, floor, weight in zip(found, base, FLOORS, WEIGHTS, strict=True):
-        of_modes = errors is found.shapes or errors is found.squares
-        part = lower if of_modes else torch.ones_like(errors[0])
-        ratio = errors @ part.to(errors) / (without @ part.to(errors) + floor**2 * part.sum())
-        total = total + weight * (ratio + _SMALLEST).sqrt()
+    kinds = zip(found, base, FLOORS, WEIGHTS, (False, False, True, True), strict=True)
+    for errors, without, floor, weight, of_modes in kinds:
+        if of_modes:
+            errors, without = ((x @ lower / lower.sum())[:, None] for x in (errors, without))
+        ratio = errors / (without + floor**2)
+        total = total + weight * (ratio + _SMALLEST).sqrt().mean(dim=1)
     return total / sum(WEIGHTS)
 
 

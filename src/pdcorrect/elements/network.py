@@ -54,10 +54,12 @@ class ElementNetwork(nn.Module):
         first = silu(self.first(numbers[:, self.own[symmetries]]))  # (C, G, width)
         table = neighbours[:, self.around[symmetries]]
         orientation = torch.arange(len(symmetries), device=numbers.device)[:, None]
+        place = (table * len(symmetries) + orientation).flatten()
         x = first
         for convolution, norm in zip(self.rounds, self.norms, strict=True):
             padded = nn.functional.pad(norm(x), (0, 0, 0, 0, 0, 1))
-            x = x + silu(convolution(padded[table, orientation].flatten(2)))
+            around = padded.flatten(0, 1).index_select(0, place)
+            x = x + silu(convolution(around.reshape(*x.shape[:2], -1)))
         found = self.last(silu(self.hidden(torch.cat([x, first], dim=2))))
         split = halves(STRAINS).places.shape[1]
         return (

@@ -50,13 +50,13 @@ class ElementRecipe:
         Largest learning rate, see `Descent`.
     """
 
-    bodies: int = 4000
+    bodies: int = 3750
     seed: int = 45
     width: int = 96
     rounds: int = 3
-    iterations: int = 22_000
+    iterations: int = 40_000
     batch: int = 16
-    symmetries: int = 8
+    symmetries: int = 24
     rate: float = 1e-2
 
 
@@ -93,7 +93,7 @@ def train(
         report(f"{name}: {count} bodies")
         if generate(folder / name, count, seed, workers, left()):
             return False
-    known, others = (_samples(folder / name, count, workers) for name, (count, _) in sets.items())
+    known, others = (samples_of(folder / name, count, workers) for name, (count, _) in sets.items())
     trainer = Trainer(recipe, known, others, device)
     path = folder / _CHECKPOINT
     if path.exists():
@@ -114,18 +114,32 @@ def train(
 class Trainer:
     """The network, its optimiser and the batches of bodies.
 
+    Parameters
+    ----------
+    recipe : ElementRecipe
+    known, others : sequences of Sample
+        Bodies to learn from, and to judge by.
+    device : str
+    kind : subclass of ElementNetwork
+        Of the network.
+
     Attributes
     ----------
     iteration : int
     """
 
     def __init__(
-        self, recipe: ElementRecipe, known: Sequence[Sample], others: Sequence[Sample], device: str
+        self,
+        recipe: ElementRecipe,
+        known: Sequence[Sample],
+        others: Sequence[Sample],
+        device: str,
+        kind: type[ElementNetwork] = ElementNetwork,
     ) -> None:
         self._recipe, self._device = recipe, device
         torch.manual_seed(recipe.seed)
         self._rng = np.random.default_rng(recipe.seed)
-        self._network = network = ElementNetwork(recipe.width, recipe.rounds).to(device)
+        self._network = network = kind(recipe.width, recipe.rounds).to(device)
         self._descent = Descent(network, recipe.rate, recipe.iterations)
         self._batches, self._validation = (
             _batches(samples, recipe.batch, device) for samples in (known, others)
@@ -232,8 +246,8 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
 
 
-def _samples(folder: Path, count: int, workers: int) -> list[Sample]:
-    """Prepared bodies, by several processes."""
+def samples_of(folder: Path, count: int, workers: int = 1) -> list[Sample]:
+    """The first bodies of a folder, prepared by several processes."""
     paths = file_paths(folder, count)
     if workers == 1:
         return [s for path in paths for s in _of_file(path)][:count]

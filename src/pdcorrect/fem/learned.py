@@ -1,8 +1,8 @@
 """The learned element: corrections of cells' stiffness and mass that a network writes.
 
-A cell's displacements are 18 numbers z: its strain S - I (Mandel's notation) times its size, and
-the amplitudes of the four patterns that are not affine, in the frame that turns with the cell.
-Its energy gains
+A cell's displacements are 18 numbers z, see `turned_strains`: its strain (Mandel's notation) times
+its size, and the amplitudes of the four patterns that are not affine, in the frame that turns
+with the cell.  Its energy gains
 
     1/2 z^T K z,    K = C^1/2 S C^1/2,    S = 2 k N (1 + N^2)^-1,
 
@@ -44,10 +44,11 @@ from pdcorrect.fem.neighbourhood import (
 
 Array = NDArray[np.float64]
 
-BOUND = 0.6
+BOUND = 0.8
 """k of stiffness and mass."""
-STIFFEST = 3.0
-"""Of the shear stiffness: the most that counts of that to changes of volume."""
+STIFFEST, VOLUME = 3.0, 0.3
+"""The most that counts of the stiffness to changes of volume: so many times that to shear, or what
+lets it change by this share of its own."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
 _CONTRAST = 12.0
@@ -90,7 +91,7 @@ def own_stiffness(cells: Array, strains: Array) -> Array:
     C = fields @ cells @ np.swapaxes(fields, -1, -2)
     C[..., :6, 6:] = C[..., 6:, :6] = 0.0
     values, axes = np.linalg.eigh(C[..., :6, :6])
-    most = STIFFEST * values[..., :1]
+    most = np.maximum(STIFFEST * values[..., :1], VOLUME / BOUND * values)
     C[..., :6, :6] = (axes * np.minimum(values, most)[..., None, :]) @ np.swapaxes(axes, -1, -2)
     return C
 

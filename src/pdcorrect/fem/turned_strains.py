@@ -4,9 +4,17 @@ With a the cell's size, u_k the displacements of its corners and b_k, g_mk the r
 
     F = I + sum_k u_k b_k^T,    h_m = sum_k g_mk u_k    (m = 1 ... 4),    F = R S,
 
-z holds a (S - I) in Mandel's notation and the four vectors R^T h_m; h_m vanishes for affine
-displacements.  A potential e(z) with y = de/dz, written as a symmetric tensor Y and vectors y_m,
-has the derivatives
+z holds a E in Mandel's notation and the four vectors R^T h_m; h_m vanishes for affine
+displacements.  E is the strain with the change of volume for its trace,
+
+    E = S - I + (g(J) + 3 - tr S) I / 3,    J = det S,    g(J) = 3/2 (J^2 - 1) / (J^2 + 2),
+
+which is S - I near rest.  The energy's own volume term has the same form: it does not see what
+S - I calls a change of volume when a cell is sheared, and is nearly constant in J where S - I
+goes on growing, so that with S - I a negative K bursts cells that are drawn out.
+
+A potential e(z) with y = de/dS and de/d(R^T h_m), a symmetric tensor Y and vectors y_m, has the
+derivatives
 
     de/dF = R (a Y - [w]),    de/dh_m = R y_m,
     (tr S - S) w = sum_m R^T h_m x y_m + a axial(S Y),
@@ -153,14 +161,61 @@ def _add_tensor(factor, G, y):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _faded(z, y, c, G):  # type: ignore[no-untyped-def]
-    """From the derivatives y by c z to those by z; returns y . z."""
+def _adjugate(S, out):  # type: ignore[no-untyped-def]
+    """Of a symmetric S."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i, i] = S[j, j] * S[k, k] - S[j, k] * S[j, k]
+        out[j, k] = out[k, j] = S[i, j] * S[i, k] - S[i, i] * S[j, k]
+
+
+@njit(**OPTIONS)
+def _volume(S, size, Q, z):  # type: ignore[no-untyped-def]
+    """Make z's first six numbers, those of S - I, E's; Q (3, 3) = d(tr E)/dS / 3 - I/3."""
+    _adjugate(S, Q)
+    J = (S[0, 0] * Q[0, 0] + S[0, 1] * Q[0, 1] + S[0, 2] * Q[0, 2]) / size**3
+    below = J * J + 2.0
+    more = (1.5 * size * (J * J - 1.0) / below - (z[0] + z[1] + z[2])) / 3.0
+    for i in range(3):
+        z[i] += more
+    factor = 3.0 * J / (below * below * size * size)
+    for i in range(3):
+        for j in range(3):
+            Q[i, j] = factor * Q[i, j] - (1.0 / 3.0 if i == j else 0.0)
+
+
+@njit(**OPTIONS)
+def _add_volume_change(factor, S, dS, size, A, y):  # type: ignore[no-untyped-def]
+    """Add a multiple of dQ to the first six numbers; A (3, 3) is scratch."""
+    _adjugate(S, A)
+    J = (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2]) / size**3
+    dJ = 0.0
+    for i in range(3):
+        for j in range(3):
+            dJ += A[i, j] * dS[i, j] / size**3
+    below = J * J + 2.0
+    first = 3.0 * J / (below * below * size * size)
+    second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size * size)
+    for i in range(3):  # the change of A: it is quadratic in S
+        j, k = (i + 1) % 3, (i + 2) % 3
+        own = dS[j, j] * S[k, k] + S[j, j] * dS[k, k] - 2.0 * S[j, k] * dS[j, k]
+        other = dS[i, j] * S[i, k] + S[i, j] * dS[i, k] - dS[i, i] * S[j, k] - S[i, i] * dS[j, k]
+        y[i] += factor * (first * own + second * dJ * A[i, i])
+        for n in range(3, 6):
+            if _ROWS[n] != i and _COLUMNS[n] != i:
+                y[n] += factor * (first * other + second * dJ * A[j, k]) / _ROOT
+
+
+@njit(**OPTIONS)
+def _to_stretch(z, y, c, G, Q):  # type: ignore[no-untyped-def]
+    """From the derivatives y by c z to those by z and, of the first six, by S."""
     along = 0.0
     for n in range(18):
         along += y[n] * z[n]
         y[n] *= c
-    _add_tensor(along, G, y)
-    return along
+    _add_tensor(y[0] + y[1] + y[2], Q, y)
+    if c != 1.0:
+        _add_tensor(along, G, y)
 
 
 @njit(**OPTIONS)
@@ -216,12 +271,37 @@ def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _change(  # type: ignore[no-untyped-def]
-    dv, R, S, Y, T, w, z, y, K, factor, fade, raw, G, D, A, B, dT, t, turn, dz, dy, dw, out
+    dv,
+    R,
+    S,
+    Y,
+    T,
+    w,
+    z,
+    y,
+    K,
+    factor,
+    fade,
+    raw,
+    G,
+    Q,
+    size,
+    D,
+    A,
+    B,
+    dT,
+    t,
+    turn,
+    dz,
+    dy,
+    dw,
+    out,
 ):
     """Out (7, 3): change of `_conjugates` by dv (7, 3); dz (18,) that of z.
 
     Without y's own second part where ``factor`` is 0: then the result is positive where K is.
-    ``fade`` are c and its derivatives, ``raw`` the derivatives by c z, G is dc/dS.
+    ``fade`` are c and its derivatives, ``raw`` the derivatives by c z, G is dc/dS, Q as in
+    `_volume`.
     """
     for i in range(3):
         for j in range(3):
@@ -236,6 +316,12 @@ def _change(  # type: ignore[no-untyped-def]
     for n in range(6):
         i, j = _ROWS[n], _COLUMNS[n]
         dz[n] = B[i, j] if i == j else 0.5 * (B[i, j] + B[j, i]) / _ROOT
+    more = 0.0
+    for i in range(3):
+        for j in range(3):
+            more += Q[i, j] * B[i, j]
+    for i in range(3):
+        dz[i] += more
     for m in range(4):
         part = dz[6 + 3 * m : 9 + 3 * m]
         for i in range(3):
@@ -252,12 +338,15 @@ def _change(  # type: ignore[no-untyped-def]
         for l in range(18):
             total += K[n, l] * (c * dz[l] + dc * z[l])
         dy[n] = total
+    along, across = 0.0, 0.0
+    for n in range(18):
+        along += raw[n] * z[n]
+        across += dy[n] * z[n] + factor * raw[n] * dz[n]
+        dy[n] = c * dy[n] + factor * dc * raw[n]
+    _add_tensor(dy[0] + dy[1] + dy[2], Q, dy)
+    if factor != 0.0:
+        _add_volume_change(c * (raw[0] + raw[1] + raw[2]), S, B, size, A, dy)
     if slope != 0.0:
-        along, across = 0.0, 0.0
-        for n in range(18):
-            along += raw[n] * z[n]
-            across += dy[n] * z[n] + factor * raw[n] * dz[n]
-            dy[n] = c * dy[n] + factor * dc * raw[n]
         _add_tensor(across, G, dy)
         if factor != 0.0:  # along dG, with dY = -Y (tr dS - dS) Y
             trace = B[0, 0] + B[1, 1] + B[2, 2]
@@ -269,8 +358,6 @@ def _change(  # type: ignore[no-untyped-def]
             _fading(D, -slope, dT)
             _add_tensor(along, dT, dy)
             _add_tensor(along * dc * (bend / slope + 1.0) / slope, G, dy)
-    elif c != 1.0:
-        dy[:] = 0.0
     _tensor(dy, dT)
     t[:] = 0.0
     _product(S, dT, A)
@@ -330,7 +417,7 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
         v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         T, A, out = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
-        G = np.empty((3, 3))
+        G, Q = np.empty((3, 3)), np.empty((3, 3))
         t, w = np.empty(3), np.empty(3)
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
@@ -339,6 +426,7 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
             l = c - begin
             _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
+            _volume(S, sizes[c], Q, z)
             fade, slope, _ = _fade(s, l, sizes[c])
             total = 0.0
             for n in range(18):
@@ -350,9 +438,8 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
                 total += fade * z[n] * (0.5 * row - less)
                 y[n] = row - less
             energy[c] = total
-            if fade != 1.0:
-                _fading(Y, slope, G)
-                _faded(z, y, fade, G)
+            _fading(Y, slope, G)
+            _to_stretch(z, y, fade, G, Q)
             _turning(z, y, S, Y, T, A, t, w)
             _conjugates(R, T, w, y, A, out)
             _spread(out, shapes[c], -1.0, by_cell[c])
@@ -368,12 +455,14 @@ def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
         s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
         v = np.empty((CHUNK, 7, 3))
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        Q = np.empty((3, 3))
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, B, W)
         for c in range(begin, end):
             _unpack(U, s, V, c - begin, sizes[c], R, S, Y)
             _strains(v[c - begin], R, S, sizes[c], out[c])
+            _volume(S, sizes[c], Q, out[c])
             fade, _, _ = _fade(s, c - begin, sizes[c])
             for n in range(18):
                 out[c, n] *= fade
@@ -397,7 +486,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
         D, dT, column = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
         t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
         dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
-        raw, G = np.empty(18), np.zeros((3, 3))
+        raw, G, Q = np.empty(18), np.empty((3, 3)), np.empty((3, 3))
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, W9, W)
@@ -405,15 +494,15 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
             l = c - begin
             _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
+            _volume(S, sizes[c], Q, z)
             fade = _fade(s, l, sizes[c])
             for n in range(18):
                 row = 0.0
                 for m in range(18):
                     row += matrices[c, n, m] * z[m]
                 y[n] = raw[n] = fade[0] * row - (shift[c, n] if len(shift) else 0.0)
-            if fade[0] != 1.0:
-                _fading(Y, fade[1], G)
-                _faded(z, y, fade[0], G)
+            _fading(Y, fade[1], G)
+            _to_stretch(z, y, fade[0], G, Q)
             _turning(z, y, S, Y, T, A, t, w)
             if project:
                 y[:] = 0.0
@@ -421,7 +510,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
                 for i in range(3):
                     dv[a, i] = 1.0
                     _change(
-                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fade, raw, G,
+                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fade, raw, G, Q, sizes[c],
                         D, A, B, dT, t, turn, dz, dy, dw, column,
                     )  # fmt: skip
                     dv[a, i] = 0.0
