@@ -146,7 +146,7 @@ def test_strains_are_corrected_at_held_corners_only():
 
 @pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45, 0.48, 0.495])
 def test_no_correction_makes_a_drawn_out_cell_burst(poisson):
-    """With all that may be taken away the energy is positive to twice the size, and grows beyond."""
+    """With all that may be taken away the energy is positive near rest, and grows far out."""
     mesh = voxel_mesh(np.ones((1, 1, 1), dtype=bool), (0, 0, 0), 1.0)
     plain = problem_on(mesh, "hex8-enhanced", material={"young": 1.0, "poisson": poisson})
     C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
@@ -325,11 +325,17 @@ def test_cells_off_the_grid_keep_the_element_and_are_counted():
                     {"region": {"plane": "y", "at": 0.0}, "components": ["y"]},
                     {"region": {"plane": "z", "at": 0.0}, "components": ["z"]}]},
         {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "young": 1e9}]},
+        {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "density": 10.0}]},
     ],
 )  # fmt: skip
 def test_what_it_was_not_trained_for_is_told(changes):
     with pytest.warns(PdcorrectWarning, match="unlike those it was trained on"):
         learned_problem(beam(**changes))
+
+
+def test_bodies_without_held_nodes_are_told():
+    with pytest.warns(PdcorrectWarning, match="this one has none"):
+        learned_problem(beam(clamps=[], loads=[]))
 
 
 def test_another_mass_rule_is_refused():

@@ -18,42 +18,35 @@ from pdcorrect.batch.points import Components, computed, moved
 from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
-from pdcorrect.fem.turned_strains import FADES, GONE, KINK
+from pdcorrect.fem.turned_strains import BENT, FADES, FOLDED, GONE, KINK
 
-_SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 3)
+_SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 8)
 """Of what `_State` has."""
 STATE = sum(_SIZES)
 
 
 class _State(NamedTuple):
-    """R, S, (tr S - S)^-1 and Q = d(tr E)/dS / 3 - I/3; z before it fades, and the derivatives by
-    what is left of it.
+    """R, S, (tr S - S)^-1 and S's adjugate; z before it fades, and the derivatives by what is left
+    of it.
 
-    Those by S and the vectors of z, their tensor, and w; c and its derivatives.
+    Those by S and the vectors of z, their tensor, and w; what `_measures` tells.
     """
 
     R: Tensor
     S: Tensor
     inverse: Tensor
-    volume: Tensor
+    adjugate: Tensor
     z: Tensor
     raw: Tensor
     y: Tensor
     tensor: Tensor
     w: Tensor
-    fade: Tensor
+    fades: Tensor
 
     @property
     def strains(self) -> Tensor:
         """What is left of z."""
-        return self.fade[..., :1] * self.z
-
-    @property
-    def slope(self) -> Tensor:
-        """Dc/dS."""
-        trace = self.inverse.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
-        identity = torch.eye(3, dtype=trace.dtype, device=trace.device)
-        return self.fade[..., 1:2, None] * (trace * identity - self.inverse)
+        return self.fades[..., :1] * self.fades[..., 5:6] * self.z
 
 
 class BatchCorrection:
@@ -114,8 +107,10 @@ class BatchCorrection:
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
         state = self._state(local)
-        dz, dS, _, _ = self._rates(state, small_products(self._shapes, x))
-        return state.fade[..., :1] * dz + _contracted(state.slope, dS) * state.z
+        dz, _, grown, _, _ = self._rates(state, small_products(self._shapes, x))
+        c, slope, _, _, _, e, down, _ = torch.split(state.fades, 1, dim=-1)
+        bent = (state.z[..., 6:] * dz[..., 6:]).sum(dim=-1, keepdim=True)
+        return c * e * dz + (slope * e * grown + c * down * bent) * state.z
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
@@ -157,27 +152,33 @@ class BatchCorrection:
 
         R, S, inverse = matrices(R), size * matrices(S), matrices(inverse) / size
         identity = torch.eye(3, dtype=v.dtype, device=v.device)
-        g, Q = _volume(S, size)
-        trace = S.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
-        E = S + (g - trace) / 3.0 * identity
+        A = _adjugates(S, S)
+        turned = small_products(v[..., 3:, :], R).flatten(2)
+        g, fades = _measures(_contracted(S, A) / 3.0, turned, self._sizes[..., None])
+        E = S + ((g - _trace(S)) / 3.0)[..., None] * identity
         strain = torch.einsum("nij,bcij->bcn", self._mandel, E)
-        turned = small_products(v[..., 3:, :], R)
-        z = torch.cat([strain, turned.flatten(2)], dim=2)
-        d = torch.linalg.det(_traced(S)) / (8.0 * self._sizes**3)
-        at = _State(R, S, inverse, Q, z, z, z, S, z, _fade(d))
+        z = torch.cat([strain, turned], dim=2)
+        at = _State(R, S, inverse, A, z, z, z, S, z, fades)
         return self._with(at, self.stress(at.strains))
 
     def _with(self, at: _State, raw: Tensor) -> _State:
         """The state with derivatives by what is left of z."""
-        along = (raw * at.z).sum(dim=-1)[..., None, None]
-        y = at.fade[..., :1] * raw
-        trace = y[..., :3].sum(dim=-1)[..., None, None]
-        more = torch.einsum("nij,bcij->bcn", self._mandel, along * at.slope + trace * at.volume)
-        y = torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
+        c, slope, _, first, _, e, down, _ = torch.split(at.fades, 1, dim=-1)
+        y = c * e * raw
+        along, trace = (raw * at.z).sum(dim=-1, keepdim=True), y[..., :3].sum(dim=-1, keepdim=True)
+        tensor = (trace * first + along * slope * e)[..., None] * at.adjugate
+        y = self._added(y, tensor, trace, along * c * down * at.z[..., 6:])
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
         torque = self._torque(at.S, tensor, _vectors(at.z), _vectors(y))
         w = small_products(at.inverse, torque[..., None])[..., 0]
         return at._replace(raw=raw, y=y, tensor=tensor, w=w)
+
+    def _added(self, y: Tensor, tensor: Tensor, trace: Tensor, vectors: Tensor) -> Tensor:
+        """Y with a tensor, less a third of a trace, and vectors more."""
+        identity = torch.eye(3, dtype=y.dtype, device=y.device)
+        tensor = tensor - trace[..., None] / 3.0 * identity
+        more = torch.einsum("nij,bcij->bcn", self._mandel, tensor)
+        return torch.cat([y[..., :6] + more, y[..., 6:] + vectors], dim=-1)
 
     def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
         return self._with(at, rate * self.stress(at.strains - before))
@@ -185,8 +186,8 @@ class BatchCorrection:
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
 
-    def _rates(self, at: _State, dv: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Changes of z, of S and of z's vectors, and how the frame turns."""
+    def _rates(self, at: _State, dv: Tensor) -> tuple[Tensor, ...]:
+        """Changes of z and S, adjugate : dS, changes of z's vectors, and how the frame turns."""
         back = at.R.transpose(-1, -2)
         D = small_products(back, dv[..., :3, :].transpose(-1, -2))
         turn = small_products(at.inverse, -_axial(D)[..., None])[..., 0]
@@ -194,29 +195,29 @@ class BatchCorrection:
         h = _vectors(at.z)
         dh = small_products(dv[..., 3:, :], at.R) - torch.linalg.cross(turn[..., None, :], h)
         identity = torch.eye(3, dtype=dS.dtype, device=dS.device)
-        dE = dS + _contracted(at.volume, dS)[..., None] * identity
+        grown = _contracted(at.adjugate, dS)
+        dE = dS + (at.fades[..., 3:4] * grown - _trace(dS) / 3.0)[..., None] * identity
         dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dE), dh.flatten(2)], dim=2)
-        return dz, dS, dh, turn
+        return dz, dS, grown, dh, turn
 
     def _changes(self, at: _State, dv: Tensor, rate: Tensor | float) -> Tensor:
         """See `turned_strains`; (B, C, 7, 3)."""
-        dz, dS, dh, turn = self._rates(at, dv)
+        dz, dS, grown, dh, turn = self._rates(at, dv)
         h, y = _vectors(at.z), _vectors(at.y)
-        c, slope, bend = torch.split(at.fade, 1, dim=-1)
-        G = at.slope
-        dc = _contracted(G, dS)
-        raw = rate * self.stress(c * dz + dc * at.z)
-        across = (raw * at.z + at.raw * dz).sum(dim=-1)[..., None, None]
-        along = (at.raw * at.z).sum(dim=-1)[..., None, None]
-        changed = at.inverse @ _traced(dS) @ at.inverse  # less the change of (tr S - S)^-1
-        bent = torch.where(slope == 0.0, 0.0, dc * (bend + slope) / (slope * slope))[..., None]
-        dG = bent * G - slope[..., None] * _traced(changed)
-        dy = c * raw + dc * at.raw
-        own, change = (x[..., :3].sum(dim=-1)[..., None, None] for x in (c * at.raw, dy))
-        size = self._sizes[..., None, None]
-        dQ = change * at.volume + own * _volume_change(at.S, dS, size)
-        more = torch.einsum("nij,bcij->bcn", self._mandel, across * G + along * dG + dQ)
-        dy = torch.cat([dy[..., :6] + more, dy[..., 6:]], dim=-1)
+        c, slope, bend, first, second, e, down, turned = torch.split(at.fades, 1, dim=-1)
+        bent = (at.z[..., 6:] * dz[..., 6:]).sum(dim=-1, keepdim=True)
+        ds = slope * e * grown + c * down * bent
+        raw = rate * self.stress(c * e * dz + ds * at.z)
+        dy = c * e * raw + ds * at.raw
+        own, trace = (x[..., :3].sum(dim=-1, keepdim=True) for x in (c * e * at.raw, dy))
+        along = (at.raw * at.z).sum(dim=-1, keepdim=True)
+        across = (raw * at.z + at.raw * dz).sum(dim=-1, keepdim=True)
+        most = trace * first + across * slope * e + own * second * grown
+        most = most + along * (bend * e * grown + slope * down * bent)
+        change = 2.0 * (own * first + along * slope * e)[..., None] * _adjugates(at.S, dS)
+        more = across * c * down + along * (slope * grown * down + c * turned * bent)
+        vectors = more * at.z[..., 6:] + along * c * down * dz[..., 6:]
+        dy = self._added(dy, most[..., None] * at.adjugate + change, trace, vectors)
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
@@ -231,12 +232,6 @@ class BatchCorrection:
 _OWN = ("raw", "y", "tensor", "w")
 
 
-def _traced(A: Tensor) -> Tensor:
-    """Tr A - A."""
-    trace = A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
-    return trace * torch.eye(3, dtype=A.dtype, device=A.device) - A
-
-
 def _adjugates(A: Tensor, B: Tensor) -> Tensor:
     """Half the change of A's adjugate by B; A's own where B is A; both symmetric."""
     a, b = (x.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] for x in (A, B))
@@ -246,39 +241,37 @@ def _adjugates(A: Tensor, B: Tensor) -> Tensor:
     return 0.5 * (both + both.transpose(-1, -2) - a * B - b * A + (a * b - trace) * identity)
 
 
-def _volume(S: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """The trace that E has instead of S - I, and Q; see `turned_strains`."""
-    A = _adjugates(S, S)
-    J = (S * A).sum(dim=(-2, -1))[..., None, None] / (3.0 * size**3)
-    below = J * J + 2.0
-    identity = torch.eye(3, dtype=S.dtype, device=S.device)
-    Q = 3.0 * J / (below * size) ** 2 * A - identity / 3.0
-    return 1.5 * size * (J * J - 1.0) / below, Q
+def _rise(t: Tensor, width: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """From 0 at t = 0 to 1 at t = 1, and its first two derivatives by ``width`` times t."""
+    t = t.clamp(0.0, 1.0)
+    first = 30.0 * t * t * (1.0 - t) ** 2 / width
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
+    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), first, second
 
 
-def _volume_change(S: Tensor, dS: Tensor, size: Tensor) -> Tensor:
-    """Change of Q."""
-    A, half = _adjugates(S, S), _adjugates(S, dS)
-    J = (S * A).sum(dim=(-2, -1))[..., None, None] / (3.0 * size**3)
-    dJ = (A * dS).sum(dim=(-2, -1))[..., None, None] / size**3
+def _measures(J: Tensor, vectors: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """The trace of E times the size, and eight numbers (B, C, 8), see `turned_strains`.
+
+    Of J times the cells' volume, and z's last twelve numbers.
+    """
+    J = J / size**3
     below = J * J + 2.0
-    first = 6.0 * J / (below * size) ** 2
-    return first * half + 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**2) * dJ * A
+    first = 3.0 * J / (below * size) ** 2
+    second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**5)
+    q = (vectors**2).sum(dim=-1, keepdim=True) / size**2
+    c = _rise((J - GONE) / (FADES - GONE), (FADES - GONE) * size**3)
+    e = _rise((FOLDED - q) / (FOLDED - BENT), (BENT - FOLDED) * 0.5 * size**2)
+    return 1.5 * size * (J * J - 1.0) / below, torch.cat([*c, first, second, *e], dim=-1)
+
+
+def _trace(A: Tensor) -> Tensor:
+    """(B, C, 1)."""
+    return A.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None]
 
 
 def _contracted(A: Tensor, B: Tensor) -> Tensor:
     """A : B, (B, C, 1)."""
     return (A * B).sum(dim=(-2, -1))[..., None]
-
-
-def _fade(d: Tensor) -> Tensor:
-    """c, and d dc/dd and d^2 d2c/dd2, (B, C, 3), see `turned_strains`."""
-    width = FADES - GONE
-    t = ((d - GONE) / width).clamp(0.0, 1.0)
-    first = 30.0 * t * t * (1.0 - t) ** 2 / width
-    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
-    c = t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
-    return torch.stack([c, d * first, d * d * second], dim=-1)
 
 
 def _kept(state: _State) -> Tensor:

@@ -221,7 +221,8 @@ def _loads(
 ) -> Array:
     """Static loads (L, nodes, 3) on the fine nodes that are not fixed.
 
-    Most lie along one axis: in a sum of several the softest answer would hide the others.
+    Weights, turnings and even tractions along one axis each: in a sum of several the softest
+    answer would hide the others.  Then fields of all directions and a narrow traction.
     """
     count = len(points)
     nodal = np.bincount(fine.cells.ravel(), np.repeat(masses, 8) / 8.0, minlength=count)[:, None]

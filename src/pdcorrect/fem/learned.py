@@ -13,7 +13,7 @@ network on the graph of cells, see `neighbourhood`.  Strains are corrected in ce
 corner only; elsewhere affine deformations stay exact.
 
 A cell keeps the element without learning where the network was not trained: off a grid, beside
-partly held nodes, of another Poisson's ratio, or beside much softer or stiffer ones.
+partly held nodes, of another Poisson's ratio, or beside ones of much other modulus or density.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ STIFFEST, VOLUME = 3.0, 0.3
 lets it change by this share of its own."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
-_CONTRAST = 12.0
-"""Of the moduli that the network sees."""
+_CONTRAST, _DENSITIES = 12.0, 5.0
+"""Of the moduli, and of the densities, that the network sees."""
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
 
@@ -131,7 +131,8 @@ class ElementWriter:
         self._held = held[cells].astype(float)
         self._inside = self._held.max(axis=1) == 0.0
         partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
-        self._fits: NDArray[np.bool_] = self._grid.regular & ~partly
+        heavy = contrasts(self._grid.place, body.materials.density, network.reach)
+        self._fits: NDArray[np.bool_] = self._grid.regular & ~partly & (heavy <= _DENSITIES)
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
 

@@ -9,9 +9,9 @@ displacements.  E is the strain with the change of volume for its trace,
 
     E = S - I + (g(J) + 3 - tr S) I / 3,    J = det S,    g(J) = 3/2 (J^2 - 1) / (J^2 + 2),
 
-which is S - I near rest.  The energy's own volume term has the same form: it does not see what
-S - I calls a change of volume when a cell is sheared, and is nearly constant in J where S - I
-goes on growing, so that with S - I a negative K bursts cells that are drawn out.
+which is S - I near rest.  At large strain its trace sees changes of volume only, as the energy's
+own volume term does, and is bounded: with S - I a negative K bursts cells that are drawn out,
+where that term grows less than quadratically.
 
 A potential e(z) with y = de/dS and de/d(R^T h_m), a symmetric tensor Y and vectors y_m, has the
 derivatives
@@ -23,10 +23,10 @@ derivatives
 frame's turning adds, without which forces would have no potential.  Second derivatives are exact
 too.  Everything here counts S and F times a, so that all numbers of z are lengths.
 
-Where two stretches add up to nothing the frame is not defined.  So z counts times a smooth c(d)
-of d = (s_1 + s_2)(s_2 + s_3)(s_3 + s_1) / 8 = det(tr S - S) / 8, which is 1 for d above `FADES`
-(a cell squeezed evenly to two thirds, or to a tenth along one axis) and 0 below `GONE`: cells
-that are crushed or inside out have the element's own energy alone.
+z counts times c(J) e(q), q = sum_m h_m . h_m.  c is 1 for J above `FADES` and 0 below `GONE`:
+the frame is not defined where two stretches add up to nothing.  e is 1 for q below `BENT` and 0
+above `FOLDED`.  So cells that are crushed, inside out or folded have the element's own energy
+alone, which may get them back.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ _COLUMNS = np.array([0, 1, 2, 2, 0, 1])
 KINK = 1e-9
 """Of the size: sums of two stretches below it count as it."""
 FADES, GONE = 0.3, 0.05
-"""Values of d between which z fades."""
+"""Values of J between which z fades."""
+BENT, FOLDED = 0.15, 0.6
+"""Values of q between which z fades; at 0.2 a corner can be inside out."""
 
 
 @njit(**OPTIONS)
@@ -129,30 +131,6 @@ def _frames(v, sizes, begin, end, F, U, s, V, B, W):  # type: ignore[no-untyped-
 
 
 @njit(**OPTIONS)
-def _fade(s, l, size):  # type: ignore[no-untyped-def]
-    """c, and d dc/dd and d^2 d2c/dd2, of lane l."""
-    d = (s[0, l] + s[1, l]) * (s[1, l] + s[2, l]) * (s[2, l] + s[0, l]) / (8.0 * size**3)
-    if d >= FADES:
-        return 1.0, 0.0, 0.0
-    if not d > GONE:
-        return 0.0, 0.0, 0.0
-    width = FADES - GONE
-    t = (d - GONE) / width
-    first = 30.0 * t * t * (1.0 - t) ** 2 / width
-    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
-    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), d * first, d * d * second
-
-
-@njit(**OPTIONS)
-def _fading(Y, slope, G):  # type: ignore[no-untyped-def]
-    """G (3, 3) = dc/dS."""
-    trace = Y[0, 0] + Y[1, 1] + Y[2, 2]
-    for i in range(3):
-        for j in range(3):
-            G[i, j] = slope * ((trace if i == j else 0.0) - Y[i, j])
-
-
-@njit(**OPTIONS)
 def _add_tensor(factor, G, y):  # type: ignore[no-untyped-def]
     """Add a symmetric tensor to the first six numbers."""
     for n in range(6):
@@ -170,52 +148,65 @@ def _adjugate(S, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _volume(S, size, Q, z):  # type: ignore[no-untyped-def]
-    """Make z's first six numbers, those of S - I, E's; Q (3, 3) = d(tr E)/dS / 3 - I/3."""
-    _adjugate(S, Q)
-    J = (S[0, 0] * Q[0, 0] + S[0, 1] * Q[0, 1] + S[0, 2] * Q[0, 2]) / size**3
+def _add_adjugate_change(factor, S, dS, y):  # type: ignore[no-untyped-def]
+    """Add a multiple of the adjugate's change to the first six numbers."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        own = dS[j, j] * S[k, k] + S[j, j] * dS[k, k] - 2.0 * S[j, k] * dS[j, k]
+        other = dS[i, j] * S[i, k] + S[i, j] * dS[i, k] - dS[i, i] * S[j, k] - S[i, i] * dS[j, k]
+        y[i] += factor * own
+        y[3 + i] += factor * other / _ROOT
+
+
+@njit(**OPTIONS)
+def _rise(t, width):  # type: ignore[no-untyped-def]
+    """From 0 at t = 0 to 1 at t = 1, and its first two derivatives by ``width`` times t."""
+    if t >= 1.0:
+        return 1.0, 0.0, 0.0
+    if not t > 0.0:
+        return 0.0, 0.0, 0.0
+    first = 30.0 * t * t * (1.0 - t) ** 2 / width
+    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
+    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), first, second
+
+
+@njit(**OPTIONS)
+def _measures(S, size, A, z):  # type: ignore[no-untyped-def]
+    """Make z's first six numbers, those of S - I, E's, and A (3, 3) the adjugate of S.
+
+    Returns c and its two derivatives by A : dS, those of tr E / 3, and e and its two by
+    sum h_m . dh_m.
+    """
+    _adjugate(S, A)
+    J = (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2]) / size**3
     below = J * J + 2.0
     more = (1.5 * size * (J * J - 1.0) / below - (z[0] + z[1] + z[2])) / 3.0
     for i in range(3):
         z[i] += more
-    factor = 3.0 * J / (below * below * size * size)
-    for i in range(3):
-        for j in range(3):
-            Q[i, j] = factor * Q[i, j] - (1.0 / 3.0 if i == j else 0.0)
+    first = 3.0 * J / (below * below * size**2)
+    second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**5)
+    c, slope, bend = _rise((J - GONE) / (FADES - GONE), (FADES - GONE) * size**3)
+    q = 0.0
+    for n in range(6, 18):
+        q += z[n] * z[n] / size**2
+    e, down, turn = _rise((FOLDED - q) / (FOLDED - BENT), (BENT - FOLDED) * 0.5 * size**2)
+    return c, slope, bend, first, second, e, down, turn
 
 
 @njit(**OPTIONS)
-def _add_volume_change(factor, S, dS, size, A, y):  # type: ignore[no-untyped-def]
-    """Add a multiple of dQ to the first six numbers; A (3, 3) is scratch."""
-    _adjugate(S, A)
-    J = (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2]) / size**3
-    dJ = 0.0
-    for i in range(3):
-        for j in range(3):
-            dJ += A[i, j] * dS[i, j] / size**3
-    below = J * J + 2.0
-    first = 3.0 * J / (below * below * size * size)
-    second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size * size)
-    for i in range(3):  # the change of A: it is quadratic in S
-        j, k = (i + 1) % 3, (i + 2) % 3
-        own = dS[j, j] * S[k, k] + S[j, j] * dS[k, k] - 2.0 * S[j, k] * dS[j, k]
-        other = dS[i, j] * S[i, k] + S[i, j] * dS[i, k] - dS[i, i] * S[j, k] - S[i, i] * dS[j, k]
-        y[i] += factor * (first * own + second * dJ * A[i, i])
-        for n in range(3, 6):
-            if _ROWS[n] != i and _COLUMNS[n] != i:
-                y[n] += factor * (first * other + second * dJ * A[j, k]) / _ROOT
-
-
-@njit(**OPTIONS)
-def _to_stretch(z, y, c, G, Q):  # type: ignore[no-untyped-def]
-    """From the derivatives y by c z to those by z and, of the first six, by S."""
+def _to_stretch(z, y, A, fades):  # type: ignore[no-untyped-def]
+    """From the derivatives y by c e z to those by z and, of the first six, by S."""
+    c, slope, _, first, _, e, down, _ = fades
     along = 0.0
     for n in range(18):
         along += y[n] * z[n]
-        y[n] *= c
-    _add_tensor(y[0] + y[1] + y[2], Q, y)
-    if c != 1.0:
-        _add_tensor(along, G, y)
+        y[n] *= c * e
+    trace = y[0] + y[1] + y[2]
+    _add_tensor(trace * first + along * slope * e, A, y)
+    for i in range(3):
+        y[i] -= trace / 3.0
+    for n in range(6, 18):
+        y[n] += along * c * down * z[n]
 
 
 @njit(**OPTIONS)
@@ -271,37 +262,12 @@ def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _change(  # type: ignore[no-untyped-def]
-    dv,
-    R,
-    S,
-    Y,
-    T,
-    w,
-    z,
-    y,
-    K,
-    factor,
-    fade,
-    raw,
-    G,
-    Q,
-    size,
-    D,
-    A,
-    B,
-    dT,
-    t,
-    turn,
-    dz,
-    dy,
-    dw,
-    out,
+    dv, R, S, Y, T, w, z, y, K, factor, fades, raw, G, D, A, B, dT, t, turn, dz, dy, dw, out
 ):
     """Out (7, 3): change of `_conjugates` by dv (7, 3); dz (18,) that of z.
 
     Without y's own second part where ``factor`` is 0: then the result is positive where K is.
-    ``fade`` are c and its derivatives, ``raw`` the derivatives by c z, G is dc/dS, Q as in
-    `_volume`.
+    ``fades`` and G, the adjugate, are of `_measures`; ``raw`` are the derivatives by c e z.
     """
     for i in range(3):
         for j in range(3):
@@ -316,48 +282,42 @@ def _change(  # type: ignore[no-untyped-def]
     for n in range(6):
         i, j = _ROWS[n], _COLUMNS[n]
         dz[n] = B[i, j] if i == j else 0.5 * (B[i, j] + B[j, i]) / _ROOT
-    more = 0.0
+    c, slope, bend, first, second, e, down, turned = fades
+    grown = 0.0
     for i in range(3):
         for j in range(3):
-            more += Q[i, j] * B[i, j]
+            grown += G[i, j] * B[i, j]
     for i in range(3):
-        dz[i] += more
+        dz[i] += first * grown - (B[0, 0] + B[1, 1] + B[2, 2]) / 3.0
     for m in range(4):
         part = dz[6 + 3 * m : 9 + 3 * m]
         for i in range(3):
             part[i] = R[0, i] * dv[3 + m, 0] + R[1, i] * dv[3 + m, 1] + R[2, i] * dv[3 + m, 2]
         _add_cross(turn, z[6 + 3 * m : 9 + 3 * m], -1.0, part)
-    c, slope, bend = fade
-    dc = 0.0
-    if slope != 0.0:
-        for i in range(3):
-            for j in range(3):
-                dc += G[i, j] * B[i, j]
+    bent = 0.0
+    for n in range(6, 18):
+        bent += z[n] * dz[n]
+    ds = slope * e * grown + c * down * bent
     for n in range(18):
         total = 0.0
         for l in range(18):
-            total += K[n, l] * (c * dz[l] + dc * z[l])
+            total += K[n, l] * (c * e * dz[l] + ds * z[l])
         dy[n] = total
     along, across = 0.0, 0.0
     for n in range(18):
         along += raw[n] * z[n]
         across += dy[n] * z[n] + factor * raw[n] * dz[n]
-        dy[n] = c * dy[n] + factor * dc * raw[n]
-    _add_tensor(dy[0] + dy[1] + dy[2], Q, dy)
-    if factor != 0.0:
-        _add_volume_change(c * (raw[0] + raw[1] + raw[2]), S, B, size, A, dy)
-    if slope != 0.0:
-        _add_tensor(across, G, dy)
-        if factor != 0.0:  # along dG, with dY = -Y (tr dS - dS) Y
-            trace = B[0, 0] + B[1, 1] + B[2, 2]
-            for i in range(3):
-                for j in range(3):
-                    D[i, j] = (trace if i == j else 0.0) - B[i, j]
-            _product(Y, D, A)
-            _product(A, Y, D)
-            _fading(D, -slope, dT)
-            _add_tensor(along, dT, dy)
-            _add_tensor(along * dc * (bend / slope + 1.0) / slope, G, dy)
+        dy[n] = c * e * dy[n] + factor * ds * raw[n]
+    trace, own = dy[0] + dy[1] + dy[2], factor * c * e * (raw[0] + raw[1] + raw[2])
+    along *= factor
+    both = trace * first + across * slope * e + own * second * grown
+    _add_tensor(both + along * (bend * e * grown + slope * down * bent), G, dy)
+    _add_adjugate_change(own * first + along * slope * e, S, B, dy)
+    for i in range(3):
+        dy[i] -= trace / 3.0
+    more = across * c * down + along * (slope * grown * down + c * turned * bent)
+    for n in range(6, 18):
+        dy[n] += more * z[n] + along * c * down * dz[n]
     _tensor(dy, dT)
     t[:] = 0.0
     _product(S, dT, A)
@@ -417,7 +377,7 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
         v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         T, A, out = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
-        G, Q = np.empty((3, 3)), np.empty((3, 3))
+        G = np.empty((3, 3))
         t, w = np.empty(3), np.empty(3)
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
@@ -426,20 +386,18 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
             l = c - begin
             _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
-            _volume(S, sizes[c], Q, z)
-            fade, slope, _ = _fade(s, l, sizes[c])
+            fades = _measures(S, sizes[c], G, z)
             total = 0.0
             for n in range(18):
                 row = 0.0
                 for m in range(18):
                     row += matrices[c, n, m] * z[m]
-                row *= fade
+                row *= fades[0] * fades[5]
                 less = shift[c, n] if len(shift) else 0.0
-                total += fade * z[n] * (0.5 * row - less)
+                total += fades[0] * fades[5] * z[n] * (0.5 * row - less)
                 y[n] = row - less
             energy[c] = total
-            _fading(Y, slope, G)
-            _to_stretch(z, y, fade, G, Q)
+            _to_stretch(z, y, G, fades)
             _turning(z, y, S, Y, T, A, t, w)
             _conjugates(R, T, w, y, A, out)
             _spread(out, shapes[c], -1.0, by_cell[c])
@@ -455,17 +413,16 @@ def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
         s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
         v = np.empty((CHUNK, 7, 3))
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        Q = np.empty((3, 3))
+        G = np.empty((3, 3))
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, B, W)
         for c in range(begin, end):
             _unpack(U, s, V, c - begin, sizes[c], R, S, Y)
             _strains(v[c - begin], R, S, sizes[c], out[c])
-            _volume(S, sizes[c], Q, out[c])
-            fade, _, _ = _fade(s, c - begin, sizes[c])
+            fades = _measures(S, sizes[c], G, out[c])
             for n in range(18):
-                out[c, n] *= fade
+                out[c, n] *= fades[0] * fades[5]
 
 
 @njit(**PARALLEL)
@@ -486,7 +443,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
         D, dT, column = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
         t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
         dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
-        raw, G, Q = np.empty(18), np.empty((3, 3)), np.empty((3, 3))
+        raw, G = np.empty(18), np.empty((3, 3))
         for c in range(begin, end):
             _amplitudes(u, cells[c], shapes[c], v[c - begin])
         _frames(v, sizes, begin, end, F, U, s, V, W9, W)
@@ -494,15 +451,13 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
             l = c - begin
             _unpack(U, s, V, l, sizes[c], R, S, Y)
             _strains(v[l], R, S, sizes[c], z)
-            _volume(S, sizes[c], Q, z)
-            fade = _fade(s, l, sizes[c])
+            fades = _measures(S, sizes[c], G, z)
             for n in range(18):
                 row = 0.0
                 for m in range(18):
                     row += matrices[c, n, m] * z[m]
-                y[n] = raw[n] = fade[0] * row - (shift[c, n] if len(shift) else 0.0)
-            _fading(Y, fade[1], G)
-            _to_stretch(z, y, fade[0], G, Q)
+                y[n] = raw[n] = fades[0] * fades[5] * row - (shift[c, n] if len(shift) else 0.0)
+            _to_stretch(z, y, G, fades)
             _turning(z, y, S, Y, T, A, t, w)
             if project:
                 y[:] = 0.0
@@ -510,7 +465,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
                 for i in range(3):
                     dv[a, i] = 1.0
                     _change(
-                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fade, raw, G, Q, sizes[c],
+                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fades, raw, G,
                         D, A, B, dT, t, turn, dz, dy, dw, column,
                     )  # fmt: skip
                     dv[a, i] = 0.0
