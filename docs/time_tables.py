@@ -83,8 +83,9 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
     yield "unlike-bodies", unlike_bodies
     yield "unlike-families", unlike_families
-    yield "unlike-families-frequencies", partial(
-        as_measured, "unlike_families", "Error of the lowest 10 frequencies, %"
+    yield (
+        "unlike-families-frequencies",
+        partial(as_measured, "unlike_families", "Error of the lowest 10 frequencies, %"),
     )
     yield "columns", partial(as_measured, "columns", "Columns")
     yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
