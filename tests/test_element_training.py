@@ -177,6 +177,11 @@ def test_files_that_are_no_weights_are_refused(tmp_path):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(FileFormatError):
         read_network(path)
+    network = random_network(width=8, rounds=1)
+    network.last.bias.data[3] = float("nan")
+    save_file(network.state_dict(), path)
+    with pytest.raises(FileFormatError, match="not finite"):
+        read_network(path)
     torch.manual_seed(0)
     network = ElementNetwork(8, 1)
     network.first = torch.nn.Linear(SIZE - 1, 8)

@@ -267,7 +267,10 @@ def read_network(path: Path) -> Network:
 
     try:
         content = path.read_bytes()
-        network = Network(load(content), hashlib.sha256(content).hexdigest()[:_DIGEST])
+        arrays = load(content)
+        if not all(np.isfinite(x).all() for x in arrays.values()):
+            raise ValueError("numbers that are not finite")
+        network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
         raise FileFormatError(
             f"{path}: no weights of a learned element ({error}): expected a file as `pdcorrect "
