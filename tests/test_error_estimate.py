@@ -44,10 +44,14 @@ def test_sees_the_error_of_the_time_step():
 
 def test_of_statics_and_finer_meshes_and_files(tmp_path):
     scene = beam(time={"integrator": "quasi-static", "step": 1.0, "frames": 1})
-    coarse, fine = (
-        pc.rollout(pc.Newton(pc.discretise(pc.best_coarse(scene), refine))) for refine in (1, 2)
+    coarse, fine, finest = (
+        pc.rollout(pc.Newton(pc.discretise(pc.best_coarse(scene), refine))) for refine in (1, 2, 4)
     )
-    assert rms(pc.error_estimate(fine)) < 0.5 * rms(pc.error_estimate(coarse))
+    estimates = [rms(pc.error_estimate(run)) for run in (coarse, fine)]
+    assert estimates[1] < estimates[0]
+    for estimate, run in zip(estimates, (coarse, fine), strict=True):
+        apart = pc.restrict(finest, run.problem).positions - run.positions
+        assert 0.5 < estimate / rms(np.linalg.norm(apart, axis=2)) < 2.0
     pc.save_trajectory(tmp_path / "run.h5", coarse)
     again = pc.error_estimate(pc.load_trajectory(tmp_path / "run.h5"))
     assert (again == pc.error_estimate(coarse)).all()
