@@ -23,7 +23,7 @@ derivatives
 frame's turning adds, without which forces would have no potential.  Second derivatives are exact
 too.  Everything here counts S and F times a, so that all numbers of z are lengths.
 
-z counts times c(J) e(q), q = sum_m h_m . h_m.  c is 1 for J above `FADES` and 0 below `GONE`:
+z counts times c(J) e(q), q = sum_m h_m . h_m / a^2.  c is 1 for J above `FADES` and 0 below `GONE`:
 the frame is not defined where two stretches add up to nothing.  e is 1 for q below `BENT` and 0
 above `FOLDED`.  So cells that are crushed, inside out or folded have the element's own energy
 alone, which may get them back.
