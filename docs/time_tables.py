@@ -61,15 +61,6 @@ def unlike_bodies() -> Rows:
     return tuple(heads[k] for k in kept), [[row[k] for k in kept] for row in rows]
 
 
-def unlike_families() -> Rows:
-    """Errors over the forty scenes, %, and median times, ms, a row a run."""
-    heads, rows = table_of("unlike_families", "Errors, % of the RMS displacement")
-    times = table_of("unlike_families", "Time a frame, ms")[1][0]
-    columns = zip(heads[1:], *(row[1:] for row in rows[-3:]), times[1:], strict=True)
-    cells = [[run, *(number(x, 2) for x in row)] for run, *row in columns]
-    return ("run, substeps", "mean", "median", "worst", "ms a frame"), cells
-
-
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By name."""
     yield "time-orders", orders
@@ -82,11 +73,6 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
     yield "unlike-bodies", unlike_bodies
-    yield "unlike-families", unlike_families
-    yield (
-        "unlike-families-frequencies",
-        partial(as_measured, "unlike_families", "Error of the lowest 10 frequencies, %"),
-    )
     yield "columns", partial(as_measured, "columns", "Columns")
     yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
 
