@@ -17,7 +17,7 @@ from pdcorrect.elements.linear import collate, errors, loss, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.fem.element_network import SCALARS, STRAINS, read_network
-from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, cell_graph, permutations
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, cell_graph, neighbours_of, permutations
 
 
 def small(seed, most=14):
@@ -133,7 +133,9 @@ def random_network(seed=0, **sizes):
 def body_graph(answer):
     index = answer.places[answer.cells[:, 0]]
     poisson = np.full(len(index), float(answer.poisson))
-    return cell_graph(index, answer.young, poisson, answer.held[answer.cells].astype(float))
+    return cell_graph(
+        neighbours_of(index), answer.young, poisson, answer.held[answer.cells].astype(float)
+    )
 
 
 def test_a_round_is_a_relational_graph_convolution(found):
@@ -192,9 +194,10 @@ def test_files_that_are_no_weights_are_refused(tmp_path):
 
 @pytest.fixture
 def few(monkeypatch):
-    """Two small bodies in a file."""
+    """Two small bodies in a file, and a line for each epoch."""
+    monkeypatch.setattr(training, "_REPORTS", 0.0)
     monkeypatch.setattr(collection, "A_FILE", 2)
-    monkeypatch.setattr(collection, "draw", lambda rng: small(int(rng.integers(100)))[0])
+    monkeypatch.setattr(collection, "draw", lambda rng, **_: small(int(rng.integers(100)))[0])
 
 
 RECIPE = training.ElementRecipe(bodies=4, width=8, rounds=2, iterations=6, batch=2, symmetries=4)
@@ -224,7 +227,7 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(few, tmp_path, mo
     def stops(self, seconds=None):
         if self.iteration >= 2:
             raise KeyboardInterrupt
-        epoch(self, seconds)
+        return epoch(self, seconds)
 
     with monkeypatch.context() as patch:
         patch.setattr(training.Trainer, "epoch", stops)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch import viscosity
+from pdcorrect.batch.correction import without_trace
 from pdcorrect.batch.modes import Following, relaxed
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.step_equation import BatchStepEquation
@@ -130,8 +131,9 @@ class DampingTerms:
         if self._viscous and self._cells.correction is not None:
             here = self._cells.local(y - self._cells.rest)
             self._y = y
-            self._against = self._cells.correction.strains(here) - objective.strains_before
-            self._written_rates = self._cells.correction.rates(here, self._cells.local(x))
+            correction = self._cells.correction
+            self._against = without_trace(correction.strains(here) - objective.strains_before)
+            self._written_rates = without_trace(correction.rates(here, self._cells.local(x)))
 
     @cached_property
     def origin(self) -> Tensor:
@@ -216,7 +218,7 @@ class DampingTerms:
             slope = viscosity.forces(self._cells, frames, self._stress)
             correction = self._cells.correction
             if correction is not None:
-                stress = self._rate * correction.stress(self._written_rates)
+                stress = correction.viscous_stress(self._written_rates, self._rate)
                 local = self._cells.local(place - self._cells.rest)
                 slope = slope + self._cells.of_corners(correction.pulled(local, stress))
             found.append(a * slope)

@@ -94,7 +94,7 @@ class BatchCorrection:
         return self._state(local).strains
 
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """r/2 (z - z') . K (z - z') (B,), and its derivatives by cell (B, C, 8, 3)."""
+        """See `WrittenViscous`: (B,), and its derivatives by cell (B, C, 8, 3)."""
         state = self._against(self._state(local), before, rate)
         energy = 0.5 * ((state.strains - before) * state.raw).sum(dim=(1, 2))
         conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
@@ -121,6 +121,10 @@ class BatchCorrection:
         """K z, (B, C, 18)."""
         return small_products(self._matrices, z[..., None])[..., 0]
 
+    def viscous_stress(self, z: Tensor, rate: Tensor) -> Tensor:
+        """Times a rate, and with the part of K that viscosity has, see `WrittenViscous`."""
+        return rate * without_trace(self.stress(without_trace(z)))
+
     def linearise(self, local: Tensor, project: bool = False) -> Tensor:
         """What `apply` needs, (STATE, B C, 1); ``project`` as in `CellCorrection.tangent`."""
         state = self._state(local)
@@ -128,8 +132,8 @@ class BatchCorrection:
             state = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
         return _kept(state)
 
-    def apply(self, kept: Tensor, local: Tensor, rate: Tensor | float = 1.0) -> Tensor:
-        """The second derivative times changes (B, C, 8, 3), by cell; ``rate`` multiplies K."""
+    def apply(self, kept: Tensor, local: Tensor, rate: Tensor | None = None) -> Tensor:
+        """The second derivative times changes (B, C, 8, 3), by cell; the rate is of viscosity."""
         scenes, cells = self._sizes.shape
         flat = kept[..., 0].T.reshape(scenes, cells, STATE)
         parts = torch.split(flat, list(_SIZES), dim=2)
@@ -181,7 +185,7 @@ class BatchCorrection:
         return torch.cat([y[..., :6] + more, y[..., 6:] + vectors], dim=-1)
 
     def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
-        return self._with(at, rate * self.stress(at.strains - before))
+        return self._with(at, self.viscous_stress(at.strains - before, rate))
 
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
@@ -200,14 +204,15 @@ class BatchCorrection:
         dz = torch.cat([torch.einsum("nij,bcij->bcn", self._mandel, dE), dh.flatten(2)], dim=2)
         return dz, dS, grown, dh, turn
 
-    def _changes(self, at: _State, dv: Tensor, rate: Tensor | float) -> Tensor:
+    def _changes(self, at: _State, dv: Tensor, rate: Tensor | None) -> Tensor:
         """See `turned_strains`; (B, C, 7, 3)."""
         dz, dS, grown, dh, turn = self._rates(at, dv)
         h, y = _vectors(at.z), _vectors(at.y)
         c, slope, bend, first, second, e, down, turned = torch.split(at.fades, 1, dim=-1)
         bent = (at.z[..., 6:] * dz[..., 6:]).sum(dim=-1, keepdim=True)
         ds = slope * e * grown + c * down * bent
-        raw = rate * self.stress(c * e * dz + ds * at.z)
+        strains = c * e * dz + ds * at.z
+        raw = self.stress(strains) if rate is None else self.viscous_stress(strains, rate)
         dy = c * e * raw + ds * at.raw
         own, trace = (x[..., :3].sum(dim=-1, keepdim=True) for x in (c * e * at.raw, dy))
         along = (at.raw * at.z).sum(dim=-1, keepdim=True)
@@ -230,6 +235,12 @@ class BatchCorrection:
 
 
 _OWN = ("raw", "y", "tensor", "w")
+
+
+def without_trace(z: Tensor) -> Tensor:
+    """Strains (..., 18) whose first three numbers have no mean."""
+    axial = z[..., :3] - z[..., :3].mean(dim=-1, keepdim=True)
+    return torch.cat([axial, z[..., 3:]], dim=-1)
 
 
 def _adjugates(A: Tensor, B: Tensor) -> Tensor:

@@ -30,6 +30,8 @@ T = TypeVar("T", bound=np.generic)
 
 REFINEMENT = 4
 MODES = 12
+_WEAK, _FOUNDATION = 1e-2, 0.05
+"""Foundations of free bodies: to find the lowest frequency, and as a share of its square."""
 _CORNERS = VTK_CORNERS.astype(int)
 
 
@@ -49,9 +51,11 @@ class Answers(NamedTuple):
         Static loads of the coarse model, and the fine answers, of size 1 in the mean; where
         ``held`` the displacements are prescribed.
     energies : (L,)
-        Twice the fine model's elastic energies.
+        Twice the fine model's energies.
+    foundation : float
+        Stiffness over mass, 1/s2, of springs that hold each node of a body with no held one.
     squares : (M,)
-        Squared angular frequencies of the modes, ascending.
+        Squared angular frequencies of the modes, ascending, the foundation's included.
     modes : (M, N, 3)
         Of unit mass in the fine model.
     stiffness, mass : (24, 24), (8, 8)
@@ -67,6 +71,7 @@ class Answers(NamedTuple):
     forces: Array
     displacements: Array
     energies: Array
+    foundation: float
     squares: Array
     modes: Array
     stiffness: Array
@@ -133,9 +138,15 @@ def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
     held = body.held[tuple(coarse.places.T)]
     fixed = (P @ held.astype(float)) > 1.0 - 1e-9
     free = np.flatnonzero(np.repeat(~fixed, 3))
-    factor = factorise(sp.csr_matrix(K[free][:, free]), "cholespy", unknowns=3)
     points: Array = np.asarray(scale * fine.places, dtype=np.float64)
+    mass = sp.csr_matrix(sp.kron(M, sp.eye_array(3)))
+    foundation = 0.0 if fixed.any() else _foundation(K, mass, points)
+    if foundation:
+        K = sp.csr_matrix(K + foundation * mass)
+    factor = factorise(sp.csr_matrix(K[free][:, free]), "cholespy", unknowns=3)
     loads = _loads(fine, points, weights, fixed, rng)
+    if foundation:
+        loads = _balanced(loads, mass, points)
     moved = _moved_clamps(body.held, coarse, P, points, rng)
     F = np.concatenate([loads, np.zeros((len(moved), count, 3))])
     U = np.zeros_like(F)
@@ -146,7 +157,7 @@ def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
     flat = U.reshape(len(U), -1)
     size = np.sqrt((U**2).sum(axis=2).mean(axis=1))
     F, flat = F / size[:, None, None], flat / size[:, None]
-    squares, shapes = _modes(K, M, free, factor.solve)
+    squares, shapes = _modes(K, mass, free, factor.solve, 6 if foundation else 0)
     at = _at_coarse(coarse, fine)
     return Answers(
         coarse.places,
@@ -158,6 +169,7 @@ def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
         np.einsum("fn,lfi->lni", P.toarray(), F, optimize=True),
         flat.reshape(U.shape)[:, at],
         np.einsum("li,li->l", flat, (K @ flat.T).T),
+        foundation,
         squares,
         shapes.reshape(len(shapes), -1, 3)[:, at],
         K1,
@@ -197,16 +209,44 @@ def _interpolation(coarse: VoxelMesh, fine: VoxelMesh) -> sp.csr_matrix:
     return sp.csr_matrix(sp.coo_matrix(entries, shape=shape))
 
 
-def _modes(K: sp.csr_matrix, M: sp.csr_matrix, free, solve) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
-    mass = sp.csr_matrix(sp.kron(M, sp.eye_array(3)))[free][:, free]
+def _modes(K: sp.csr_matrix, mass: sp.csr_matrix, free, solve, rigid: int) -> tuple[Array, Array]:  # type: ignore[no-untyped-def]
+    """Squares and shapes of the lowest modes after so many ``rigid`` ones."""
+    inside = sp.csr_matrix(mass[free][:, free])
     stiffness = sp.csr_matrix(K[free][:, free])
     inverse = spla.LinearOperator(stiffness.shape, matvec=solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=len(free))
-    squares, vectors = spla.eigsh(stiffness, MODES, mass, sigma=0.0, OPinv=inverse, v0=start)
-    order = np.argsort(squares)
+    count = MODES + rigid
+    squares, vectors = spla.eigsh(stiffness, count, inside, sigma=0.0, OPinv=inverse, v0=start)
+    order = np.argsort(squares)[rigid:]
     shapes = np.zeros((MODES, K.shape[0]))
     shapes[:, free] = vectors[:, order].T
     return squares[order], shapes
+
+
+# --- free bodies ---------------------------------------------------------------------------------
+
+
+def _foundation(K: sp.csr_matrix, mass: sp.csr_matrix, points: Array) -> float:
+    """A small share of the square of the lowest elastic frequency."""
+    weak = _WEAK / np.ptp(points, axis=0).max() ** 4
+    factor = factorise(sp.csr_matrix(K + weak * mass), "cholespy", unknowns=3)
+    everything = np.arange(K.shape[0])
+    squares, _ = _modes(sp.csr_matrix(K + weak * mass), mass, everything, factor.solve, 6)
+    return float(_FOUNDATION * squares[0])
+
+
+def _balanced(loads: Array, mass: sp.csr_matrix, points: Array) -> Array:
+    """Loads less the inertia of the rigid motion that they cause, without those of nothing else."""
+    axes = np.eye(3)
+    away = points - points.mean(axis=0)
+    moves = [np.broadcast_to(axis, away.shape) for axis in axes]
+    moves += [np.cross(axis, away) for axis in axes]
+    R = np.stack([move.ravel() for move in moves])
+    inertia = (mass @ R.T).T
+    flat = loads.reshape(len(loads), -1)
+    left = flat - np.linalg.solve(R @ inertia.T, R @ flat.T).T @ inertia
+    kept = np.linalg.norm(left, axis=1) > 0.05 * np.linalg.norm(flat, axis=1)
+    return np.asarray(left[kept].reshape(-1, *loads.shape[1:]))
 
 
 # --- loads ---------------------------------------------------------------------------------------
@@ -221,8 +261,7 @@ def _loads(
 ) -> Array:
     """Static loads (L, nodes, 3) on the fine nodes that are not fixed.
 
-    Weights, turnings and even tractions along one axis each: in a sum of several the softest
-    answer would hide the others.  Then fields of all directions and a narrow traction.
+    Most lie along one axis: in a sum of several the softest answer would hide the others.
     """
     count = len(points)
     nodal = np.bincount(fine.cells.ravel(), np.repeat(masses, 8) / 8.0, minlength=count)[:, None]
@@ -233,16 +272,20 @@ def _loads(
     out += [nodal * np.cross(axis, away) for axis in axes]  # turning
     out.append(nodal * (rng.normal(size=3) + away @ rng.normal(size=(3, 3))))
     out.append(nodal * np.einsum("ni,nj,ijk->nk", away, away, rng.normal(size=(3, 3, 3))))
-    for wide in (True, True, False):
+    for kind in ("even", "linear", "narrow"):
         axis, side = int(rng.integers(3)), int(rng.integers(2))
         area = np.where(fixed, 0.0, _face_areas(fine, axis, side))[:, None]
         if not area.any():
             continue
-        place = points[rng.choice(np.flatnonzero(area[:, 0] > 0.0))]
-        reach = 1e3 if wide else rng.uniform(0.7, 2.0)
-        near = np.exp(-((points - place) ** 2).sum(axis=1) / (2.0 * reach**2))[:, None]
-        traction = axes[rng.integers(3)] + away @ rng.normal(size=(3, 3)) * (0.0 if wide else 2.0)
-        out.append(area * near * traction)
+        traction: Array = axes[rng.integers(3)]
+        if kind == "linear":  # moments, if normal
+            traction = traction * (away @ axes[rng.integers(3)])[:, None]
+        elif kind == "narrow":
+            place = points[rng.choice(np.flatnonzero(area[:, 0] > 0.0))]
+            reach = rng.uniform(0.7, 2.0)
+            near = np.exp(-((points - place) ** 2).sum(axis=1) / (2.0 * reach**2))[:, None]
+            traction = near * (traction + 2.0 * away @ rng.normal(size=(3, 3)))
+        out.append(area * traction)
     return np.stack(out)
 
 

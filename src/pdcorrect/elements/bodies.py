@@ -16,6 +16,8 @@ _LONGEST = 24
 """Cells along a member: long ones part what its ends do from what its middle does."""
 _FEWEST, _MOST = 4, 150
 """Cells of a body."""
+_MOST_CUT = 24
+"""Before each is cut into eight."""
 _MOST_HELD = 0.6
 """Share of the nodes."""
 _NEARLY_INCOMPRESSIBLE = 0.3
@@ -47,17 +49,26 @@ class VoxelBody:
     poisson: float
 
 
-def draw(rng: np.random.Generator) -> VoxelBody:
-    """A body; the same one from a generator in the same state."""
+def draw(rng: np.random.Generator, cut: bool = False, free: bool = False) -> VoxelBody:
+    """A body; the same one from a generator in the same state.
+
+    ``cut`` is for meshes that are finer than their bodies need: cells of a small one, each in
+    eight.  Nothing holds a ``free`` one.
+    """
+    most = _MOST_CUT if cut else _MOST
     kinds = sorted(_SHAPES)
     while True:
         kind = kinds[rng.integers(len(kinds))]
         solid = connected(_SHAPES[kind](rng))
-        if not _FEWEST <= solid.sum() <= _MOST:
+        if not _FEWEST <= solid.sum() <= most:
             continue
         solid = _trimmed(solid.transpose(rng.permutation(3)))
+        if cut:
+            solid = solid.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
         held = _held(solid, rng)
-        if holds(held, nodes_of(solid)):
+        if free:
+            held[:] = False
+        if free or holds(held, nodes_of(solid)):
             break
     young, density = _materials(solid, rng)
     low, high = (0.45, 0.495) if rng.random() < _NEARLY_INCOMPRESSIBLE else (0.0, 0.45)

@@ -6,12 +6,14 @@ import os
 import time
 import zipfile
 import zlib
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdcorrect._files import make_folder, replacing
 from pdcorrect.data.workers import one_thread
@@ -19,10 +21,14 @@ from pdcorrect.elements.answers import Answers, answers
 from pdcorrect.elements.bodies import draw
 from pdcorrect.errors import InputError
 
+Array = NDArray[Any]
+
 A_FILE = 25
 """Bodies in a file."""
+_TURN, _FREE, _CUT = 10, 8, 9
+"""Of so many files two have bodies of other kinds, see `draw`."""
 _HALF = ("forces", "displacements", "modes")
-"""Kept in half precision: errors of 2e-4, far below what the loss counts."""
+"""Kept in half precision, each load and mode over its largest number: errors of 2e-4."""
 
 
 def generate(
@@ -47,10 +53,16 @@ def read_file(path: Path) -> list[Answers]:
     try:
         with np.load(path) as data:
             return [
-                Answers(*(data[f"{i}/{name}"] for name in Answers._fields)) for i in range(A_FILE)
+                Answers(**{name: _read(data, f"{i}/{name}") for name in Answers._fields})
+                for i in range(A_FILE)
             ]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: {error}. Delete it and generate again.") from None
+
+
+def _read(data: Mapping[str, Array], name: str) -> Any:
+    kept, scale = data[name], f"{name} largest"
+    return kept * data[scale] if scale in data else kept
 
 
 def file_paths(folder: Path, count: int) -> list[Path]:
@@ -71,10 +83,15 @@ def _write(folder: Path, seed: int, number: int, deadline: float | None) -> bool
     with one_thread():
         for i in range(A_FILE):
             rng = np.random.default_rng([seed, number * A_FILE + i])
-            found = answers(draw(rng), rng)
+            body = draw(rng, cut=number % _TURN == _CUT, free=number % _TURN == _FREE)
+            found = answers(body, rng)
             for name, value in found._asdict().items():
-                kept = np.asarray(value)
-                arrays[f"{i}/{name}"] = kept.astype(np.float16) if name in _HALF else kept
+                kept, key = np.asarray(value), f"{i}/{name}"
+                if name in _HALF:
+                    largest = np.abs(kept).max(axis=(1, 2), keepdims=True) + 1e-300
+                    arrays[f"{key} largest"] = largest
+                    kept = (kept / largest).astype(np.float16)
+                arrays[key] = kept
     with replacing(_path(folder, number)) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return True

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pdcorrect.elements.network import ElementNetwork
 
@@ -39,15 +38,13 @@ class Descent:
             _ADAM: torch.optim.AdamW(others, lr=_ADAM * rate, weight_decay=_ADAM_DECAY),
         }
 
-    def step(self, value: Tensor, iteration: int) -> None:
-        """Move the weights against the derivative of ``value``."""
+    def step(self, iteration: int) -> None:
+        """Move the weights against the derivatives that they have."""
         fall = 0.5 + 0.5 * np.cos(np.pi * iteration / self._iterations)
         rise = min(1.0, (iteration + 1) / (_WARM_UP * self._iterations))
         for share, optimiser in self._optimisers.items():
             for group in optimiser.param_groups:
                 group["lr"] = float(share * self._rate * rise * fall)
-        self._network.zero_grad()
-        value.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
         for optimiser in self._optimisers.values():
             optimiser.step()

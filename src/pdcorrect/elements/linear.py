@@ -13,14 +13,14 @@ from torch import Tensor
 
 from pdcorrect.elements.answers import Answers
 from pdcorrect.fem.cell_correction import cell_shapes
-from pdcorrect.fem.learned import bounded, own_mass, own_stiffness, root, scalar_map, strain_map
+from pdcorrect.fem.learned import BOUND, own_mass, own_stiffness, root, scalar_map, strain_map
 from pdcorrect.fem.mesh import VTK_CORNERS
-from pdcorrect.fem.neighbourhood import cell_graph
+from pdcorrect.fem.neighbourhood import cell_graph, neighbours_of
 
 Array = NDArray[np.float64]
 
 _LOADS, _MODES = 12, 12
-FLOORS = (0.01, 0.01, 0.01, 0.003)
+FLOORS = (0.004, 0.004, 0.004, 0.001)
 """Below which errors hardly count: of displacements, energies, shapes and squared frequencies."""
 WEIGHTS = (1.0, 1.0, 1.0, 3.0)
 _SMALLEST = 1e-4
@@ -47,6 +47,7 @@ class Sample(NamedTuple):
     density: Array
     rows: NDArray[np.int64]
     free: NDArray[np.bool_]
+    foundation: float
     forces: Array
     displacements: Array
     energies: Array
@@ -61,13 +62,13 @@ def sample(body: Answers) -> Sample:
     count = len(body.cells)
     index = body.places[body.cells[:, 0]]
     corners = body.held[body.cells].astype(float)
-    graph = cell_graph(index, body.young, np.full(count, poisson), corners)
+    graph = cell_graph(neighbours_of(index), body.young, np.full(count, poisson), corners)
     rows = (3 * body.cells[:, :, None] + np.arange(3)).reshape(count, 24)
     return Sample(
         graph.numbers.astype(np.float32), graph.neighbours,
         corners.any(axis=1).astype(float), K, M,
         root(own_stiffness(K, unit_strains())), root(own_mass(M)),
-        body.young, body.density, rows, ~np.repeat(body.held, 3),
+        body.young, body.density, rows, ~np.repeat(body.held, 3), float(body.foundation),
         body.forces.reshape(len(body.forces), -1).astype(float),
         body.displacements.reshape(len(body.forces), -1).astype(float),
         body.energies, body.squares, body.modes.reshape(len(body.modes), -1).astype(float),
@@ -89,6 +90,7 @@ class Batch(NamedTuple):
         Place of each displacement among the body's, which are padded to n.
     solve : (C, 24)
         Place among the free ones, padded to m; m itself where held.
+    foundation : (B,)
     free : (B, n)
     forces, displacements : (B, L, n)
     energies : (B, L), loaded : (B, L)
@@ -110,6 +112,7 @@ class Batch(NamedTuple):
     rows: Tensor
     solve: Tensor
     places: Tensor
+    foundation: Tensor
     forces: Tensor
     displacements: Tensor
     energies: Tensor
@@ -157,7 +160,8 @@ def collate(samples: Sequence[Sample]) -> Batch:
     owner = np.repeat(np.arange(size), [len(s.rows) for s in samples])
     arrays = dict(
         **stacked, **joined, owner=owner, solve=np.concatenate(solve), places=places,
-        forces=forces, displacements=displacements, energies=energies, loaded=loaded, modes=modes,
+        foundation=np.array([s.foundation for s in samples]), forces=forces,
+        displacements=displacements, energies=energies, loaded=loaded, modes=modes,
     )  # fmt: skip
     return Batch(**{k: torch.as_tensor(v) for k, v in arrays.items()})
 
@@ -177,21 +181,63 @@ class _Solved(torch.autograd.Function):
     """X of A X = B (..., m, m) and (..., m, L), A symmetric and positive.
 
     One factorisation serves X and its derivatives; `torch.linalg.solve` would differentiate
-    through it at several times the cost.
+    through it at several times the cost.  Nothing here waits for a GPU, see `training.Recorded`.
     """
 
     @staticmethod
     def forward(ctx: Any, A: Tensor, B: Tensor) -> Tensor:
         factor = torch.linalg.cholesky_ex(A).L  # positive by construction: no look at its success
-        X = torch.cholesky_solve(B, factor)
+        X = _backward(factor, _forward(factor, B))
         ctx.save_for_backward(factor, X)
         return X
 
     @staticmethod
     def backward(ctx: Any, slopes: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         factor, X = ctx.saved_tensors
-        by_B = torch.cholesky_solve(slopes, factor)
+        by_B = _backward(factor, _forward(factor, slopes))
         return -by_B @ X.mT, by_B
+
+
+_BLOCK = 512
+"""Largest triangle that torch gives cuBLAS; larger ones go to a library that waits."""
+
+
+def _forward(L: Tensor, B: Tensor) -> Tensor:
+    """X of L X = B, L lower triangular."""
+    h = L.shape[-1] // 2
+    if 2 * h <= _BLOCK:
+        return torch.linalg.solve_triangular(L, B, upper=False)
+    top = _forward(L[..., :h, :h], B[..., :h, :])
+    rest = B[..., h:, :] - L[..., h:, :h] @ top
+    return torch.cat([top, _forward(L[..., h:, h:], rest)], dim=-2)
+
+
+def _backward(L: Tensor, B: Tensor) -> Tensor:
+    """X of L^T X = B."""
+    h = L.shape[-1] // 2
+    if 2 * h <= _BLOCK:
+        return torch.linalg.solve_triangular(L.mT, B, upper=True)
+    below = _backward(L[..., h:, h:], B[..., h:, :])
+    rest = B[..., :h, :] - L[..., h:, :h].mT @ below
+    return torch.cat([_backward(L[..., :h, :h], rest), below], dim=-2)
+
+
+def _solved(A: Tensor, B: Tensor) -> Tensor:
+    return _Solved.apply(A, B)  # type: ignore[no-any-return, no-untyped-call]
+
+
+def _bounded(N: Tensor) -> Tensor:
+    """See `fem.learned.bounded`."""
+    one = torch.eye(N.shape[-1], dtype=N.dtype, device=N.device)
+    return 2.0 * BOUND * _solved(one + N @ N, N)
+
+
+@lru_cache(maxsize=4)
+def _maps(like: tuple[torch.device, torch.dtype]) -> tuple[Tensor, Tensor]:
+    """`unit_strains` and `scalar_map`."""
+    device, dtype = like
+    T, P = (torch.as_tensor(x(), dtype=dtype, device=device) for x in (unit_strains, scalar_map))
+    return T, P
 
 
 def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
@@ -202,16 +248,19 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
     """
     K, M = batch.K[batch.owner], batch.M[batch.owner]
     if N is not None and H is not None:
-        T, P = (torch.as_tensor(f()).to(K) for f in (unit_strains, scalar_map))
+        T, P = _maps((K.device, K.dtype))
         gate = torch.ones(len(N), 18, dtype=K.dtype, device=K.device)
         gate[:, :6] = batch.near[:, None]
         N = N.to(K) * gate[:, :, None] * gate[:, None, :]
         left = batch.stiff_root[batch.owner] @ T
-        K = K + left.mT @ bounded(torch, N) @ left
+        K = K + left.mT @ _bounded(N) @ left
         below = batch.heavy_root[batch.owner] @ P
-        M = M + below.mT @ bounded(torch, H.to(K)) @ below
+        M = M + below.mT @ _bounded(H.to(K)) @ below
     K = K * batch.young[:, None, None]
     M = M * batch.density[:, None, None]
+    one = torch.eye(3, dtype=K.dtype, device=K.device)
+    spread = (M[:, :, None, :, None] * one[:, None]).reshape(-1, 24, 24)
+    K = K + batch.foundation[batch.owner, None, None] * spread
     size, m = batch.places.shape
     flat = batch.owner[:, None, None] * (m + 1) ** 2
     flat = flat + batch.solve[:, :, None] * (m + 1) + batch.solve[:, None, :]
@@ -223,18 +272,17 @@ def errors(batch: Batch, N: Tensor | None, H: Tensor | None) -> Errors:
     def times(matrices: Tensor, x: Tensor) -> Tensor:
         """Cell matrices (C, 24, 24) times fields (B, L, n + 1)."""
         places = batch.rows[:, None].expand(-1, x.shape[1], -1)
-        local = torch.gather(x[batch.owner], 2, places) @ matrices.mT
+        local = torch.gather(x.index_select(0, batch.owner), 2, places) @ matrices.mT
         out = torch.zeros_like(x).flatten(0, 1)
         line = batch.owner[:, None] * x.shape[1] + torch.arange(x.shape[1], device=x.device)
         where = line[:, :, None] * (n + 1) + places
         return out.flatten().index_add(0, where.flatten(), local.flatten()).reshape(x.shape)
 
-    spread = (M[:, :, None, :, None] * torch.eye(3).to(K)[:, None]).reshape(-1, 24, 24)
     inertia = times(spread, batch.modes)
     index = batch.places[:, None].expand(-1, _LOADS + _MODES, -1)
     held = batch.displacements.scatter(2, index[:, :_LOADS], 0.0)
     right = torch.cat([batch.forces - times(K, held), inertia], dim=1)
-    answers = _Solved.apply(A, torch.gather(right, 2, index).mT).mT  # type: ignore[no-untyped-call]
+    answers = _solved(A, torch.gather(right, 2, index).mT).mT
     answers = torch.zeros_like(right).scatter(2, index, answers)
     answers = torch.cat([answers[..., :n], torch.zeros_like(answers[..., n:])], dim=2)
     u, v = held + answers[:, :_LOADS], batch.squares[:, :, None] * answers[:, _LOADS:]

@@ -35,10 +35,14 @@ class ElementNetwork(nn.Module):
         self.rounds = nn.ModuleList(nn.Linear(NEIGHBOURS * width, width) for _ in range(rounds))
         self.norms = nn.ModuleList(nn.RMSNorm(width, eps=EPSILON) for _ in range(rounds))
         self.hidden = nn.Linear(2 * width, head)
-        self.last = nn.Linear(head, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS)))
+        self._lengths = [halves(size).places.shape[1] for size in (STRAINS, SCALARS)]
+        self.last = nn.Linear(head, sum(self._lengths))
         own, around = permutations()
-        self.register_buffer("own", torch.as_tensor(own), persistent=False)
-        self.register_buffer("around", torch.as_tensor(around), persistent=False)
+        tables = {"own": own, "around": around}
+        for size in (STRAINS, SCALARS):
+            tables |= {f"{name}{size}": x for name, x in halves(size)._asdict().items()}
+        for name, table in tables.items():
+            self.register_buffer(name, torch.as_tensor(table), persistent=False)
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
@@ -61,18 +65,15 @@ class ElementNetwork(nn.Module):
             around = padded.flatten(0, 1).index_select(0, place)
             x = x + silu(convolution(around.reshape(*x.shape[:2], -1)))
         found = self.last(silu(self.hidden(torch.cat([x, first], dim=2))))
-        split = halves(STRAINS).places.shape[1]
-        return (
-            _mean(found[..., :split], STRAINS, symmetries),
-            _mean(found[..., split:], SCALARS, symmetries),
+        lower = zip(found.split(self._lengths, dim=2), (STRAINS, SCALARS), strict=True)
+        N, H = (self._mean(answers, size, symmetries) for answers, size in lower)
+        return N, H
+
+    def _mean(self, lower: Tensor, size: int, symmetries: Tensor) -> Tensor:
+        """The mean (C, n, n) of symmetric matrices given by lower halves (C, G, h), turned back."""
+        places, signs, number = (
+            self.get_buffer(f"{name}{size}") for name in ("places", "signs", "number")
         )
-
-
-def _mean(lower: Tensor, size: int, symmetries: Tensor) -> Tensor:
-    """The mean (C, n, n) of symmetric matrices given by lower halves (C, G, h), turned back."""
-    half = halves(size)
-    places = torch.as_tensor(half.places, device=lower.device)[symmetries]
-    signs = torch.as_tensor(half.signs, device=lower.device)[symmetries].to(lower)
-    turned = torch.gather(lower, 2, places.expand(len(lower), -1, -1)) * signs
-    number = torch.as_tensor(half.number, device=lower.device)
-    return turned.mean(dim=1)[:, number]
+        turned = torch.gather(lower, 2, places[symmetries].expand(len(lower), -1, -1))
+        mean = (turned * signs[symmetries].to(lower)).mean(dim=1)
+        return mean.index_select(1, number.flatten()).reshape(-1, size, size)

@@ -20,7 +20,7 @@ from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, replacing, write_bytes, write_text
 from pdcorrect.elements.collection import file_paths, generate, read_file
 from pdcorrect.elements.descent import Descent
-from pdcorrect.elements.linear import Batch, Errors, Sample, collate, errors, loss, means, sample
+from pdcorrect.elements.linear import Batch, Sample, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import InputError
 from pdcorrect.fem.learned import LARGEST_POISSON
@@ -29,6 +29,8 @@ WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
 _CHECKPOINT = "checkpoint.pt"
 _VALIDATION = 0.05
 """Bodies that judge the network, of those that it learns from."""
+_REPORTS = 20.0
+"""Seconds from one line, and one checkpoint, to the next."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,9 @@ def train(
     while trainer.iteration < recipe.iterations:
         if left() == 0.0:
             return False
-        trainer.epoch(left())
+        told = time.monotonic()
+        while trainer.epoch(left()) and time.monotonic() < told + _REPORTS:
+            pass
         trainer.save(path)
         report(trainer.line())
     write_bytes(folder / WEIGHTS, save(trainer.weights()))
@@ -141,36 +145,48 @@ class Trainer:
         self._rng = np.random.default_rng(recipe.seed)
         self._network = network = kind(recipe.width, recipe.rounds).to(device)
         self._descent = Descent(network, recipe.rate, recipe.iterations)
-        self._batches, self._validation = (
+        batches, self._validation = (
             _batches(samples, recipe.batch, device) for samples in (known, others)
         )
         with torch.no_grad():
-            self._base = [errors(batch, None, None) for batch in self._batches]
             self._without = [errors(batch, None, None) for batch in self._validation]
+        self._symmetries = torch.arange(recipe.symmetries, device=device)
+        self._slopes = [self._slopes_of(batch) for batch in batches]
         self.iteration = 0
         self._loss = float("nan")
 
-    def epoch(self, seconds: float | None = None) -> None:
-        """Each body once, or as many as the recipe, or the time (s), still has."""
+    def epoch(self, seconds: float | None = None) -> bool:
+        """Each body once, as far as the recipe's iterations and the time (s) go; if they do."""
         deadline = None if seconds is None else time.monotonic() + seconds
-        losses = []
-        for i in self._rng.permutation(len(self._batches)):
+        losses: list[Tensor] = []
+        more = True
+        for i in self._rng.permutation(len(self._slopes)):
             late = deadline is not None and time.monotonic() > deadline
-            if late or self.iteration >= self._recipe.iterations:
+            more = not late and self.iteration < self._recipe.iterations
+            if not more:
                 break
-            losses.append(self._step(self._batches[i], self._base[i]))
+            chosen = self._rng.choice(48, len(self._symmetries), replace=False)
+            self._symmetries.copy_(torch.as_tensor(chosen))
+            losses.append(self._slopes[i]().clone())
+            self._descent.step(self.iteration)
+            self.iteration += 1
         if losses:
             self._loss = float(torch.stack(losses).mean())
+        return more
 
-    def _step(self, batch: Batch, base: Errors) -> Tensor:
-        recipe, network = self._recipe, self._network
-        chosen = self._rng.choice(48, recipe.symmetries, replace=False)
-        symmetries = torch.as_tensor(chosen, device=self._device)
-        found = network(batch.numbers, batch.neighbours, symmetries)
-        value = loss(errors(batch, *found), base).mean()
-        self._descent.step(value, self.iteration)
-        self.iteration += 1
-        return value.detach()
+    def _slopes_of(self, batch: Batch) -> Callable[[], Tensor]:
+        """What gives a batch's loss, and its derivatives to the network."""
+        with torch.no_grad():
+            base = errors(batch, None, None)
+
+        def slopes() -> Tensor:
+            self._network.zero_grad(set_to_none=False)
+            found = self._network(batch.numbers, batch.neighbours, self._symmetries)
+            value = loss(errors(batch, *found), base).mean()
+            value.backward()  # type: ignore[no-untyped-call]
+            return value.detach()
+
+        return Recorded(slopes) if "cuda" in self._device else slopes
 
     def measured(self) -> dict[str, float]:
         """Errors on the validation bodies, and without learning."""
@@ -244,6 +260,30 @@ class Trainer:
         self._network.load_state_dict(state["network"])
         self._descent.restore(state["descent"])
         self._rng.bit_generator.state = state["rng"]
+
+
+class Recorded:
+    """Work on a GPU as a CUDA graph: its thousand kernels take longer to launch than to run.
+
+    Parameters
+    ----------
+    work : callable
+        Without arguments and of the same shapes each time; its answer is overwritten each time.
+    """
+
+    _pool = None
+
+    def __init__(self, work: Callable[[], Tensor]) -> None:
+        self._work = work  # keeps what the kernels read
+        work()  # libraries set themselves up
+        self._graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self._graph, pool=Recorded._pool):
+            self._answer = work()
+        Recorded._pool = self._graph.pool()
+
+    def __call__(self) -> Tensor:
+        self._graph.replay()
+        return self._answer
 
 
 def samples_of(folder: Path, count: int, workers: int = 1) -> list[Sample]:

@@ -92,7 +92,9 @@ def tune(
         batch = batches[which]
         symmetries = torch.as_tensor(rng.choice(48, _SYMMETRIES, replace=False))
         found = network(batch.numbers, batch.neighbours, symmetries)
-        descent.step(loss(errors(batch, *found), started[which]).mean(), i)
+        network.zero_grad()
+        loss(errors(batch, *found), started[which]).mean().backward()  # type: ignore[no-untyped-call]
+        descent.step(i)
     tuned = Tuned(means(base), means(started), means(_found(network, batches)))
     write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
     card = {

@@ -112,6 +112,11 @@ class CellCorrection:
         """A multiple of the matrices."""
         return replace(self, matrices=factor * self.matrices)
 
+    def without_volume(self) -> CellCorrection:
+        """The matrices on strains whose trace is taken out."""
+        rows = without_trace(self.matrices)
+        return replace(self, matrices=without_trace(np.swapaxes(rows, -1, -2)))
+
     def matrix_slopes(self, u: Array, x: Array) -> Array:
         """Derivatives (C, 18, 18) of x . dW/du by the matrices, m2, for (N or more, 3)."""
         return _symmetric_products(self.rates(u, x), self.strains(u))
@@ -176,6 +181,13 @@ class CellCorrection:
     def assembly(self) -> Assembly:
         """Sums cells' values at the nodes."""
         return Assembly(self.cells, int(self.cells.max()) + 1)
+
+
+def without_trace(z: Array) -> Array:
+    """Strains (..., 18) whose first three numbers have no mean."""
+    out = z.copy()
+    out[..., :3] -= z[..., :3].mean(axis=-1, keepdims=True)
+    return out
 
 
 def _symmetric_products(a: Array, b: Array) -> Array:

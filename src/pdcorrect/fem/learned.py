@@ -21,16 +21,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
-from pdcorrect.fem.cube_symmetry import (
-    MANDEL,
-    SCALAR_PATTERNS,
-)
+from pdcorrect.fem.cube_symmetry import MANDEL, SCALAR_PATTERNS
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.element_network import STRAINS, Network
 from pdcorrect.fem.internal_modes import Condensed
@@ -38,7 +34,8 @@ from pdcorrect.fem.neighbourhood import (
     CellGraph,
     cell_graph,
     cell_graph_slopes,
-    contrasts,
+    extremes,
+    neighbours_of,
     on_grid,
 )
 
@@ -51,16 +48,15 @@ STIFFEST, VOLUME = 3.0, 0.3
 lets it change by this share of its own."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
-_CONTRAST, _DENSITIES = 12.0, 5.0
-"""Of the moduli, and of the densities, that the network sees."""
+_CONTRAST, _DENSITIES, _POISSONS = 12.0, 5.0, 0.1
+"""Ratios of the moduli and of the densities, and the difference of Poisson's ratios, in reach."""
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
 
 
-def bounded(xp: Any, N: Any) -> Any:
-    """S (..., n, n) for symmetric N, with ``xp`` numpy or torch."""
-    one = xp.eye(N.shape[-1], dtype=N.dtype) if xp is np else xp.eye(N.shape[-1]).to(N)
-    return 2.0 * BOUND * xp.linalg.solve(one + N @ N, N)
+def bounded(N: Array) -> Array:
+    """S (..., n, n) for symmetric N."""
+    return np.asarray(2.0 * BOUND * np.linalg.solve(np.eye(N.shape[-1]) + N @ N, N))
 
 
 def strain_map(shapes: Array) -> Array:
@@ -131,8 +127,9 @@ class ElementWriter:
         self._held = held[cells].astype(float)
         self._inside = self._held.max(axis=1) == 0.0
         partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
-        heavy = contrasts(self._grid.place, body.materials.density, network.reach)
-        self._fits: NDArray[np.bool_] = self._grid.regular & ~partly & (heavy <= _DENSITIES)
+        self._neighbours = neighbours_of(self._grid.place)
+        least, most = extremes(self._neighbours, body.materials.density, network.reach)
+        self._fits: NDArray[np.bool_] = self._grid.regular & ~partly & (most <= _DENSITIES * least)
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
 
@@ -143,7 +140,7 @@ class ElementWriter:
         count = len(learned)
         matrices, masses = np.zeros((count, STRAINS, STRAINS)), np.zeros((count, 8, 8))
         if learned.any():
-            S, R = (bounded(np, N) for N in self._answers(graph, learned))
+            S, R = (bounded(N) for N in self._answers(graph, learned))
             stiff, heavy = self._roots(mu, omega)
             stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
             matrices[learned] = stiff @ S @ stiff
@@ -176,7 +173,7 @@ class ElementWriter:
             return nothing, nothing
         G, J = self._in_order(by_matrices, by_masses, learned)
         N, H = self._answers(graph, learned)
-        S, R = bounded(np, N), bounded(np, H)
+        S, R = bounded(N), bounded(H)
 
         def own(mu: Array, omega: Array) -> Array:
             stiff, heavy = self._roots(mu, omega)
@@ -218,13 +215,19 @@ class ElementWriter:
 
     def _seen(self, young: Array, poisson: Array) -> tuple[CellGraph, NDArray[np.bool_]]:
         """What the network sees of all cells, and which it was trained for."""
-        learned = self._fits & (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
-        found = contrasts(self._grid.place, np.nan_to_num(young, nan=np.inf), self._network.reach)
+        learned: NDArray[np.bool_] = (
+            self._fits & (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
+        )
         known = np.where(np.isfinite(young), young, 0.0), np.nan_to_num(poisson).clip(0.0)
+        reach = self._network.reach
+        least, most = extremes(self._neighbours, np.nan_to_num(young, nan=np.inf), reach)
+        learned &= most <= _CONTRAST * least
+        least, most = extremes(self._neighbours, known[1], reach)
+        learned &= most <= least + _POISSONS
         with np.errstate(invalid="ignore"):
-            graph = cell_graph(self._grid.place, *known, self._held)
+            graph = cell_graph(self._neighbours, *known, self._held)
         numbers = np.nan_to_num(graph.numbers)
-        return CellGraph(numbers, graph.neighbours), np.asarray(learned & (found <= _CONTRAST))
+        return CellGraph(numbers, graph.neighbours), learned
 
     def _answers(self, graph: CellGraph, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
         """N and H of the learned cells, strains uncorrected away from held corners."""

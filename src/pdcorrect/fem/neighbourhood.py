@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-import scipy.ndimage as ndi
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cube_symmetry import on_window
@@ -69,7 +68,7 @@ class Grid(NamedTuple):
 def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     """Where the cells (C, 8) of a mesh with nodes at ``positions`` (N, 3) lie on a grid of cubes.
 
-    Its spacing is the median length of the cells along the axes.
+    Its spacing is the median length of the cells along the axes; its origin too is where most are.
     """
     corners = positions[cells]
     low, high = corners.min(axis=1), corners.max(axis=1)
@@ -78,9 +77,10 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     key = side @ [1, 2, 4]
     wanted = VTK_CORNERS.astype(np.int64) @ [1, 2, 4]
     order = np.argsort(key, axis=1)[:, wanted]
-    place = (low - low.min(axis=0)) / size
-    index = np.round(place).astype(np.int64)
-    ideal = low.min(axis=0) + size * (index[:, None] + VTK_CORNERS)
+    away = (low - low.min(axis=0)) / size
+    offset = np.median(away - np.round(away), axis=0)
+    index = np.round(away - offset).astype(np.int64)
+    ideal = low.min(axis=0) + size * (offset + index[:, None] + VTK_CORNERS)
     ordered = np.take_along_axis(corners, order[..., None], axis=1)
     regular = np.abs(ordered - ideal).max(axis=(1, 2)) <= _OFF_GRID * size
     _, inverse, counts = np.unique(index, axis=0, return_inverse=True, return_counts=True)
@@ -88,22 +88,30 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     return Grid(np.take_along_axis(cells, order, axis=1), order, index, regular)
 
 
-def cell_graph(index: NDArray[np.int64], young: Array, poisson: Array, held: Array) -> CellGraph:
-    """The graph of cells on a grid.
+def neighbours_of(index: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The (C, 27) cells about each of the cells at ``index`` (C, 3) of a grid; C where none is."""
+    index = index - index.min(axis=0) + 1
+    shape = index.max(axis=0) + 2
+    keys = np.ravel_multi_index(tuple(index.T), tuple(shape))
+    order = np.argsort(keys)
+    wanted = keys[:, None] + _AROUND @ [shape[1] * shape[2], shape[2], 1]
+    place = np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)
+    found = order[place]
+    return np.where(keys[found] == wanted, found, len(keys))
+
+
+def cell_graph(
+    neighbours: NDArray[np.int64], young: Array, poisson: Array, held: Array
+) -> CellGraph:
+    """The graph of cells with these `neighbours_of` them.
 
     Parameters
     ----------
-    index : (C, 3)
-        Of the cells on the grid.
+    neighbours : (C, 27)
     young, poisson : (C,)
     held : (C, 8)
         1 where a corner is held, VTK order.
     """
-    count = len(index)
-    index = index - index.min(axis=0) + 1
-    cells = np.full(index.max(axis=0) + 2, count)
-    cells[tuple(index.T)] = np.arange(count)
-    neighbours = cells[tuple(np.moveaxis(index[:, None] + _AROUND, -1, 0))]
     other = np.append(young, 0.0)[neighbours]
     share = 2.0 * other / (young[:, None] + other)
     values = np.stack([4.0 * poisson - 1.0, 0.5 * np.log(1.0 - 2.0 * poisson + _FLOOR)], axis=1)
@@ -124,18 +132,13 @@ def cell_graph_slopes(
     return by_young, by_poisson
 
 
-def contrasts(index: NDArray[np.int64], young: Array, reach: int) -> Array:
-    """Largest modulus over smallest, (C,), of the cells at most ``reach`` away along each axis."""
-    index = index - index.min(axis=0)
-    shape = index.max(axis=0) + 1
-    size = 2 * reach + 1
-    extremes = []
-    for fill, extreme in ((0.0, ndi.maximum_filter), (np.inf, ndi.minimum_filter)):
-        grid = np.full(shape, fill)
-        grid[tuple(index.T)] = young
-        extremes.append(extreme(grid, size, mode="constant", cval=fill)[tuple(index.T)])
-    with np.errstate(invalid="ignore"):  # only cells of no modulus in reach
-        return np.asarray(extremes[0] / extremes[1])
+def extremes(neighbours: NDArray[np.int64], values: Array, reach: int) -> tuple[Array, Array]:
+    """Least and largest of the values (C,) of cells at most ``reach`` neighbours away."""
+    least, most = values, values
+    for _ in range(reach):
+        least = np.append(least, np.inf)[neighbours].min(axis=1)
+        most = np.append(most, -np.inf)[neighbours].max(axis=1)
+    return least, most
 
 
 @lru_cache(maxsize=1)

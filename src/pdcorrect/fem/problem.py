@@ -364,13 +364,6 @@ def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
             PdcorrectWarning,
             stacklevel=4,
         )
-    if clamps.free.any(axis=1).all():
-        warnings.warn(
-            "element 'hex8-learned' was trained on bodies with held nodes: this one has none, and "
-            "if it is short 'hex8-enhanced' may be nearer",
-            PdcorrectWarning,
-            stacklevel=4,
-        )
     return found
 
 

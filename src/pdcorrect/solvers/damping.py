@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.cell_correction import CorrectionTangent
+from pdcorrect.fem.cell_correction import CorrectionTangent, without_trace
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress
@@ -126,6 +126,9 @@ class Viscous:
 class WrittenViscous:
     """r/2 (z(y) - z') . K (z(y) - z'), summed over the cells of a learned element.
 
+    K has no part in volume: the rate of z's trace is not that of the stretch, and could outweigh
+    what the element itself dissipates.  The rest of K is less than the element's own.
+
     Attributes
     ----------
     places : list of (float, (N, 3))
@@ -138,8 +141,8 @@ class WrittenViscous:
         assert problem.correction is not None
         self._rest = problem.positions
         self.places = [(a, self.displacement(x)) for a, x in zip(factors, places, strict=True)]
-        self.correction = problem.correction
-        self._rated = problem.correction.scaled(rate)
+        self.correction = problem.correction.without_volume()
+        self._rated = self.correction.scaled(rate)
         parts = [a * self.correction.strains(u) for a, u in self.places]
         self._before: Array = np.sum(parts, axis=0)
         self._shift = self._rated.stress(self._before)
@@ -175,7 +178,7 @@ class WrittenViscous:
         rates = self.correction.rates(self.displacement(y), x)
         stress = self._rated.stress(rates)
         by_places = [a * self.correction.pulled(u, stress) for a, u in self.places]
-        out = rates[:, :, None] * self.change(y)[:, None]
+        out = without_trace(rates)[:, :, None] * without_trace(self.change(y))[:, None]
         return by_places, out + np.swapaxes(out, 1, 2)
 
     def along(self, y: Array, x: Array) -> float:
