@@ -57,6 +57,32 @@ def test_bodies_hang_together_and_are_held():
     assert len(kinds) == 9
 
 
+def test_cells_may_be_cut_in_eight():
+    for seed in range(5):
+        solid = draw(np.random.default_rng(seed), cut=True).solid
+        halves = solid.reshape(*(x for n in solid.shape for x in (n // 2, 2)))
+        assert (halves.any(axis=(1, 3, 5)) == halves.all(axis=(1, 3, 5))).all()
+        assert solid.sum() <= 192
+
+
+def test_free_bodies_are_under_loads_in_balance():
+    """They stand on weak springs, which leave the shapes of their modes as they are."""
+    rng = np.random.default_rng(1)
+    body = draw(rng, free=True)
+    while body.solid.sum() > 20:
+        body = draw(rng, free=True)
+    found = answers(body, rng)
+    assert not found.held.any()
+    assert found.squares[0] == pytest.approx(21.0 * found.foundation, rel=1e-3)
+    F, x = found.forces, found.places - found.places.mean(axis=0)
+    size = np.abs(F).sum(axis=(1, 2))
+    assert np.abs(F.sum(axis=1)).max() < 1e-9 * size.max()
+    assert np.abs(np.cross(x, F).sum(axis=1)).max() < 1e-9 * size.max()
+    base = errors(collate([sample(found)]), None, None)
+    assert 0.0 < float(base.squares[0, 0].sqrt()) < 0.5
+    assert float(base.displacements[0, : len(F)].sqrt().mean()) < 0.5
+
+
 def test_the_coarse_model_without_corrections_is_the_best_coarse_one(found):
     """Its errors are those of `pdcorrect.best_coarse` in statics, to the network's eyes too."""
     body, answer = found[0]
@@ -245,6 +271,14 @@ def test_time_that_is_up_and_other_recipes(few, tmp_path):
     assert run(RECIPE, tmp_path)
     other = training.ElementRecipe(**{**vars(RECIPE), "rate": 1e-4})
     with pytest.raises(InputError, match="recipe"):
+        run(other, tmp_path)
+
+
+def test_bodies_of_another_seed_are_refused(few, tmp_path):
+    assert run(RECIPE, tmp_path)
+    (tmp_path / "checkpoint.pt").unlink()
+    other = training.ElementRecipe(**{**vars(RECIPE), "seed": 1})
+    with pytest.raises(InputError, match="seed"):
         run(other, tmp_path)
 
 

@@ -75,6 +75,10 @@ def test_the_body_is_the_problem_s():
     )
 
 
+def test_a_body_may_be_free():
+    assert not own_body(pc.discretise(scene(clamps=[], loads=[]))).held.any()
+
+
 def test_parts_of_a_large_body_are_held_and_hang_together():
     body = own_body(pc.discretise(beam((12, 6, 4))))
     rng = np.random.default_rng(0)
@@ -88,7 +92,7 @@ def test_parts_of_a_large_body_are_held_and_hang_together():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"clamps": []}, "held"),
+        ({"clamps": [{"region": {"box": [[0, 0, 0], [0, 0, 1]]}}]}, "no face"),
         ({"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.05, 1.0, 1.0]]}, "young": 1e6,
                          "poisson": 0.1, "density": 1e3}]}, "poisson"),
     ],

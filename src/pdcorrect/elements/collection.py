@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 import zipfile
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import make_folder, replacing
+from pdcorrect._files import make_folder, replacing, write_text
 from pdcorrect.data.workers import one_thread
 from pdcorrect.elements.answers import Answers, answers
 from pdcorrect.elements.bodies import draw
@@ -27,6 +28,9 @@ A_FILE = 25
 """Bodies in a file."""
 _TURN, _FREE, _CUT = 10, 8, 9
 """Of so many files two have bodies of other kinds, see `draw`."""
+_KIND = "bodies.json"
+_DRAWN = 2
+"""Counts the ways in which bodies and loads have been drawn."""
 _HALF = ("forces", "displacements", "modes")
 """Kept in half precision, each load and mode over its largest number: errors of 2e-4."""
 
@@ -37,8 +41,14 @@ def generate(
     """Compute the files that are missing of ``count`` bodies; how many are still missing.
 
     Body i depends on the seed and i alone.  After ``seconds`` nothing new is begun.
+
+    Raises
+    ------
+    InputError
+        If the folder has bodies of another seed or another way to draw them.
     """
     make_folder(folder)
+    _mark(folder, {"drawn": _DRAWN, "seed": seed})
     deadline = None if seconds is None else time.monotonic() + seconds
     missing = [n for n, path in enumerate(file_paths(folder, count)) if not path.exists()]
     if workers == 1:
@@ -46,6 +56,15 @@ def generate(
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         tasks = [pool.submit(_write, folder, seed, n, deadline) for n in missing]
         return sum(not task.result() for task in as_completed(tasks))
+
+
+def _mark(folder: Path, kind: dict[str, int]) -> None:
+    """Write what a folder's bodies are, or refuse them if they are not."""
+    path = folder / _KIND
+    if not path.exists():
+        write_text(path, json.dumps(kind) + "\n")
+    elif (found := json.loads(path.read_text())) != kind:
+        raise InputError(f"{path}: of {found}: expected {kind}. Use another folder.")
 
 
 def read_file(path: Path) -> list[Answers]:

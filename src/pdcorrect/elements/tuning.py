@@ -21,6 +21,7 @@ from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, mean
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import InputError
 from pdcorrect.fem.element_network import MODEL, read_network
+from pdcorrect.fem.learned import effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
 from pdcorrect.fem.problem import Problem
 
@@ -68,8 +69,8 @@ def tune(
     Raises
     ------
     InputError
-        If cells are off the grid, no face of a cell is held, there are several Poisson's
-        ratios, or the file's name does not end with safetensors.
+        If cells are off the grid, nodes are held but no face of a cell is, there are several
+        Poisson's ratios, or the file's name does not end with safetensors.
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
@@ -111,7 +112,7 @@ def tune(
 
 
 def own_body(problem: Problem) -> VoxelBody:
-    """A problem's body in cells of size 1, its first cell's modulus and density 1.
+    """A problem's body in cells of size 1, its first cell's small-strain modulus and density 1.
 
     Raises
     ------
@@ -119,27 +120,31 @@ def own_body(problem: Problem) -> VoxelBody:
         See `tune`.
     """
     grid = on_grid(problem.positions, problem.cells)
-    poisson = np.unique(problem.materials.poisson)
+    materials = problem.materials
+    stiff, poisson = effective_moduli(materials.mu, materials.volume_weight)
     if not grid.regular.all():
         raise InputError(
             f"{int((~grid.regular).sum())} of {len(grid.regular)} cells are off the grid: expected "
             "cubic cells on one grid."
         )
-    if len(poisson) > 1:
-        raise InputError(f"poisson = {', '.join(map(str, poisson))}: expected one for the body.")
+    if not np.ptp(poisson) < 1e-6:
+        found = f"{poisson.min():.3g} to {poisson.max():.3g}"
+        raise InputError(f"poisson = {found}: expected one for the body.")
     places = grid.place - grid.place.min(axis=0)
     shape = places.max(axis=0) + 1
     solid, young, density = np.zeros(shape, dtype=bool), np.ones(shape), np.ones(shape)
     at = tuple(places.T)
     solid[at] = True
-    young[at] = problem.materials.young / problem.materials.young[0]
-    density[at] = problem.materials.density / problem.materials.density[0]
+    young[at] = stiff / stiff[0]
+    density[at] = materials.density / materials.density[0]
     held = np.zeros(shape + 1, dtype=bool)
     clamped = ~problem.free.any(axis=1)
     corners = (problem.positions - problem.positions.min(axis=0)) / problem.cell_size
     held[tuple(np.round(corners[clamped]).astype(int).T)] = True
-    if not holds(held, nodes_of(solid)):
-        raise InputError("no face of a cell is held, or nearly all nodes are: expected some.")
+    if held.any() and not holds(held, nodes_of(solid)):
+        raise InputError(
+            "nodes are held but no face of a cell, or nearly all are: expected some, or none."
+        )
     return VoxelBody("own", solid, held, young, density, float(poisson[0]))
 
 
