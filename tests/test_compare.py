@@ -302,7 +302,8 @@ def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, mon
     scene = thick.with_changes(time={"integrator": "generalised-alpha", "step": 1e-3, "frames": 8})
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     folder = tmp_path / "report"
-    status, out, _ = program("compare", tmp_path / "scene.toml", "-o", folder, "--converged-error")
+    options = ("--converged-error", "--estimate-error")
+    status, out, _ = program("compare", tmp_path / "scene.toml", "-o", folder, *options)
     assert status == 0
     with (folder / "report.csv").open() as file:
         rows = {r["label"]: r for r in csv.DictReader(file)}
@@ -316,8 +317,11 @@ def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, mon
     lines = (folder / "report.md").read_text().splitlines()
     (header,) = [line for line in lines if line.startswith("| solver")]
     assert [x.strip() for x in header.split("|")[1:5]] == [
-        "solver", "error", "ms/frame", "speed-up"
+        "solver", "estimated", "error", "ms/frame"
     ]  # fmt: skip
+    for label in ("coarse PD", "best coarse PD"):
+        assert 0.5 < float(rows[label]["estimated_error"]) / errors[label] < 2.0
+    assert not rows["fine best PD"]["estimated_error"]
     record = json.loads((folder / "report.json").read_text())
     assert {"time_error", "mesh_error"} <= set(record["converged"])
     shown = f"{report.three_digits(100 * errors['coarse PD'])} %"

@@ -60,6 +60,14 @@ def compare(
             help="The same, and how exact the converged motion is: several times as long.",
         ),
     ] = False,
+    estimate_error: Annotated[
+        bool,
+        typer.Option(
+            "--estimate-error",
+            help="Also estimate the errors of runs on the coarse mesh, by a run 10 to 20 times as "
+            "long.",
+        ),
+    ] = False,
     vtu: Annotated[
         bool,
         typer.Option(
@@ -97,7 +105,8 @@ def compare(
     tell_of_compiling()
     count = frames or loaded.time.frames
     truth = _converged(loaded, count, converged_error) if converged else None
-    comparison = _run(loaded, count, cases, truth)
+    finer = _finer(loaded, count) if estimate_error else None
+    comparison = _run(loaded, count, cases, truth, finer)
     _print_table(comparison)
     for note in report.notes(comparison):
         say("- " + note)
@@ -129,8 +138,22 @@ def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
         return converged.converged(scene, count, error=error, on_step=on_step)
 
 
+def _finer(scene: Scene, count: int) -> Trajectory:
+    """What estimates errors, with a bar."""
+    from pdcorrect.cli.common import progress_bar
+    from pdcorrect.evaluation.error_estimate import finer_run
+
+    with progress_bar() as progress:
+        task = progress.add_task("estimate of errors", total=count)
+        return finer_run(scene, count, on_step=lambda *_: progress.advance(task))
+
+
 def _run(
-    scene: Scene, count: int, cases: Sequence[Case], converged: Trajectory | None
+    scene: Scene,
+    count: int,
+    cases: Sequence[Case],
+    converged: Trajectory | None,
+    finer: Trajectory | None,
 ) -> Comparison:
     """The comparison, with a bar for each case."""
     from pdcorrect.cli.common import progress_bar
@@ -148,7 +171,7 @@ def _run(
                 progress.start_task(tasks[label])
             progress.update(tasks[label], completed=frame)
 
-        return evaluate.compare(scene, count, cases, on_step, converged=converged)
+        return evaluate.compare(scene, count, cases, on_step, converged=converged, finer=finer)
 
 
 def _print_table(comparison: Comparison) -> None:

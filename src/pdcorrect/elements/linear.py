@@ -312,7 +312,7 @@ def loss(found: Errors, base: Errors) -> Tensor:
 
 
 def means(found: Sequence[Errors]) -> dict[str, float]:
-    """Relative errors, mean over bodies."""
+    """Relative errors, mean over bodies; of frequencies as `errors` estimates them."""
     count = [(e.displacements > 0.0).sum(dim=1).clamp_min(1) for e in found]
     u = [(e.displacements.sum(dim=1) / n).sqrt() for e, n in zip(found, count, strict=True)]
     return {

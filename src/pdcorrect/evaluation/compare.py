@@ -43,10 +43,11 @@ OnStep = Callable[[str, int, StepResult], None]
 class Row:
     """One line of the comparison table.
 
-    ``relative_error`` is the one to the converged motion, see `metrics.relative_error`; None
-    where that was not computed.  The other errors are node distances on the coarse nodes over all
-    frames, against the reference case, in metres; ``omega`` is eq. 7-2 with the first case on the
-    coarse mesh as its zero.  Times are medians for one frame; ``setup_seconds``
+    ``relative_error`` is the one to the converged motion, see `metrics.relative_error`, and
+    ``estimated_error`` the same to a finer run; None where that was not computed.  The other
+    errors are node distances on the coarse nodes over all frames, against the reference case, in
+    metres; ``omega`` is eq. 7-2 with the first case on the coarse mesh as its zero.  Times are
+    medians for one frame; ``setup_seconds``
     covers meshing, assembly and the first factorisation.  ``unusual_frames``
     converged only by a fallback (see `Status`).  ``refused_frames`` are those whose correction
     a gate refused; None without a corrector.
@@ -54,6 +55,7 @@ class Row:
 
     label: str
     relative_error: float | None
+    estimated_error: float | None
     solver: str
     refine: int
     nodes: int
@@ -110,6 +112,7 @@ class Comparison:
     failures: Mapping[str, str] = field(default_factory=dict)
     without_best: str | None = None
     converged: Trajectory | None = None
+    finer: Trajectory | None = None
 
     def errors_over_time(self) -> dict[str, np.ndarray]:
         """RMS node distance in each frame, by label, m: from the converged motion or reference."""
@@ -162,6 +165,7 @@ def compare(
     on_step: OnStep | None = None,
     *,
     converged: Trajectory | None = None,
+    finer: Trajectory | None = None,
 ) -> Comparison:
     """Run a scene with several solvers and measure error and time.
 
@@ -176,12 +180,14 @@ def compare(
         For progress.
     converged : Trajectory, optional
         Of `pdcorrect.converged` for the same frames: relative errors are measured from it.
+    finer : Trajectory, optional
+        Of `finer_run` for the same frames: errors on the coarse mesh are estimated by it.
 
     Raises
     ------
     InputError
         If there are no cases, or two of one label, or a model does not fit the scene, or the
-        converged motion has other frames.
+        converged motion or the finer run has other frames.
     ConvergenceError
         If the reference fails.  Other cases that fail are among ``failures``.
     """
@@ -192,8 +198,9 @@ def compare(
     if len(set(labels)) < len(labels):
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
     count = scene.time.frames if frames is None else frames
-    if converged is not None and len(converged) != count:
-        raise InputError(f"converged has {len(converged)} frames: expected {count}.")
+    for name, other in (("converged", converged), ("finer", finer)):
+        if other is not None and len(other) != count:
+            raise InputError(f"{name} has {len(other)} frames: expected {count}.")
     coarse = discretise(scene)
     runs, on_coarse, setup, failures = {}, {}, {}, {}
     for case in cases[::-1]:  # the reference, which takes longest, after all that may be refused
@@ -211,6 +218,7 @@ def compare(
     truth = on_coarse[cases[0].label]
     complete = tuple(case for case in cases if case.label in runs)
     base = next((on_coarse[c.label] for c in complete[::-1] if c.plain and c.solver == "pd"), None)
+    nearer = None if finer is None else restrict(finer, to=coarse)
     rows = []
     for case in sorted(complete, key=_coarse_to_fine):
         run, here = runs[case.label], on_coarse[case.label]
@@ -219,6 +227,9 @@ def compare(
             Row(
                 label=case.label,
                 relative_error=None if converged is None else relative_error(run, converged),
+                estimated_error=(
+                    None if nearer is None or case.refine > 1 else relative_error(here, nearer)
+                ),
                 solver="hybrid" if case.model else case.solver,
                 refine=case.refine,
                 nodes=len(run.points),
@@ -237,6 +248,7 @@ def compare(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
         _models(cases), failures,
         None if any(case.base == "enhanced" for case in cases) else without_best(scene), converged,
+        finer,
     )  # fmt: skip
 
 

@@ -49,15 +49,27 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> Array:
     refine = int(run.attributes.get("refine", "1"))
     _check_steps(run, scene)
     _check_begin(run, discretise(scene, refine))
-    problem = _finer(scene, refine)
+    finer = finer_run(scene, len(run), refine, on_step=on_step)
+    distance = np.linalg.norm(run.positions - restrict(finer, run).positions, axis=2)
+    return np.asarray(distance)
+
+
+def finer_run(
+    scene: Scene, frames: int, refine: int = 1, *, on_step: OnStep | None = None
+) -> Trajectory:
+    """The run from which `error_estimate` measures those with ``refine`` cells for each coarse one.
+
+    Raises
+    ------
+    ConvergenceError
+    """
     try:
-        finer = rollout(ProjectiveDynamics(problem).prepare(), len(run), on_step=on_step)
+        problem = _finer(scene, refine)
+        return rollout(ProjectiveDynamics(problem).prepare(), frames, on_step=on_step)
     except ConvergenceError as error:
         raise ConvergenceError(
             f"the finer run of the estimate: {error}", result=error.result
         ) from None
-    distance = np.linalg.norm(run.positions - restrict(finer, run).positions, axis=2)
-    return np.asarray(distance)
 
 
 def _finer(scene: Scene, refine: int) -> Problem:

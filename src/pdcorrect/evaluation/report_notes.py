@@ -33,9 +33,14 @@ def notes(comparison: Comparison) -> list[str]:
 
 def _of_the_errors(comparison: Comparison) -> str:
     truth, time = comparison.on_coarse[comparison.reference], comparison.scene.time
+    estimated = (
+        "'estimated' is the relative RMS distance from a run with the learned element on 2×2×2 cells for each coarse "
+        "one and twice the substeps. "
+    )
     return (
         f"{len(truth)} frames of {time.step:g} s by {time.integrator}. "
-        f"{_of_the_converged(comparison)}RMS and worst are distances "
+        f"{_of_the_converged(comparison)}"
+        f"{'' if comparison.finer is None else estimated}RMS and worst are distances "
         f"of the coarse nodes from {comparison.reference}, which moves by up to "
         f"{1e3 * largest_displacement(truth):.3g} mm; 'corrected' is the share of the coarse PD "
         "run's squared error that is gone."

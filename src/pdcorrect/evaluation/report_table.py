@@ -16,7 +16,8 @@ _CONVERGED_FIRST = (
 
 def headings(comparison: Comparison) -> tuple[str, ...]:
     """Of `table`; where there is a converged motion, first the error to it."""
-    return _HEADINGS if comparison.converged is None else _CONVERGED_FIRST
+    found = _HEADINGS if comparison.converged is None else _CONVERGED_FIRST
+    return found if comparison.finer is None else (found[0], "estimated", *found[1:])
 
 
 def table(comparison: Comparison) -> list[tuple[str, ...]]:
@@ -41,6 +42,7 @@ def _cells(row: Row, reference_seconds: float, is_reference: bool) -> dict[str, 
     }
     return {
         "error": "" if row.relative_error is None else relative_text(row.relative_error),
+        "estimated": "" if row.estimated_error is None else relative_text(row.estimated_error),
         "nodes": str(row.nodes),
         **(dict.fromkeys(distances, "ref.") if is_reference else distances),
         "ms/frame": three_digits(1e3 * row.seconds_a_frame),
