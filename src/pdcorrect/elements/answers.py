@@ -32,6 +32,8 @@ REFINEMENT = 4
 MODES = 12
 _WEAK, _FOUNDATION = 1e-2, 0.05
 """Foundations of free bodies: to find the lowest frequency, and as a share of its square."""
+_LEAST = 1e-6
+"""Traction of a load."""
 _CORNERS = VTK_CORNERS.astype(int)
 
 
@@ -285,7 +287,9 @@ def _loads(
             reach = rng.uniform(0.7, 2.0)
             near = np.exp(-((points - place) ** 2).sum(axis=1) / (2.0 * reach**2))[:, None]
             traction = near * (traction + 2.0 * away @ rng.normal(size=(3, 3)))
-        out.append(area * traction)
+        load = area * traction
+        if np.abs(load).max() > _LEAST * area.max():  # else the side is where the moment is zero
+            out.append(load)
     return np.stack(out)
 
 

@@ -34,8 +34,8 @@ def notes(comparison: Comparison) -> list[str]:
 def _of_the_errors(comparison: Comparison) -> str:
     truth, time = comparison.on_coarse[comparison.reference], comparison.scene.time
     estimated = (
-        "'estimated' is the relative RMS distance from a run with the learned element on 2×2×2 cells for each coarse "
-        "one and twice the substeps. "
+        "'estimated' is the relative RMS distance from a run with the learned element on 2×2×2 "
+        "cells for each coarse one and twice the substeps. "
     )
     return (
         f"{len(truth)} frames of {time.step:g} s by {time.integrator}. "
