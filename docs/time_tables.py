@@ -9,6 +9,7 @@ from typing import Any
 
 from records import RECORDS, Rows, number, percent, read
 
+FREQUENCIES = "Error of the lowest 10 frequencies, %"
 INTEGRATORS = ("backward-euler", "bdf2", "midpoint", "generalised-alpha")
 
 
@@ -61,6 +62,15 @@ def unlike_bodies() -> Rows:
     return tuple(heads[k] for k in kept), [[row[k] for k in kept] for row in rows]
 
 
+def unlike_families() -> Rows:
+    """Errors over the forty scenes, %, and median times, ms, a row a run."""
+    heads, rows = table_of("unlike_families", "Errors, % of the RMS displacement")
+    times = table_of("unlike_families", "Time a frame, ms")[1][0]
+    columns = zip(heads[1:], *(row[1:] for row in rows[-3:]), times[1:], strict=True)
+    cells = [[run, *(number(x, 2) for x in row)] for run, *row in columns]
+    return ("run, substeps", "mean", "median", "worst", "ms a frame"), cells
+
+
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By name."""
     yield "time-orders", orders
@@ -73,6 +83,8 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
     yield "unlike-bodies", unlike_bodies
+    yield "unlike-families", unlike_families
+    yield "frequencies", partial(as_measured, "unlike_families", FREQUENCIES)
     yield "columns", partial(as_measured, "columns", "Columns")
     yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
 

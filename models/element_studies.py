@@ -52,7 +52,7 @@ class OneOrientation(ElementNetwork):
 
 FULL = ElementRecipe()
 STUDIES: dict[str, tuple[ElementRecipe, type[ElementNetwork]]] = {
-    **{f"{n} bodies": (replace(FULL, bodies=n), ElementNetwork) for n in (50, 200, 1000)},
+    **{f"{n} bodies": (replace(FULL, bodies=n), ElementNetwork) for n in (250, 1000)},
     f"{FULL.bodies} bodies": (FULL, ElementNetwork),
     "sees 3 cells across": (replace(FULL, rounds=1), ElementNetwork),
     "sees 5 cells across": (replace(FULL, rounds=2), ElementNetwork),

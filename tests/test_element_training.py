@@ -15,7 +15,7 @@ from pdcorrect.elements.answers import VoxelMesh, answers
 from pdcorrect.elements.bodies import draw, nodes_of
 from pdcorrect.elements.linear import collate, errors, loss, sample
 from pdcorrect.elements.network import ElementNetwork
-from pdcorrect.errors import FileFormatError, FileVersionError, InputError
+from pdcorrect.errors import ConvergenceError, FileFormatError, FileVersionError, InputError
 from pdcorrect.fem.element_network import SCALARS, STRAINS, read_network
 from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, cell_graph, neighbours_of, permutations
 
@@ -159,9 +159,8 @@ def random_network(seed=0, **sizes):
 def body_graph(answer):
     index = answer.places[answer.cells[:, 0]]
     poisson = np.full(len(index), float(answer.poisson))
-    return cell_graph(
-        neighbours_of(index), answer.young, poisson, answer.held[answer.cells].astype(float)
-    )
+    held = answer.held[answer.cells].astype(float)
+    return cell_graph(neighbours_of(answer.cells, index), answer.young, poisson, held)
 
 
 def test_a_round_is_a_relational_graph_convolution(found):
@@ -274,12 +273,35 @@ def test_time_that_is_up_and_other_recipes(few, tmp_path):
         run(other, tmp_path)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="of a GPU's graphs")
+def test_recorded_steps_learn_what_others_do(found, monkeypatch):
+    samples, ends = [sample(answer) for _, answer in found], []
+    for replaced in (training.Recorded, lambda work: work):
+        monkeypatch.setattr(training, "Recorded", replaced)
+        trainer = training.Trainer(RECIPE, samples, samples, "cuda")
+        for _ in range(4):
+            trainer.epoch()
+        ends.append(trainer.measured()["loss"])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-3)
+    assert ends[0] < 0.99
+
+
+def test_a_loss_that_is_not_finite_ends_the_training(few, tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "loss", lambda found, base: found.squares[:, 0] * float("nan"))
+    with pytest.raises(ConvergenceError, match="loss"):
+        run(RECIPE, tmp_path)
+    assert not (tmp_path / "checkpoint.pt").exists()
+
+
 def test_bodies_of_another_seed_are_refused(few, tmp_path):
     assert run(RECIPE, tmp_path)
     (tmp_path / "checkpoint.pt").unlink()
     other = training.ElementRecipe(**{**vars(RECIPE), "seed": 1})
     with pytest.raises(InputError, match="seed"):
         run(other, tmp_path)
+    (tmp_path / "training" / "bodies.json").unlink()
+    with pytest.raises(InputError, match="drawn"):
+        run(RECIPE, tmp_path)
 
 
 def test_damaged_bodies_are_named(few, tmp_path):

@@ -75,8 +75,19 @@ def test_the_body_is_the_problem_s():
     )
 
 
-def test_a_body_may_be_free():
-    assert not own_body(pc.discretise(scene(clamps=[], loads=[]))).held.any()
+def test_a_body_may_be_free_and_so_are_its_parts(tmp_path):
+    free = pc.discretise(beam((8, 4, 4), clamps=[], loads=[]))
+    assert not part(own_body(free), np.random.default_rng(0)).held.any()
+    small = pc.discretise(scene(clamps=[], loads=[]))
+    found = tune(small, tmp_path / "own.safetensors", iterations=30, report=lambda _: None)
+    assert found.after["frequencies"] < found.before["frequencies"]
+
+
+def test_bodies_in_several_pieces_are_refused():
+    solid = np.ones((3, 2, 2), dtype=bool)
+    solid[1] = False
+    with pytest.raises(InputError, match="pieces"):
+        own_body(problem_on(voxel_mesh(solid, (0, 0, 0), 0.1), "hex8-enhanced"))
 
 
 def test_parts_of_a_large_body_are_held_and_hang_together():
@@ -93,6 +104,7 @@ def test_parts_of_a_large_body_are_held_and_hang_together():
     ("changes", "message"),
     [
         ({"clamps": [{"region": {"box": [[0, 0, 0], [0, 0, 1]]}}]}, "no face"),
+        ({"clamps": [{"region": {"plane": "x", "at": "min"}, "components": ["x"]}]}, "components"),
         ({"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.05, 1.0, 1.0]]}, "young": 1e6,
                          "poisson": 0.1, "density": 1e3}]}, "poisson"),
     ],

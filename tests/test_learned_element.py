@@ -6,12 +6,12 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, cross, problem_on
-from pdcorrect.elements.answers import unit_cell
+from pdcorrect.elements.answers import VoxelMesh, unit_cell
 from pdcorrect.elements.linear import unit_strains
 from pdcorrect.errors import PdcorrectWarning, SceneError
 from pdcorrect.fem import element_network, learned
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
-from pdcorrect.fem.cube_symmetry import group, on_scalars, on_strains
+from pdcorrect.fem.cube_symmetry import PATTERNS, group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.neighbourhood import (
     NEIGHBOURS,
@@ -59,9 +59,8 @@ def seen(solid, seed=3):
     index = np.argwhere(solid)
     rng = np.random.default_rng(seed)
     young, poisson = 10.0 ** rng.uniform(-0.5, 0.5, len(index)), rng.uniform(0.0, 0.49, len(index))
-    return cell_graph(
-        neighbours_of(index), young, poisson, rng.integers(0, 2, (len(index), 8)).astype(float)
-    )
+    held = rng.integers(0, 2, (len(index), 8)).astype(float)
+    return cell_graph(neighbours_of(VoxelMesh.of(solid).cells, index), young, poisson, held)
 
 
 def test_the_corrections_are_large_enough_to_test(any_network):
@@ -92,15 +91,22 @@ def test_answers_turn_with_the_cube(any_network, g):
         assert moved == pytest.approx(R @ answer @ R.T, abs=1e-6)
 
 
+def test_cells_on_both_sides_of_a_cut_do_not_see_each_other():
+    cells = np.arange(16).reshape(2, 8)
+    alone = neighbours_of(cells, np.array([[0, 0, 0], [1, 0, 0]]))
+    assert (alone < 2).sum() == 2
+    assert alone[:, 13].tolist() == [0, 1]
+
+
 def test_answers_depend_on_what_is_in_reach(any_network):
     """And no further: three cells away with two rounds."""
-    index = np.stack([np.arange(9), np.zeros(9, int), np.zeros(9, int)], axis=1)
+    row = np.ones((9, 1, 1), dtype=bool)
+    neighbours = neighbours_of(VoxelMesh.of(row).cells, np.argwhere(row))
     held, poisson = np.zeros((9, 8)), np.full(9, 0.3)
     young = np.ones(9)
     young[8] = 2.0
     same, other = (
-        any_network(cell_graph(neighbours_of(index), e, poisson, held))[0]
-        for e in (0 * young + 1, young)
+        any_network(cell_graph(neighbours, e, poisson, held))[0] for e in (0 * young + 1, young)
     )
     changed = np.abs(same - other).max(axis=(1, 2)) > 1e-9
     assert changed.tolist() == [False] * 5 + [True] * 4
@@ -229,7 +235,7 @@ def test_a_free_body_keeps_its_momentum():
 
 def two_materials(**changes):
     parts = [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 0.02]]}, "young": 3e6,
-              "poisson": 0.3, "density": 2e3}]  # fmt: skip
+              "poisson": 0.42, "density": 2e3}]  # fmt: skip
     return beam((4, 2, 2), materials=parts, **changes)
 
 
@@ -278,7 +284,27 @@ def test_viscosity_is_of_the_stiffness_without_learned_volume():
     assert blocks == pytest.approx(objective.viscous.rate * K, abs=1e-9 * np.abs(blocks).max())
 
 
-@pytest.mark.parametrize("poisson", [0.3, 0.49])
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.45])
+def test_no_force_drives_a_cell_into_the_fades(poisson):
+    """Of the stiffest matrices that a network can write: crushed and bent its energy grows."""
+    material = {"young": 1.0, "poisson": poisson, "density": 1.0}
+    problem = learned_problem(beam((1, 1, 1), 1.0, material=material, clamps=[], loads=[]))
+    C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
+    own = problem.correction
+    problem = problem.with_correction(learned.BOUND * C[None], own.masses)
+    X, cell = problem.positions, problem.cells[0]
+    ways = [-X * np.isin(range(3), axes) for axes in ([0], [0, 1], [0, 1, 2])]
+    for pattern in PATTERNS:
+        for i in range(3):
+            way = np.zeros_like(X)
+            way[cell, i] = 0.6 * pattern
+            ways.append(way)
+    for way in ways:
+        energies = [problem.energy(X + t * way) for t in np.linspace(0.0, 0.98, 60)]
+        assert (np.diff(energies) > 0.0).all()
+
+
+@pytest.mark.parametrize("poisson", [0.0, 0.3, 0.49])
 def test_viscosity_takes_energy_however_soft_the_matrices(poisson, rng):
     """At large strain, with the softest matrices that a network can write, and no others."""
     scene = beam(
@@ -296,6 +322,11 @@ def test_viscosity_takes_energy_however_soft_the_matrices(poisson, rng):
         for size in np.repeat([0.05, 0.1, 0.2], 5)
     ]
     motions.append((X * [1.4, 0.8, 0.8], X * [1.0, -0.5, -0.5]))  # volume, but no trace of S
+    motions += [(X * [1.0, 1.0, squeezed], X * [0.0, 0.0, -1.0]) for squeezed in (0.5, 0.2, 0.1)]
+    motions += [
+        (X + 0.4 * free * rng.normal(size=X.shape), free * rng.normal(size=X.shape))
+        for _ in range(10)
+    ]
     for x, v in motions:
         state = pc.State(x, v, 0.0)
         viscous = StepObjective(problem, state, backward_euler(problem, state, h)).viscous

@@ -21,6 +21,7 @@ from pdcorrect import metrics  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
 from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import draw_scene, make_plan  # noqa: E402
+from pdcorrect.elements.answers import VoxelMesh  # noqa: E402
 from pdcorrect.evaluation.measures import read_cases  # noqa: E402
 from pdcorrect.fem.neighbourhood import cell_graph, neighbours_of  # noqa: E402
 
@@ -180,10 +181,10 @@ def test_baselines_are_steps_of_changed_problems():
 def test_studies_of_the_element_leave_out_what_they_say():
     studies = script("models/element_studies.py")
     rng = np.random.default_rng(0)
-    solid = np.argwhere(np.ones((2, 2, 1)))
-    graph = cell_graph(
-        neighbours_of(solid), np.ones(4), np.full(4, 0.3), rng.integers(0, 2, (4, 8)).astype(float)
-    )
+    solid = np.ones((2, 2, 1), dtype=bool)
+    neighbours = neighbours_of(VoxelMesh.of(solid).cells, np.argwhere(solid))
+    held = rng.integers(0, 2, (4, 8)).astype(float)
+    graph = cell_graph(neighbours, np.ones(4), np.full(4, 0.3), held)
     seen = torch.as_tensor(graph.numbers).float(), torch.as_tensor(graph.neighbours)
     answers = {}
     for kind in (studies.ElementNetwork, studies.WithoutMass, studies.OneOrientation):

@@ -133,7 +133,8 @@ class DampingTerms:
             self._y = y
             correction = self._cells.correction
             self._against = without_trace(correction.strains(here) - objective.strains_before)
-            self._written_rates = without_trace(correction.rates(here, self._cells.local(x)))
+            rates = correction.rates(here, self._cells.local(x))
+            self._written_rates = objective.whole * without_trace(rates)
 
     @cached_property
     def origin(self) -> Tensor:

@@ -93,6 +93,11 @@ class BatchCorrection:
         """z, (B, C, 18)."""
         return self._state(local).strains
 
+    def whole(self, local: Tensor) -> Tensor:
+        """Whether z does not fade at all, (B, C, 1)."""
+        fades = self._state(local).fades
+        return (fades[..., :1] == 1.0) & (fades[..., 5:6] == 1.0)
+
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """See `WrittenViscous`: (B,), and its derivatives by cell (B, C, 8, 3)."""
         state = self._against(self._state(local), before, rate)

@@ -142,12 +142,13 @@ class BatchObjective:
         written = self.viscous and cells.correction is not None
         n = cells.sizes
         self.strains_before = cells.rest.new_zeros(n.scenes, n.cells if written else 0, 18)
+        self.whole = torch.ones_like(self.strains_before[..., :1])
 
     def narrowed(self, rows: Tensor) -> BatchObjective:
         """Of some scenes, as it is now."""
         cells = self.cells.narrowed(rows)
         mass = self.mass.narrowed(cells, rows)
-        names = ("free", "target", "origin", "forces", "strains_before")
+        names = ("free", "target", "origin", "forces", "strains_before", "whole")
         return with_rows(
             self, rows, *names, cells=cells, mass=mass,
             tangent=self.tangent and tuple(self.cells.of_scenes(x, rows) for x in self.tangent),
@@ -198,9 +199,14 @@ class BatchObjective:
         if cells.correction is None:
             return energy, forces
         more, by_cell = cells.correction.viscous(
-            cells.local(y - cells.rest), self.strains_before, self.factors[3]
+            cells.local(y - cells.rest), self.strains_before, self.written_rate
         )
         return energy + more, forces + cells.of_corners(by_cell)
+
+    @property
+    def written_rate(self) -> Tensor:
+        """Of what a learned element adds to viscosity, (B, C, 1)."""
+        return self.factors[3] * self.whole
 
     @property
     def _viscous_weights(self) -> Tensor:
@@ -215,7 +221,7 @@ class BatchObjective:
         written, cells = None, self.cells
         if cells.correction is not None:
             written = cells.correction.linearise_viscous(
-                cells.local(y - cells.rest), self.strains_before, self.factors[3]
+                cells.local(y - cells.rest), self.strains_before, self.written_rate
             )
         return Tangents(cells.linearise(y), viscous, written)
 
@@ -229,7 +235,7 @@ class BatchObjective:
             out = out + viscosity.apply(self.cells, tangents.viscous, x)
         if tangents.written is not None and self.cells.correction is not None:
             changes = self.cells.correction.apply(
-                tangents.written, self.cells.local(x), self.factors[3]
+                tangents.written, self.cells.local(x), self.written_rate
             )
             out = out + self.cells.of_corners(changes)
         return out

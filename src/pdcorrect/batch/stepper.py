@@ -441,10 +441,11 @@ class BatchStepper:
                 objective.before.add_(stretches(cells, relaxed(cells, place))[0], alpha=a)
             if cells.correction is not None:
                 nodes = cells.rest[:, : cells.sizes.nodes]
-                parts = [
-                    a * cells.correction.strains(cells.local(x - nodes)) for a, x in stage.strains
-                ]
+                local = [(a, cells.local(x - nodes)) for a, x in stage.strains]
+                parts = [a * cells.correction.strains(u) for a, u in local]
                 objective.strains_before.copy_(torch.stack(parts).sum(dim=0))
+                whole = [cells.correction.whole(u) for _, u in local]
+                objective.whole.copy_(torch.stack(whole).all(dim=0))
 
     def _make_minimiser(self) -> None:
         """With the first Hessian of a step that goes on, which serves a run's first steps too."""

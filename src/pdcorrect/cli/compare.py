@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect.cli.common import FAILED, Frames, SceneFile, check_models, say, tell_of_compiling
-from pdcorrect.errors import require_extra
+from pdcorrect.errors import ConvergenceError, require_extra
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -138,14 +138,18 @@ def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
         return converged.converged(scene, count, error=error, on_step=on_step)
 
 
-def _finer(scene: Scene, count: int) -> Trajectory:
-    """What estimates errors, with a bar."""
+def _finer(scene: Scene, count: int) -> Trajectory | None:
+    """What estimates errors, with a bar; None, and why, if it fails."""
     from pdcorrect.cli.common import progress_bar
     from pdcorrect.evaluation.error_estimate import finer_run
 
     with progress_bar() as progress:
         task = progress.add_task("estimate of errors", total=count)
-        return finer_run(scene, count, on_step=lambda *_: progress.advance(task))
+        try:
+            return finer_run(scene, count, on_step=lambda *_: progress.advance(task))
+        except ConvergenceError as error:
+            say(f"no estimate of errors: {error}")
+            return None
 
 
 def _run(

@@ -33,7 +33,7 @@ MODES = 12
 _WEAK, _FOUNDATION = 1e-2, 0.05
 """Foundations of free bodies: to find the lowest frequency, and as a share of its square."""
 _LEAST = 1e-6
-"""Traction of a load."""
+"""Largest number of a load over the largest area of a node: loads below it are rounding."""
 _CORNERS = VTK_CORNERS.astype(int)
 
 

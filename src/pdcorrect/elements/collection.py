@@ -27,9 +27,9 @@ Array = NDArray[Any]
 A_FILE = 25
 """Bodies in a file."""
 _TURN, _FREE, _CUT = 10, 8, 9
-"""Of so many files two have bodies of other kinds, see `draw`."""
+"""Of ten files the ninth has free bodies, the tenth cut ones, see `draw`."""
 _KIND = "bodies.json"
-_DRAWN = 2
+DRAWN = 2
 """Counts the ways in which bodies and loads have been drawn."""
 _HALF = ("forces", "displacements", "modes")
 """Kept in half precision, each load and mode over its largest number: errors of 2e-4."""
@@ -48,7 +48,7 @@ def generate(
         If the folder has bodies of another seed or another way to draw them.
     """
     make_folder(folder)
-    _mark(folder, {"drawn": _DRAWN, "seed": seed})
+    _mark(folder, {"drawn": DRAWN, "seed": seed})
     deadline = None if seconds is None else time.monotonic() + seconds
     missing = [n for n, path in enumerate(file_paths(folder, count)) if not path.exists()]
     if workers == 1:
@@ -61,9 +61,10 @@ def generate(
 def _mark(folder: Path, kind: dict[str, int]) -> None:
     """Write what a folder's bodies are, or refuse them if they are not."""
     path = folder / _KIND
-    if not path.exists():
+    if not path.exists() and not any(folder.glob("bodies-*.npz")):
         write_text(path, json.dumps(kind) + "\n")
-    elif (found := json.loads(path.read_text())) != kind:
+        return
+    if (found := json.loads(path.read_text()) if path.exists() else {}) != kind:
         raise InputError(f"{path}: of {found}: expected {kind}. Use another folder.")
 
 

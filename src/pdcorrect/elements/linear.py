@@ -62,7 +62,8 @@ def sample(body: Answers) -> Sample:
     count = len(body.cells)
     index = body.places[body.cells[:, 0]]
     corners = body.held[body.cells].astype(float)
-    graph = cell_graph(neighbours_of(index), body.young, np.full(count, poisson), corners)
+    neighbours = neighbours_of(body.cells, index)
+    graph = cell_graph(neighbours, body.young, np.full(count, poisson), corners)
     rows = (3 * body.cells[:, :, None] + np.arange(3)).reshape(count, 24)
     return Sample(
         graph.numbers.astype(np.float32), graph.neighbours,
@@ -306,8 +307,9 @@ def loss(found: Errors, base: Errors) -> Tensor:
     for errors, without, floor, weight, of_modes in kinds:
         if of_modes:
             errors, without = ((x @ lower / lower.sum())[:, None] for x in (errors, without))
-        ratio = errors / (without + floor**2)
-        total = total + weight * (ratio + _SMALLEST).sqrt().mean(dim=1)
+        there = (without > 0.0).to(without)  # bodies have fewer loads than places for them
+        ratio = (errors / (without + floor**2) + _SMALLEST).sqrt()
+        total = total + weight * (ratio * there).sum(dim=1) / there.sum(dim=1).clamp_min(1.0)
     return total / sum(WEIGHTS)
 
 

@@ -18,16 +18,16 @@ from torch import Tensor
 
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, replacing, write_bytes, write_text
-from pdcorrect.elements.collection import file_paths, generate, read_file
+from pdcorrect.elements.collection import DRAWN, file_paths, generate, read_file
 from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Sample, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.learned import LARGEST_POISSON
 
 WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
 _CHECKPOINT = "checkpoint.pt"
-_VALIDATION = 0.05
+_VALIDATION = 0.0625
 """Bodies that judge the network, of those that it learns from."""
 _REPORTS = 20.0
 """Seconds from one line, and one checkpoint, to the next."""
@@ -52,7 +52,7 @@ class ElementRecipe:
         Largest learning rate, see `Descent`.
     """
 
-    bodies: int = 3750
+    bodies: int = 4000
     seed: int = 45
     width: int = 96
     rounds: int = 3
@@ -141,6 +141,8 @@ class Trainer:
         kind: type[ElementNetwork] = ElementNetwork,
     ) -> None:
         self._recipe, self._device = recipe, device
+        if "cuda" in device:
+            torch.cuda.set_device(device)  # which graphs are recorded on
         torch.manual_seed(recipe.seed)
         self._rng = np.random.default_rng(recipe.seed)
         self._network = network = kind(recipe.width, recipe.rounds).to(device)
@@ -224,16 +226,27 @@ class Trainer:
             "command": f"pdcorrect train-element --bodies {recipe.bodies} --iterations "
             f"{recipe.iterations} --seed {recipe.seed}",
             "largest_poisson": LARGEST_POISSON,
-            "recipe": asdict(recipe),
+            "recipe": self._kind(),
             "validation": self.measured(),
             "device": torch.cuda.get_device_name(device) if "cuda" in device else device,
             "environment": environment(),
         }
 
+    def _kind(self) -> dict[str, Any]:
+        return {**asdict(self._recipe), "drawn": DRAWN}
+
     def save(self, path: Path) -> None:
-        """Write a checkpoint."""
+        """Write a checkpoint.
+
+        Raises
+        ------
+        ConvergenceError
+            If the loss is not finite, and with it the weights.
+        """
+        if not np.isfinite(self._loss):
+            raise ConvergenceError(f"loss {self._loss} at iteration {self.iteration}.")
         state = {
-            "recipe": asdict(self._recipe),
+            "recipe": self._kind(),
             "iteration": self.iteration,
             "network": self._network.state_dict(),
             "descent": self._descent.state(),
@@ -251,10 +264,9 @@ class Trainer:
             If it is of another recipe.
         """
         state = torch.load(path, map_location=self._device, weights_only=True)
-        if state["recipe"] != asdict(self._recipe):
+        if state["recipe"] != self._kind():
             raise InputError(
-                f"{path}: of recipe {state['recipe']}: expected {asdict(self._recipe)}. Use "
-                "another folder."
+                f"{path}: of recipe {state['recipe']}: expected {self._kind()}. Use another folder."
             )
         self.iteration = state["iteration"]
         self._network.load_state_dict(state["network"])

@@ -19,7 +19,7 @@ from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_o
 from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
-from pdcorrect.errors import InputError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.element_network import MODEL, read_network
 from pdcorrect.fem.learned import effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
@@ -68,9 +68,12 @@ def tune(
 
     Raises
     ------
+    ConvergenceError
+        If the weights do not stay finite.
     InputError
-        If cells are off the grid, nodes are held but no face of a cell is, there are several
-        Poisson's ratios, or the file's name does not end with safetensors.
+        If cells are off the grid or the body is in several pieces, nodes are held in some
+        components, or some nodes but no face of a cell, there are several Poisson's ratios, or the
+        file's name does not end with safetensors.
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
@@ -97,6 +100,8 @@ def tune(
         loss(errors(batch, *found), started[which]).mean().backward()  # type: ignore[no-untyped-call]
         descent.step(i)
     tuned = Tuned(means(base), means(started), means(_found(network, batches)))
+    if not np.isfinite(tuned.after["displacements"]):
+        raise ConvergenceError("the weights have become infinite or NaN.")
     write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
     card = {
         "format": 1,
@@ -138,7 +143,11 @@ def own_body(problem: Problem) -> VoxelBody:
     young[at] = stiff / stiff[0]
     density[at] = materials.density / materials.density[0]
     held = np.zeros(shape + 1, dtype=bool)
+    if not (connected(solid) == solid).all():
+        raise InputError("the body is in several pieces: expected one.")
     clamped = ~problem.free.any(axis=1)
+    if (partly := int((~clamped & ~problem.free.all(axis=1)).sum())) > 0:
+        raise InputError(f"{partly} nodes are held in some components: expected all or none.")
     corners = (problem.positions - problem.positions.min(axis=0)) / problem.cell_size
     held[tuple(np.round(corners[clamped]).astype(int).T)] = True
     if held.any() and not holds(held, nodes_of(solid)):
@@ -149,7 +158,10 @@ def own_body(problem: Problem) -> VoxelBody:
 
 
 def part(body: VoxelBody, rng: np.random.Generator) -> VoxelBody:
-    """A box of the body with at most 110 cells, held where the body is, or at a side."""
+    """A box of the body with at most 110 cells, held where the body is, or at a side.
+
+    Parts of a body that nothing holds are free.
+    """
     places = np.argwhere(body.solid)
     start = places[rng.integers(len(places))]
     low, high = start.copy(), start + 1
@@ -168,7 +180,7 @@ def part(body: VoxelBody, rng: np.random.Generator) -> VoxelBody:
     solid = connected(body.solid[box], tuple(start - low))
     nodes = nodes_of(solid)
     held: Grid = body.held[_box(low, high + 1)] & nodes
-    while not holds(held, nodes):
+    while body.held.any() and not holds(held, nodes):
         region = np.zeros_like(nodes)
         np.moveaxis(region, int(rng.integers(3)), 0)[-int(rng.integers(2))] = True
         held = region & nodes

@@ -88,9 +88,11 @@ class CellCorrection:
     def tangent(
         self, u: Array, project: bool = False, shift: Array = _NO_SHIFT, cells: slice = slice(None)
     ) -> CorrectionTangent:
-        """The second derivative; ``project`` leaves the rest of K's own one where z is not zero.
+        """The second derivative by u.
 
-        That is positive semi-definite together with the element's projected one near rest.
+        With ``project`` what z's own second derivatives add is left out.  What remains is
+        K between the rates of z: together with the element's projected stiffness it is positive
+        semi-definite near rest.
         """
         part = self if cells == slice(None) else self.of_cells(cells)
         out = np.empty((len(part.cells), 21, 21))
@@ -108,9 +110,17 @@ class CellCorrection:
         without = replace(self, matrices=np.zeros_like(self.matrices))
         return without.energy_and_forces(u, stress)[1]
 
-    def scaled(self, factor: float) -> CellCorrection:
-        """A multiple of the matrices."""
-        return replace(self, matrices=factor * self.matrices)
+    def whole(self, u: Array) -> NDArray[np.bool_]:
+        """Cells (C,) whose strains do not fade, see `turned_strains`."""
+        v = self.shapes @ u[self.cells] / self.sizes[:, None, None]
+        J = np.linalg.det(np.eye(3) + v[:, :3])
+        bent = np.square(v[:, 3:]).sum(axis=(1, 2))
+        return np.asarray((J >= turned_strains.FADES) & (bent <= turned_strains.BENT))
+
+    def scaled(self, factor: float | Array) -> CellCorrection:
+        """A multiple of the matrices, or one of each, (C,)."""
+        factors = np.broadcast_to(factor, len(self.cells))
+        return replace(self, matrices=factors[:, None, None] * self.matrices)
 
     def without_volume(self) -> CellCorrection:
         """The matrices on strains whose trace is taken out."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -77,14 +78,15 @@ class Network:
         """
         own, around = permutations()
         whole = np.round(_DIGITS * graph.numbers).astype(np.int64).astype(np.uint64)
-        keys = _hashed(whole, own)
+        keys = _hashed(whole[:, places] for places in own)
         _, seen, kind = np.unique(keys, return_index=True, return_inverse=True)
         turn, cell = np.divmod(seen, len(graph.numbers))
         x = graph.numbers.astype(self._type)[cell[:, None], own[turn]]
         features = first = _silu(self._first(x))
         for convolution, scale in self._rounds:
             before = np.append(kind.reshape(48, -1), np.full((48, 1), len(features)), axis=1)
-            keys = _hashed(before, graph.neighbours[:, around].transpose(1, 0, 2))
+            pairs = zip(before, around, strict=True)
+            keys = _hashed(kinds[graph.neighbours[:, places]] for kinds, places in pairs)
             _, seen, kind = np.unique(keys, return_index=True, return_inverse=True)
             turn, cell = np.divmod(seen, len(graph.numbers))
             table = before[turn[:, None], graph.neighbours[cell[:, None], around[turn]]]
@@ -97,11 +99,10 @@ class Network:
             features = features[itself] + _silu(np.concatenate(sums))
             first = first[itself]
         found = self._last(_silu(self._hidden(np.concatenate([features, first], axis=1))))
-        found = found[kind].reshape(48, len(graph.numbers), -1)
-        split = halves(STRAINS).places.shape[1]
+        kinds, split = kind.reshape(48, -1), halves(STRAINS).places.shape[1]
         N, H = (
-            _mean(part, halves(size))[:, halves(size).number]
-            for part, size in ((found[..., :split], STRAINS), (found[..., split:], SCALARS))
+            _mean((part[row] for row in kinds), halves(size))[:, halves(size).number]
+            for part, size in ((found[:, :split], STRAINS), (found[:, split:], SCALARS))
         )
         return N, H
 
@@ -172,22 +173,18 @@ def _normed_transposed(x: Array, slopes: Array) -> Array:
     return np.asarray(slopes / size - x * along / size**3)
 
 
-def _hashed(values: NDArray[Any], places: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """A number for each row of ``values[places]``, alike for rows alike and for no others.
+def _hashed(turned: Iterable[NDArray[Any]]) -> NDArray[np.uint64]:
+    """A number for each row of whole numbers (C, F) of the 48 orientations, (48 C,).
 
-    Of whole numbers (C, F) and places (48, F); or of (48, C + 1) and places (48, C, F), row g of
-    one with row g of the other.  Out (48 C,).  Two rows out of n fall together by chance with
-    n^2 / 2^65.
+    Rows alike have the same; two others out of n do by chance with n^2 / 2^65.
     """
-    factors = np.random.default_rng(0).integers(1, 2**63, size=places.shape[-1], dtype=np.uint64)
-    factors |= np.uint64(1)
     out = []
-    for g in range(48):
-        rows = values[:, places[g]] if places.ndim == 2 else values[g][places[g]]
+    for rows in turned:
+        factors = np.random.default_rng(0).integers(1, 2**63, size=rows.shape[1], dtype=np.uint64)
         mixed = rows.astype(np.uint64) + np.uint64(1)
         mixed = (mixed ^ (mixed << np.uint64(13))) * np.uint64(0x9E3779B97F4A7C15)
         mixed ^= mixed >> np.uint64(29)
-        out.append((mixed * factors).sum(axis=1, dtype=np.uint64))
+        out.append((mixed * (factors | np.uint64(1))).sum(axis=1, dtype=np.uint64))
     return np.concatenate(out)
 
 
@@ -220,12 +217,10 @@ def halves(size: int) -> Halves:
     return Halves(number, places, signs[:, rows] * signs[:, columns])
 
 
-def _mean(lower: NDArray[Any], half: Halves) -> Array:
-    """The mean (C, h) of lower halves (48, C, h), turned back."""
-    total = np.zeros(lower.shape[1:])
-    for turned, places, signs in zip(lower, half.places, half.signs, strict=True):
-        total += turned[:, places] * signs
-    return total / 48.0
+def _mean(lower: Iterable[NDArray[Any]], half: Halves) -> Array:
+    """The mean (C, h) of lower halves (C, h) of the 48 orientations, turned back."""
+    halves = zip(lower, half.places, half.signs, strict=True)
+    return np.asarray(sum(turned[:, places] * signs for turned, places, signs in halves) / 48.0)
 
 
 def _mean_transposed(slopes: Array, half: Halves) -> Array:

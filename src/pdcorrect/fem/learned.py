@@ -127,7 +127,7 @@ class ElementWriter:
         self._held = held[cells].astype(float)
         self._inside = self._held.max(axis=1) == 0.0
         partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
-        self._neighbours = neighbours_of(self._grid.place)
+        self._neighbours = neighbours_of(body.cells, self._grid.place)
         least, most = extremes(self._neighbours, body.materials.density, network.reach)
         self._fits: NDArray[np.bool_] = self._grid.regular & ~partly & (most <= _DENSITIES * least)
         self._shapes, self._sizes = cell_shapes(body.positions[cells])

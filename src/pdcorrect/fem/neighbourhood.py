@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cube_symmetry import on_window
@@ -24,7 +25,6 @@ SIZE = NEIGHBOURS + 8 + 2
 """Numbers of a cell."""
 _OFF_GRID = 0.02
 """Of the spacing: how far corners may lie from a grid of cubes."""
-_AROUND = np.stack(np.unravel_index(np.arange(NEIGHBOURS), (3, 3, 3)), axis=1) - 1
 _IN_WINDOW = np.argsort(VTK_CORNERS.astype(np.int64) @ [4, 2, 1])
 """Of the corners, in the order of `on_window`."""
 _FLOOR = 0.01
@@ -68,7 +68,7 @@ class Grid(NamedTuple):
 def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     """Where the cells (C, 8) of a mesh with nodes at ``positions`` (N, 3) lie on a grid of cubes.
 
-    Its spacing is the median length of the cells along the axes; its origin too is where most are.
+    Its spacing is the median length of the cells along the axes, its origin where most of them are.
     """
     corners = positions[cells]
     low, high = corners.min(axis=1), corners.max(axis=1)
@@ -88,16 +88,24 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     return Grid(np.take_along_axis(cells, order, axis=1), order, index, regular)
 
 
-def neighbours_of(index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The (C, 27) cells about each of the cells at ``index`` (C, 3) of a grid; C where none is."""
-    index = index - index.min(axis=0) + 1
-    shape = index.max(axis=0) + 2
-    keys = np.ravel_multi_index(tuple(index.T), tuple(shape))
-    order = np.argsort(keys)
-    wanted = keys[:, None] + _AROUND @ [shape[1] * shape[2], shape[2], 1]
-    place = np.searchsorted(keys[order], wanted).clip(max=len(keys) - 1)
-    found = order[place]
-    return np.where(keys[found] == wanted, found, len(keys))
+def neighbours_of(cells: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The (C, 27) cells about each that share nodes with it; C where there is none.
+
+    Parameters
+    ----------
+    cells : (C, 8)
+    place : (C, 3)
+        On the grid.
+    """
+    count = len(cells)
+    entries = np.ones(cells.size, dtype=np.int64), cells.ravel(), 8 * np.arange(count + 1)
+    nodes = sp.csr_array(entries, shape=(count, int(cells.max()) + 1))
+    one, other = (nodes @ nodes.T).tocoo().coords
+    offset = place[other] - place[one]
+    near = np.abs(offset).max(axis=1) <= 1
+    out = np.full((count, NEIGHBOURS), count)
+    out[one[near], (offset[near] + 1) @ [9, 3, 1]] = other[near]
+    return out
 
 
 def cell_graph(

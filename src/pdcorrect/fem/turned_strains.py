@@ -26,7 +26,7 @@ too.  Everything here counts S and F times a, so that all numbers of z are lengt
 z counts times c(J) e(q), q = sum_m h_m . h_m / a^2.  c is 1 for J above `FADES` and 0 below `GONE`:
 the frame is not defined where two stretches add up to nothing.  e is 1 for q below `BENT` and 0
 above `FOLDED`.  So cells that are crushed, inside out or folded have the element's own energy
-alone, which may get them back.
+alone, which may get them back, and on the way there no force drives them further.
 """
 
 from __future__ import annotations
@@ -46,10 +46,13 @@ _ROWS = np.array([0, 1, 2, 1, 2, 0])
 _COLUMNS = np.array([0, 1, 2, 2, 0, 1])
 KINK = 1e-9
 """Of the size: sums of two stretches below it count as it."""
-FADES, GONE = 0.3, 0.05
+FADES, GONE = 0.6, 0.05
 """Values of J between which z fades."""
-BENT, FOLDED = 0.15, 0.6
-"""Values of q between which z fades; at 0.2 a corner can be inside out."""
+BENT, FOLDED = 0.1, 0.6
+"""Values of q between which z fades; at 0.2 a corner can be inside out.
+
+Both are so far apart that energy still grows on the way in where K is as large as C.
+"""
 
 
 @njit(**OPTIONS)

@@ -126,8 +126,9 @@ class Viscous:
 class WrittenViscous:
     """r/2 (z(y) - z') . K (z(y) - z'), summed over the cells of a learned element.
 
-    K has no part in volume: the rate of z's trace is not that of the stretch, and could outweigh
-    what the element itself dissipates.  The rest of K is less than the element's own.
+    K has no part in volume, nor in cells whose strains fade where the step begins: their rates
+    are not those of the stretch, and could outweigh what the element itself dissipates.  The rest
+    of K is less than the element's own.
 
     Attributes
     ----------
@@ -141,7 +142,8 @@ class WrittenViscous:
         assert problem.correction is not None
         self._rest = problem.positions
         self.places = [(a, self.displacement(x)) for a, x in zip(factors, places, strict=True)]
-        self.correction = problem.correction.without_volume()
+        self._whole = np.all([problem.correction.whole(u) for _, u in self.places], axis=0)
+        self.correction = problem.correction.without_volume().scaled(self._whole)
         self._rated = self.correction.scaled(rate)
         parts = [a * self.correction.strains(u) for a, u in self.places]
         self._before: Array = np.sum(parts, axis=0)
@@ -178,7 +180,8 @@ class WrittenViscous:
         rates = self.correction.rates(self.displacement(y), x)
         stress = self._rated.stress(rates)
         by_places = [a * self.correction.pulled(u, stress) for a, u in self.places]
-        out = without_trace(rates)[:, :, None] * without_trace(self.change(y))[:, None]
+        rates = self._whole[:, None] * without_trace(rates)
+        out = rates[:, :, None] * without_trace(self.change(y))[:, None]
         return by_places, out + np.swapaxes(out, 1, 2)
 
     def along(self, y: Array, x: Array) -> float:
