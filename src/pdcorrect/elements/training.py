@@ -142,7 +142,7 @@ class Trainer:
     ) -> None:
         self._recipe, self._device = recipe, device
         if "cuda" in device:
-            torch.cuda.set_device(device)  # which graphs are recorded on
+            torch.cuda.set_device(torch.device(device).index or 0)  # which graphs are recorded on
         torch.manual_seed(recipe.seed)
         self._rng = np.random.default_rng(recipe.seed)
         self._network = network = kind(recipe.width, recipe.rounds).to(device)
