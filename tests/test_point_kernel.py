@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pdcorrect.batch import point_kernel, points
+from pdcorrect.batch import correction, point_kernel, points, viscosity
 from pdcorrect.batch.point_kernel import Program
 from pdcorrect.errors import MissingExtraError
 from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF
@@ -138,6 +138,18 @@ def test_kernels_compute_what_torch_does(request, dtype, model, first):
     found = everything(p, H, weights)
     tolerance = 1e-12 if dtype == torch.float64 else 1e-4
     torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance, check_stride=True)
+
+
+STRETCHES = {"viscosity": (viscosity._stretch, (6, 9, 3, 9)),
+             "learned element": (correction._stretch, (9, 9, 9))}  # fmt: skip
+
+
+@pytest.mark.parametrize(("function", "sizes"), STRETCHES.values(), ids=STRETCHES)
+def test_stretches_have_kernels_too(interpreted, function, sizes):
+    H = gradients(torch.float64)[:, 4:].contiguous()
+    found = points.computed(function, [H], sizes)
+    for got, expected in zip(found, function(list(H)), strict=True):
+        torch.testing.assert_close(got, torch.stack(expected), rtol=1e-12, atol=1e-12)
 
 
 @needs_gpu

@@ -298,9 +298,7 @@ def _kept(state: _State) -> Tensor:
 def _stretch(H: Components) -> list[Components]:
     """R, S and (tr S - S)^-1 of H + I."""
     U, s, V = signed_svd(moved(H))
-    floor = torch.full_like(s[0], KINK)
-    sums = [torch.maximum(s[1] + s[2], floor), torch.maximum(s[2] + s[0], floor)]
-    sums.append(torch.maximum(s[0] + s[1], floor))
+    sums = [torch.clamp(s[(a + 1) % 3] + s[(a + 2) % 3], min=KINK) for a in range(3)]
 
     def product(A: Components, d: Components | None) -> Components:
         out = []
