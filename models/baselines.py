@@ -1,7 +1,7 @@
 """Measure what needs no training beside a data set's reference: elements, mass, fitted stiffness.
 
 python models/baselines.py DATA -o OUTPUT [--split evaluation] [--device cuda] [--batch 60]
-    [--workers 2] [--fit 40] [--fit-split validation]
+    [--workers 2] [--fit 40] [--fit-split validation] [--only NAME ...]
 
 The plain coarse mesh is stepped again with other elements, the learned one among them, with the
 consistent mass, and, unless ``--fit`` is 0, with Young's modulus times one factor for the whole
@@ -123,6 +123,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--fit", type=int, default=40, help="simulations")
     parser.add_argument("--fit-split", default=None, help="of which they are")
+    parser.add_argument("--only", nargs="+", help="elements, or 'consistent mass'")
     options = parser.parse_args()
     split = options.fit_split or TRAINING
     if options.fit_split is None and not (options.data / TRAINING).is_dir():
@@ -132,6 +133,8 @@ def main() -> None:
         "hex8-learned": with_solver(element="hex8-learned", mass="averaged"),
         "consistent mass": with_solver(mass="consistent"),
     }
+    if options.only:
+        changes = {name: changes[name] for name in options.only}
     notes, more = [], {}
     if options.fit:
         cases = read_cases(options.data, split, skip_damaged=False).cases[: options.fit]
