@@ -158,7 +158,13 @@ class Trainer:
         self._loss = float("nan")
 
     def epoch(self, seconds: float | None = None) -> bool:
-        """Each body once, as far as the recipe's iterations and the time (s) go; if they do."""
+        """Each body once, as far as the recipe's iterations and the time (s) go; if they do.
+
+        Raises
+        ------
+        ConvergenceError
+            If the loss is not finite, and with it the weights.
+        """
         deadline = None if seconds is None else time.monotonic() + seconds
         losses: list[Tensor] = []
         more = True
@@ -174,6 +180,8 @@ class Trainer:
             self.iteration += 1
         if losses:
             self._loss = float(torch.stack(losses).mean())
+            if not np.isfinite(self._loss):
+                raise ConvergenceError(f"loss {self._loss} at iteration {self.iteration}.")
         return more
 
     def _slopes_of(self, batch: Batch) -> Callable[[], Tensor]:
@@ -236,15 +244,7 @@ class Trainer:
         return {**asdict(self._recipe), "drawn": DRAWN}
 
     def save(self, path: Path) -> None:
-        """Write a checkpoint.
-
-        Raises
-        ------
-        ConvergenceError
-            If the loss is not finite, and with it the weights.
-        """
-        if not np.isfinite(self._loss):
-            raise ConvergenceError(f"loss {self._loss} at iteration {self.iteration}.")
+        """Write a checkpoint."""
         state = {
             "recipe": self._kind(),
             "iteration": self.iteration,
