@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -145,7 +146,7 @@ def tune_element(
 ) -> None:
     """Tune the learned element to the body of one scene, in a minute (extra 'learn').
 
-    The scene then says ``[solver] element = "hex8-learned"`` and ``weights = "FILE"``.
+    The scene then has the element hex8-learned and the file as weights, both in [solver].
     """
     from pdcorrect.elements.tuning import tune
     from pdcorrect.fem.problem import discretise
@@ -161,4 +162,5 @@ def tune_element(
             f"{name}: {without:.2f} % off without learning, {before:.2f} % before, "
             f"{after:.2f} % now"
         )
-    typer.echo(f'wrote {output}; [solver] element = "hex8-learned", weights = "{output}"')
+    told = os.path.relpath(output, scene.parent)  # as the scene's paths are
+    typer.echo(f'wrote {output}; [solver] element = "hex8-learned", weights = "{told}"')

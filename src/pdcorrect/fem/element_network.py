@@ -269,7 +269,7 @@ def read_network(path: Path) -> Network:
     except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
         raise FileFormatError(
             f"{path}: no weights of a learned element ({error}): expected a file as `pdcorrect "
-            "train-element` writes it. Install the package again for its own."
+            "tune-element` or `train-element` writes it."
         ) from None
     expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
     if network.shape != expected:
