@@ -123,7 +123,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--fit", type=int, default=40, help="simulations")
     parser.add_argument("--fit-split", default=None, help="of which they are")
-    parser.add_argument("--only", nargs="+", help="elements, or 'consistent mass'")
+    names = (*ELEMENTS, "hex8-learned", "consistent mass")
+    parser.add_argument("--only", nargs="+", choices=names)
     options = parser.parse_args()
     split = options.fit_split or TRAINING
     if options.fit_split is None and not (options.data / TRAINING).is_dir():

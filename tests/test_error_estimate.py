@@ -42,7 +42,7 @@ def test_sees_the_error_of_the_time_step():
     assert found[0] < found[1] < 0.3 * found[2]
 
 
-@pytest.mark.xfail(strict=True, reason="0.52: trained on too few thick bodies")
+@pytest.mark.xfail(strict=True, reason="0.51: cells of thick bodies are a little too soft")
 def test_of_statics_finer_meshes_have_half_the_error():
     scene = beam(time={"integrator": "quasi-static", "step": 1.0, "frames": 1})
     coarse, fine = (

@@ -47,10 +47,9 @@ class Row:
     ``estimated_error`` the same to a finer run; None where that was not computed.  The other
     errors are node distances on the coarse nodes over all frames, against the reference case, in
     metres; ``omega`` is eq. 7-2 with the first case on the coarse mesh as its zero.  Times are
-    medians for one frame; ``setup_seconds``
-    covers meshing, assembly and the first factorisation.  ``unusual_frames``
-    converged only by a fallback (see `Status`).  ``refused_frames`` are those whose correction
-    a gate refused; None without a corrector.
+    medians for one frame; ``setup_seconds`` covers meshing, assembly and the first factorisation.
+    ``unusual_frames`` converged only by a fallback (see `Status`).  ``refused_frames`` are those
+    whose correction a gate refused; None without a corrector.
     """
 
     label: str
@@ -99,6 +98,8 @@ class Comparison:
         Why none of the cases is the best coarse model; None if one is, or could be.
     converged : Trajectory or None
         The converged motion, if errors to it were asked for.
+    finer : Trajectory or None
+        What errors on the coarse mesh are estimated by, if that was asked for.
     """
 
     scene: Scene
