@@ -11,7 +11,7 @@ from conftest import beam, problem_on
 from pdcorrect.cli.program import app
 from pdcorrect.elements.bodies import holds, nodes_of
 from pdcorrect.elements.tuning import own_body, part, tune
-from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 
 
@@ -48,6 +48,11 @@ def test_the_command_and_a_path_beside_the_scene(tmp_path):
         app, ["tune-element", str(file), "-o", str(tmp_path / "w.safetensors"), "--iterations", "2"]
     )
     assert result.exit_code == 0, result.output
+    assert 'weights = "w.safetensors"' in result.output  # from the scene's folder
+    again = CliRunner().invoke(
+        app, ["tune-element", str(file), "-o", str(tmp_path / "w.safetensors")]
+    )
+    assert isinstance(again.exception, OutputError)
     file.write_text(
         scene().to_toml().split("[solver]")[0]
         + '\n[solver]\nelement = "hex8-learned"\nweights = "w.safetensors"\n'

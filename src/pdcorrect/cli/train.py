@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect.cli.common import tell_of_compiling
+from pdcorrect.errors import OutputError
 
 if TYPE_CHECKING:
     from pdcorrect.training.progress import Progress
@@ -143,6 +144,7 @@ def tune_element(
     output: Annotated[Path, typer.Option("-o", "--output", help="File of weights, *.safetensors.")],
     iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 200,
     seed: Annotated[int, typer.Option(help="Of loads and order.", min=0)] = 0,
+    overwrite: Annotated[bool, typer.Option(help="Replace an existing file of weights.")] = False,
 ) -> None:
     """Tune the learned element to the body of one scene, in a minute (extra 'learn').
 
@@ -153,6 +155,8 @@ def tune_element(
     from pdcorrect.scene import Scene
 
     loaded = Scene.load(scene)
+    if output.exists() and not overwrite:
+        raise OutputError(f"{output}: there already: expected a new name, or --overwrite.")
     tell_of_compiling()
     problem = discretise(loaded.with_changes(solver={"element": "hex8-enhanced"}))
     found = tune(problem, output, iterations=iterations, seed=seed, report=typer.echo)
