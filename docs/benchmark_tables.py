@@ -126,6 +126,21 @@ def elements() -> Rows:
     return head, rows
 
 
+def batch_elements() -> Rows:
+    """256 scenes of 405 nodes, and 16 of the fine mesh, on a GPU."""
+    rows = [
+        [
+            f"`{row['element']}`", str(row["nodes"]), str(row["scenes"]),
+            number(row["step_ms_a_scene"]), number(row["backward_ms"] / row["scenes"]),
+            number(row["memory_bytes"] / 1e9, 2),
+        ]
+        for row in results_of(H100, "batch elements")
+    ]  # fmt: skip
+    head = ("element", "nodes", "scenes", "step, ms a scene", "derivative, ms a scene",
+            "memory, GB")  # fmt: skip
+    return head, rows
+
+
 def _cell(row: dict[str, Any] | None, key: str) -> str:
     return "" if row is None else number(row[key])
 
@@ -172,6 +187,7 @@ def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "peer": peer, "derivatives": derivatives, "integrators": integrators, "batches": batches,
-        "batch-integrators": batch_integrators, "elements": elements,
+        "batch-integrators": batch_integrators, "batch-elements": batch_elements,
+        "elements": elements,
         "corrected-steps": corrected_steps, "networks": networks, "reading": reading,
     }.items()  # fmt: skip

@@ -36,6 +36,7 @@ BASELINES = {
     "hex8-mean": "element `hex8-mean`",
     "hex8-bubble": "element `hex8-bubble`",
     "hex8-bubble-mean": "element `hex8-bubble-mean`",
+    "hex8-learned": "element `hex8-learned`",
     "consistent mass": "consistent mass",
     "fitted stiffness": "one factor on Young's modulus, fitted",
     "total-mass": "the reference's total mass",
@@ -226,6 +227,19 @@ def _omega(found: Mapping[str, float] | None) -> str:
     return "" if found is None else f"{percent(found['mean'])}, {percent(found['smallest'])}"
 
 
+def element_studies() -> Rows:
+    """Trainings of the learned element on fewer bodies, and with parts left out."""
+    found = read(RECORDS / "element_studies.json")["studies"]
+    names = ("displacements", "first frequency", "frequencies")
+    some = next(iter(found.values()))["validation"]
+    rows = [["without learning", "1.00", *(percent(100 * some[f"{n}, without"], 2) for n in names)]]
+    for study, record in found.items():
+        judged = record["validation"]
+        errors = (percent(100 * judged[f"{name}, learned"], 2) for name in names)
+        rows.append([study, number(judged["loss"], 2), *errors])
+    return ("trained on", "loss", *(f"{name}, %" for name in names)), rows
+
+
 def trainings(*studies: str) -> Rows:
     """Other trainings of some studies."""
     found = [t for t in read("models/withdrawn.json")["trainings"] if t["study"] in studies]
@@ -242,6 +256,7 @@ def tables() -> Iterable[tuple[str, Any]]:
         "models": released, "recipes": recipes, "results": results, "losses": losses,
         "time-error": time_error,
         "further-splits": further_splits, "baselines": baselines,
+        "element-studies": element_studies,
         "recipes-compared": partial(trainings, "recipes"),
         "changes-one-by-one": partial(trainings, "ablation"),
         "bodies-and-seeds": partial(trainings, "seeds", "bodies"),

@@ -20,12 +20,15 @@ from typing import Any
 
 import torch
 from program import origin, run_script
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import silu
 
 from pdcorrect._files import write_text
 from pdcorrect.elements.collection import A_FILE
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.elements.training import ElementRecipe, Trainer, samples_of
+from pdcorrect.fem.element_network import SCALARS, STRAINS
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE
 
 
 class WithoutMass(ElementNetwork):
@@ -50,12 +53,38 @@ class OneOrientation(ElementNetwork):
         return super().forward(numbers, neighbours, first)
 
 
+class NeighbourhoodMLP(ElementNetwork):
+    """A plain MLP on the numbers of a cell and its 26 neighbours, instead of rounds of messages."""
+
+    def __init__(self, width: int = 256, rounds: int = 3) -> None:
+        super().__init__(width, 0)
+        sizes = [NEIGHBOURS * SIZE, *[width] * rounds]
+        self.layers = nn.ModuleList(map(nn.Linear, sizes[:-1], sizes[1:]))
+        self.hidden = nn.Linear(width, 128)
+
+    def forward(
+        self, numbers: Tensor, neighbours: Tensor, symmetries: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """See `ElementNetwork`."""
+        if symmetries is None:
+            symmetries = torch.arange(48, device=numbers.device)
+        turned = nn.functional.pad(numbers, (0, 0, 0, 1))[:, self.own[symmetries]]
+        orientation = torch.arange(len(symmetries), device=numbers.device)[:, None]
+        x = turned[neighbours[:, self.around[symmetries]], orientation].flatten(2)
+        for layer in (*self.layers, self.hidden):
+            x = silu(layer(x))
+        lower = zip(self.last(x).split(self._lengths, dim=2), (STRAINS, SCALARS), strict=True)
+        N, H = (self._mean(answers, size, symmetries) for answers, size in lower)
+        return N, H
+
+
 FULL = ElementRecipe()
 STUDIES: dict[str, tuple[ElementRecipe, type[ElementNetwork]]] = {
-    **{f"{n} bodies": (replace(FULL, bodies=n), ElementNetwork) for n in (250, 1000)},
+    **{f"{n} bodies": (replace(FULL, bodies=n), ElementNetwork) for n in (50, 200, 1000)},
     f"{FULL.bodies} bodies": (FULL, ElementNetwork),
     "sees 3 cells across": (replace(FULL, rounds=1), ElementNetwork),
     "sees 5 cells across": (replace(FULL, rounds=2), ElementNetwork),
+    "MLP on 27 cells": (replace(FULL, width=256), NeighbourhoodMLP),
     "without mass": (FULL, WithoutMass),
     "one orientation": (FULL, OneOrientation),
 }
@@ -89,7 +118,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     options = parser.parse_args()
     found = json.loads(options.output.read_text())["studies"] if options.output.exists() else {}
-    with ProcessPoolExecutor(options.workers, mp_context=get_context("spawn")) as pool:
+    spawn = get_context("spawn")
+    with ProcessPoolExecutor(options.workers, spawn, max_tasks_per_child=1) as pool:
         tasks = {
             pool.submit(study, name, options.iterations, options.folder, options.device): name
             for name in STUDIES

@@ -153,6 +153,7 @@ class Trainer:
         with torch.no_grad():
             self._without = [errors(batch, None, None) for batch in self._validation]
         self._symmetries = torch.arange(recipe.symmetries, device=device)
+        self._pool = torch.cuda.graph_pool_handle() if "cuda" in device else None
         self._slopes = [self._slopes_of(batch) for batch in batches]
         self.iteration = 0
         self._loss = float("nan")
@@ -196,7 +197,7 @@ class Trainer:
             value.backward()  # type: ignore[no-untyped-call]
             return value.detach()
 
-        return Recorded(slopes) if "cuda" in self._device else slopes
+        return slopes if self._pool is None else Recorded(slopes, self._pool)
 
     def measured(self) -> dict[str, float]:
         """Errors on the validation bodies, and without learning."""
@@ -281,17 +282,16 @@ class Recorded:
     ----------
     work : callable
         Without arguments and of the same shapes each time; its answer is overwritten each time.
+    pool : handle of `torch.cuda.graph_pool_handle`
+        Memory that it shares with other graphs that never run at the same time.
     """
 
-    _pool = None
-
-    def __init__(self, work: Callable[[], Tensor]) -> None:
+    def __init__(self, work: Callable[[], Tensor], pool: Any) -> None:
         self._work = work  # keeps what the kernels read
         work()  # libraries set themselves up
         self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph, pool=Recorded._pool):
+        with torch.cuda.graph(self._graph, pool=pool):
             self._answer = work()
-        Recorded._pool = self._graph.pool()
 
     def __call__(self) -> Tensor:
         self._graph.replay()
