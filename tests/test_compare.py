@@ -20,7 +20,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.evaluation import compare as compare_module
 from pdcorrect.evaluation import report
 from pdcorrect.evaluation.compare import CASES, Case, case_stepper, cases_with
-from pdcorrect.evaluation.comparison_cases import HEX27, cases_for, without_best
+from pdcorrect.evaluation.comparison_cases import HEX27, LEARNED, cases_for, without_best
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 MODEL = "torsion-exact"
@@ -127,6 +127,25 @@ def test_hex27_is_refused_where_it_is_the_scenes_own(program, thick, tmp_path):
     assert not (tmp_path / "r").exists()
     with pytest.raises(InputError, match="element 'hex27' with base 'best'"):
         dataclasses.replace(HEX27, base="best").problem(thick)
+
+
+def test_the_learned_element_is_there_once_and_called_so(program, thick, tmp_path):
+    thick = thick.with_changes(time={"integrator": "backward-euler"})
+    own = pc.learned_coarse(thick)
+    for scene, learned in ((own, False), (own, True), (thick, True)):
+        cases = cases_for(scene, learned=learned, second_order=True)
+        (case,) = (case for case in cases if case.label == LEARNED.label)
+        assert case.problem(scene).element == "hex8-learned"
+        assert case.plain == (scene is own)
+        assert ("coarse PD" in labels(cases)) == (scene is thick)
+        assert labels(cases).count(f"{LEARNED.label}, generalised-alpha") == 1
+    (tmp_path / "scene.toml").write_text(thick.with_changes(solver={"element": "hex27"}).to_toml())
+    for command in ("simulate", "compare"):  # it has not all nodes
+        arguments = ("--learned", "-o", tmp_path / "out")
+        status, _, err = program(command, tmp_path / "scene.toml", *arguments)
+        assert status == BAD_INPUT
+        assert "27" in err
+        assert not (tmp_path / "out").exists()
 
 
 def test_models_keep_the_reference_that_they_learned_from(thick):

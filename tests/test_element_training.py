@@ -198,11 +198,17 @@ def test_inference_without_torch_agrees(found, tmp_path):
 
 def test_files_that_are_no_weights_are_refused(tmp_path):
     path = tmp_path / "weights.safetensors"
-    with pytest.raises(FileFormatError):
-        read_network(path)
+    for unread in (path, tmp_path):
+        with pytest.raises(FileFormatError, match=unread.name):
+            read_network(unread)
     save_file(random_network(width=8, rounds=1).state_dict(), path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(FileFormatError):
+        read_network(path)
+    network = random_network(width=8, rounds=1)
+    network.hidden = torch.nn.Linear(3, 3)  # whose sizes do not fit the others
+    save_file(network.state_dict(), path)
+    with pytest.raises(FileFormatError, match=path.name):
         read_network(path)
     network = random_network(width=8, rounds=1)
     network.last.bias.data[3] = float("nan")

@@ -60,6 +60,10 @@ def test_the_command_and_a_path_beside_the_scene(tmp_path):
     loaded = pc.Scene.load(file)
     assert loaded.solver.weights == tmp_path / "w.safetensors"
     assert pc.discretise(loaded).correction.learned.all()
+    more = ["-o", str(tmp_path / "more.safetensors"), "--iterations", "2"]
+    assert CliRunner().invoke(app, ["tune-element", str(file), *more]).exit_code == 0
+    card = json.loads((tmp_path / "more.json").read_text())
+    assert card["from"] == str(loaded.solver.weights)
     with pytest.raises(FileFormatError, match="gone"):
         pc.discretise(loaded.with_changes(solver={"weights": tmp_path / "gone"}))
 

@@ -378,33 +378,56 @@ def test_cells_off_the_grid_keep_the_element_and_are_counted():
     mesh = voxel_mesh(np.ones((3, 2, 2), dtype=bool), (0, 0, 0), 0.1)
     x = mesh.positions.copy()
     x[-1] += 0.03
-    with pytest.warns(PdcorrectWarning, match="1 of 12 cells"):
+    with pytest.warns(PdcorrectWarning, match="1 of 12 cells.*grid"):
         problem = problem_on(HexMesh.create(x, mesh.cells), "hex8-learned")
     assert problem.correction.learned.sum() == 11
     assert not problem.correction.matrices[~problem.correction.learned].any()
 
 
+PART = {"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}}
+
+
 @pytest.mark.parametrize(
-    "changes",
+    ("what", "changes"),
     [
-        {"material": {"poisson": 0.4999}},
-        {"clamps": [{"region": {"plane": "x", "at": 0.0}, "components": ["x"]},
-                    {"region": {"plane": "y", "at": 0.0}, "components": ["y"]},
-                    {"region": {"plane": "z", "at": 0.0}, "components": ["z"]}]},
-        {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "young": 1e9}]},
-        {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "density": 10.0}]},
-        {"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.06, 1.0, 1.0]]}, "poisson": 0.1}]},
+        ("nu", {"material": {"poisson": 0.4999}}),
+        ("components", {"clamps": [{"region": {"plane": axis, "at": 0.0}, "components": [axis]}
+                                   for axis in "xyz"]}),
+        ("moduli", {"materials": [{**PART, "young": 1e9}]}),
+        ("densities", {"materials": [{**PART, "density": 10.0}]}),
+        ("nu", {"materials": [{**PART, "poisson": 0.1}]}),
     ],
 )  # fmt: skip
-def test_what_it_was_not_trained_for_is_told(changes):
-    with pytest.warns(PdcorrectWarning, match="unlike those it was trained on"):
-        learned_problem(beam(**changes))
+def test_what_it_was_not_trained_for_is_told(what, changes):
+    with pytest.warns(PdcorrectWarning, match=what):
+        problem = learned_problem(beam(**changes))
+    own, materials = problem.correction, problem.materials
+    ((told, count),) = own.writer.unlike(materials.mu, materials.volume_weight).items()
+    assert what in told
+    assert count == (~own.learned).sum() > 0
 
 
 def test_another_mass_rule_is_refused():
     with pytest.raises(SceneError, match="mass"):
         beam(solver={"element": "hex8-learned", "mass": "lumped"})
     assert beam(solver={"element": "hex8-learned"}).solver.mass == "averaged"
+
+
+def test_weights_are_of_the_learned_element_only(tmp_path):
+    with pytest.raises(SceneError, match="weights"):
+        beam(solver={"element": "hex8", "weights": tmp_path / "w.safetensors"})
+    tuned = beam(solver={"element": "hex8-learned", "weights": tmp_path / "w.safetensors"})
+    assert pc.learned_coarse(tuned).solver == tuned.solver
+    assert pc.best_coarse(tuned).solver.weights is None
+    assert pc.discretise(tuned, element="hex27").scene.solver.weights is None
+    with pytest.raises(SceneError, match="weights"):
+        pc.best_coarse(tuned).with_changes(solver={"weights": tmp_path / "w.safetensors"})
+
+
+@pytest.mark.parametrize("path", ["", "a\0b"])
+def test_weights_without_a_name_are_refused(path):
+    with pytest.raises(SceneError, match="weights"):
+        beam(solver={"element": "hex8-learned", "weights": path})
 
 
 def test_second_order_under_refinement():

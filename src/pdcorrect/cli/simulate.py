@@ -41,7 +41,7 @@ def simulate(
         bool, typer.Option(help="Of the corrector: let the default gate refuse its corrections.")
     ] = True,
     learned: Annotated[
-        bool, typer.Option("--learned", help="With the learned element, whatever the scene's own.")
+        bool, typer.Option("--learned", help="With the learned element in place of the scene's.")
     ] = False,
     estimate_error: Annotated[
         bool,
@@ -115,14 +115,14 @@ def _estimated(run: Trajectory) -> str:
 
 
 def _learned(scene: Scene, model: str | None) -> Scene:
-    from pdcorrect.scene import learned_coarse
+    from pdcorrect.evaluation.comparison_cases import with_learned
 
     if model is not None:
         raise InputError(
             f"--learned with --model {model}: expected one of them; a corrector is for the coarse "
             "model that it was trained on."
         )
-    return learned_coarse(scene)
+    return with_learned(scene)
 
 
 def _check_corrected(model: str, solver: SolverName, refine: int) -> None:

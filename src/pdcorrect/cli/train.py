@@ -152,13 +152,13 @@ def tune_element(
     """
     from pdcorrect.elements.tuning import tune
     from pdcorrect.fem.problem import discretise
-    from pdcorrect.scene import Scene
+    from pdcorrect.scene import Scene, learned_coarse
 
     loaded = Scene.load(scene)
     if output.exists() and not overwrite:
         raise OutputError(f"{output}: there already: expected a new name, or --overwrite.")
     tell_of_compiling()
-    problem = discretise(loaded.with_changes(solver={"element": "hex8-enhanced"}))
+    problem = discretise(learned_coarse(loaded))
     found = tune(problem, output, iterations=iterations, seed=seed, report=typer.echo)
     for name in ("displacements", "frequencies"):
         without, before, after = (100.0 * errors[name] for errors in found)

@@ -64,7 +64,7 @@ class Case:
         if self.base == "enhanced":
             return discretise(best_coarse(scene), self.refine)
         if self.base == "learned":
-            return discretise(learned_coarse(scene), self.refine)
+            return discretise(with_learned(scene), self.refine)
         if self.refine == 1:
             return coarse_model(scene, self.base)
         if self.base not in ("plain", "best"):
@@ -83,6 +83,22 @@ class Case:
             )
         mass = "averaged" if scene.solver.mass == "per-node" else scene.solver.mass
         return discretise(scene, self.refine, mass, self.element)
+
+
+def with_learned(scene: Scene) -> Scene:
+    """`learned_coarse` of a scene whose nodes it has.
+
+    Raises
+    ------
+    InputError
+        If the scene's own element has 27 nodes.
+    """
+    if scene.solver.element == HEX27.element:
+        raise InputError(
+            "learned: the scene's 27-node elements have nodes where it has none: expected a "
+            "scene of another element."
+        )
+    return learned_coarse(scene)
 
 
 def check_corrected(case: Case, base: str) -> None:
@@ -152,7 +168,8 @@ def cases_for(
 
     The reference is the fine mesh with the element of the best coarse model; with correctors it
     is what they learned from.  A scene that has no such model, see `without_best`,
-    has its own element on the fine mesh.
+    has its own element on the fine mesh.  The coarse run of a scene with the learned element is
+    called so.
 
     Parameters
     ----------
@@ -164,7 +181,7 @@ def cases_for(
     hex27 : bool
         Also 27-node elements on the coarse mesh.
     learned : bool
-        Also the learned element.
+        Also the learned element, where it is not the scene's own.
     second_order : bool
         The best coarse model, the learned and the 27-node elements also by generalised-alpha,
         where the scene has another integrator.
@@ -186,12 +203,10 @@ def cases_for(
                 f"models {', '.join(models)}: correct a coarse model that this scene has not: "
                 f"{why}. Expected a scene that has one, or models of another base."
             )
-    if learned and scene.solver != learned_coarse(scene).solver:
-        if _impossible(scene, learned_coarse(scene)):
-            raise InputError(
-                "learned: the scene's 27-node elements have nodes where it has none: expected a "
-                "scene of another element."
-            )
+    if scene.solver.element == "hex8-learned":
+        others[others.index(CASES[2])] = replace(CASES[2], label=LEARNED.label)
+    elif learned:
+        with_learned(scene)  # or a refusal before anything runs
         others.append(LEARNED)
     if hex27:
         if scene.solver.element == HEX27.element:
@@ -203,7 +218,7 @@ def cases_for(
         others += [
             replace(case, label=f"{case.label}, {_SECOND_ORDER}", integrator=_SECOND_ORDER)
             for case in others
-            if case in (_BEST, LEARNED, HEX27)
+            if case.label in (_BEST.label, LEARNED.label, HEX27.label)
         ]
     return (reference, *others)
 

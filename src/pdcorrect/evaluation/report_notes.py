@@ -38,8 +38,8 @@ def _of_the_errors(comparison: Comparison) -> str:
         f"{_of_the_converged(comparison)}"
         f"{_of_the_estimate(comparison)}RMS and worst are distances "
         f"of the coarse nodes from {comparison.reference}, which moves by up to "
-        f"{1e3 * largest_displacement(truth):.3g} mm; 'corrected' is the share of the coarse PD "
-        "run's squared error that is gone."
+        f"{1e3 * largest_displacement(truth):.3g} mm; 'corrected' is the share of the scene's "
+        "own coarse PD run's squared error that is gone."
     )
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import FileFormatError, FileVersionError
 from pdcorrect.fem.cube_symmetry import on_scalars, on_strains
-from pdcorrect.fem.neighbourhood import SIZE, CellGraph, permutations
+from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, CellGraph, permutations
 
 Array = NDArray[np.float64]
 
@@ -262,16 +262,24 @@ def read_network(path: Path) -> Network:
 
     try:
         content = path.read_bytes()
-        arrays = load(content)
-        if not all(np.isfinite(x).all() for x in arrays.values()):
-            raise ValueError("numbers that are not finite")
-        network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
-    except (OSError, SafetensorError, KeyError, IndexError, ValueError) as error:
+    except OSError as error:
         raise FileFormatError(
-            f"{path}: no weights of a learned element ({error}): expected a file as `pdcorrect "
-            "tune-element` or `train-element` writes it."
+            f"{path}: weights cannot be read ({error.strerror or error})."
         ) from None
     expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
+    try:
+        arrays = load(content)
+        finite = all(np.isfinite(x).all() for x in arrays.values())
+        network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
+        if finite and network.shape == expected:  # one cell alone, for the sizes in between
+            network(CellGraph(np.zeros((1, SIZE)), np.ones((1, NEIGHBOURS), dtype=np.int64)))
+    except (SafetensorError, KeyError, IndexError, ValueError):
+        raise FileFormatError(
+            f"{path}: no weights of a learned element, or damaged: expected a file as `pdcorrect "
+            "tune-element` or `train-element` writes it."
+        ) from None
+    if not finite:
+        raise FileFormatError(f"{path}: weights that are not finite.")
     if network.shape != expected:
         raise FileVersionError(
             f"{path}: from {network.shape[0]} to {network.shape[1]} numbers: expected "

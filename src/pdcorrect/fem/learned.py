@@ -129,7 +129,11 @@ class ElementWriter:
         partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
         self._neighbours = neighbours_of(body.cells, self._grid.place)
         least, most = extremes(self._neighbours, body.materials.density, network.reach)
-        self._fits: NDArray[np.bool_] = self._grid.regular & ~partly & (most <= _DENSITIES * least)
+        self._placed: dict[str, NDArray[np.bool_]] = {
+            "that are not cubes of the grid": self._grid.regular,
+            "beside nodes held in some components": ~partly,
+            f"in reach of densities over {_DENSITIES:g} times apart": most <= _DENSITIES * least,
+        }
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
 
@@ -213,17 +217,29 @@ class ElementWriter:
         by_masses = by_masses[cell, order[:, :, None], order[:, None, :]]
         return by_matrices[learned], by_masses[learned]
 
+    def unlike(self, mu: Array, omega: Array) -> dict[str, int]:
+        """How many cells the network was not trained for, by what they are."""
+        fits = self._fits(*effective_moduli(mu, omega))
+        return {what: int((~fit).sum()) for what, fit in fits.items() if not fit.all()}
+
+    def _fits(self, young: Array, poisson: Array) -> dict[str, NDArray[np.bool_]]:
+        """Which cells are as those of the training, by what the others are."""
+        reach = self._network.reach
+        soft, stiff = extremes(self._neighbours, np.nan_to_num(young, nan=np.inf), reach)
+        least, most = extremes(self._neighbours, np.nan_to_num(poisson).clip(0.0), reach)
+        return {
+            **self._placed,
+            f"of nu outside 0 to {LARGEST_POISSON:.3g}": (
+                (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
+            ),
+            f"in reach of moduli over {_CONTRAST:g} times apart": stiff <= _CONTRAST * soft,
+            f"in reach of nu over {_POISSONS:g} apart": most <= least + _POISSONS,
+        }
+
     def _seen(self, young: Array, poisson: Array) -> tuple[CellGraph, NDArray[np.bool_]]:
         """What the network sees of all cells, and which it was trained for."""
-        learned: NDArray[np.bool_] = (
-            self._fits & (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
-        )
+        learned = np.logical_and.reduce([*self._fits(young, poisson).values()])
         known = np.where(np.isfinite(young), young, 0.0), np.nan_to_num(poisson).clip(0.0)
-        reach = self._network.reach
-        least, most = extremes(self._neighbours, np.nan_to_num(young, nan=np.inf), reach)
-        learned &= most <= _CONTRAST * least
-        least, most = extremes(self._neighbours, known[1], reach)
-        learned &= most <= least + _POISSONS
         with np.errstate(invalid="ignore"):
             graph = cell_graph(self._neighbours, *known, self._held)
         numbers = np.nan_to_num(graph.numbers)

@@ -358,9 +358,11 @@ def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
     found = writer.correction(materials.mu, materials.volume_weight)
     count = int((~found.learned).sum())
     if count:
+        unlike = writer.unlike(materials.mu, materials.volume_weight)
+        told = "; ".join(f"{cells} {what}" for what, cells in unlike.items())
         warnings.warn(
             f"element 'hex8-learned': {count} of {len(body.cells)} cells are unlike those it was "
-            "trained on and keep the element 'hex8-enhanced'",
+            f"trained on ({told}) and keep the element 'hex8-enhanced'",
             PdcorrectWarning,
             stacklevel=4,
         )

@@ -111,6 +111,19 @@ class Solver(Strict):
             )
         return {**data, "mass": "averaged"}
 
+    @model_validator(mode="after")
+    def _weights_of_learned(self) -> Solver:
+        """Weights are a file, and of the learned element."""
+        if self.weights is None:
+            return self
+        if not self.weights.name or "\0" in str(self.weights):
+            raise ValueError("weights: expected the path of a file")
+        if self.element != "hex8-learned":
+            raise ValueError(
+                f"weights with element = {self.element!r}: expected 'hex8-learned', or no weights"
+            )
+        return self
+
 
 class Scene(TomlConfig):
     """A body, its material, how it is held and loaded, and for how long.
@@ -182,6 +195,8 @@ class Scene(TomlConfig):
     def with_changes(self, **sections: Any) -> Scene:
         """The same scene with some sections' keys replaced.
 
+        Another element leaves ``solver.weights`` out.
+
         Examples
         --------
         ``scene.with_changes(material={"poisson": 0.3}, time={"frames": 5})``
@@ -189,6 +204,8 @@ class Scene(TomlConfig):
         data = self.model_dump(mode="python", exclude_none=True, exclude_unset=True, by_alias=True)
         for section, change in sections.items():
             if isinstance(change, dict) and isinstance(data.get(section), dict):
+                if section == "solver" and change.get("element", "hex8-learned") != "hex8-learned":
+                    data[section].pop("weights", None)
                 data[section] = {**data[section], **change}
             else:
                 data[section] = change
