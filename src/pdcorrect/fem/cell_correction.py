@@ -112,10 +112,10 @@ class CellCorrection:
 
     def whole(self, u: Array) -> NDArray[np.bool_]:
         """Cells (C,) whose strains do not fade, see `turned_strains`."""
-        v = self.shapes @ u[self.cells] / self.sizes[:, None, None]
-        J = np.linalg.det(np.eye(3) + v[:, :3])
-        bent = np.square(v[:, 3:]).sum(axis=(1, 2))
-        return np.asarray((J >= turned_strains.FADES) & (bent <= turned_strains.BENT))
+        v = self.shapes[:, :3] @ u[self.cells] / self.sizes[:, None, None]
+        q = np.square(self.strains(u) / self.sizes[:, None]).sum(axis=1)
+        J = np.linalg.det(np.eye(3) + v)
+        return np.asarray((J >= turned_strains.FADES) & (q <= turned_strains.LARGE))
 
     def scaled(self, factor: float | Array) -> CellCorrection:
         """A multiple of the matrices, or one of each, (C,)."""
