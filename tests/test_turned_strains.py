@@ -35,7 +35,7 @@ def slope(f, e=1e-4):
 
 @pytest.mark.parametrize(
     ("squeezed", "bent"),
-    [(1.0, 0.2), (0.5, 0.5), (1.0, 1.0), (1.4, 0.2)],
+    [(1.0, 0.3), (0.5, 0.5), (1.0, 1.0), (1.6, 0.2)],
     ids=["mild", "crushed", "folded", "drawn out"],
 )
 @pytest.mark.parametrize("shifted", [False, True])
@@ -47,7 +47,7 @@ def test_forces_and_tangent_are_the_derivatives_of_the_potential(cells, shifted,
     u, x = bent * moved() + (squeezed - 1.0) * rest, 0.02 * rng.normal(size=(8 * CELLS, 3))
     full, left = (np.linalg.norm(correction.strains(v)[:, 6:], axis=1) for v in (0.05 * moved(), u))
     faded = (left > 0.0) & (left < 0.9 * bent / 0.05 * full)  # rotations leave lengths
-    assert (faded.sum() > 3) == ((squeezed, bent) != (1.0, 0.2)), faded.sum()
+    assert (faded.sum() > 3) == ((squeezed, bent) != (1.0, 0.3)), faded.sum()
 
     def forces(t):
         return correction.energy_and_forces(u + t * x, shift)[1]
@@ -102,7 +102,7 @@ def test_affine_displacements_have_no_other_strains_than_stretch(cells):
 
 def test_crushed_and_drawn_out_cells_have_no_strains(cells):
     correction, rest = cells
-    for F in (np.zeros((3, 3)), np.diag([1.0, 1.0, -0.9]), np.diag([2.0, 0.7, 0.7])):
+    for F in (np.zeros((3, 3)), np.diag([1.0, 1.0, -0.9]), np.diag([2.2, 0.7, 0.7])):
         assert not correction.strains(rest @ F.T - rest).any()
         energy, forces = correction.energy_and_forces(rest @ F.T - rest)
         assert energy == 0.0

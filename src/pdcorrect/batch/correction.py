@@ -18,7 +18,7 @@ from pdcorrect.batch.points import Components, computed, moved
 from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
-from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE
+from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE, SHARES
 
 _SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 8)
 """Of what `_State` has."""
@@ -114,7 +114,7 @@ class BatchCorrection:
         state = self._state(local)
         dz, _, grown, _, _ = self._rates(state, small_products(self._shapes, x))
         c, slope, _, _, _, e, down, _ = torch.split(state.fades, 1, dim=-1)
-        longer = (state.z * dz).sum(dim=-1, keepdim=True)
+        longer = (_shared(state.z) * dz).sum(dim=-1, keepdim=True)
         return c * e * dz + (slope * e * grown + c * down * longer) * state.z
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
@@ -178,7 +178,7 @@ class BatchCorrection:
         """The state with derivatives by what is left of z."""
         c, slope, _, first, _, e, down, _ = torch.split(at.fades, 1, dim=-1)
         along = (raw * at.z).sum(dim=-1, keepdim=True)
-        y = c * e * raw + along * c * down * at.z
+        y = c * e * raw + along * c * down * _shared(at.z)
         trace = y[..., :3].sum(dim=-1, keepdim=True)
         y = self._added(y, (trace * first + along * slope * e)[..., None] * at.adjugate, trace)
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
@@ -218,7 +218,7 @@ class BatchCorrection:
         dz, dS, grown, dh, turn = self._rates(at, dv)
         h, y = _vectors(at.z), _vectors(at.y)
         c, slope, bend, first, second, e, down, turned = torch.split(at.fades, 1, dim=-1)
-        longer = (at.z * dz).sum(dim=-1, keepdim=True)
+        longer = (_shared(at.z) * dz).sum(dim=-1, keepdim=True)
         ds = slope * e * grown + c * down * longer
         strains = c * e * dz + ds * at.z
         raw = self.stress(strains) if rate is None else self.viscous_stress(strains, rate)
@@ -226,8 +226,8 @@ class BatchCorrection:
         across = (raw * at.z + at.raw * dz).sum(dim=-1, keepdim=True)
         less = along * c * down
         more = across * c * down + along * (slope * grown * down + c * turned * longer)
-        dy = c * e * raw + ds * at.raw + more * at.z + less * dz
-        before = c * e * at.raw + less * at.z
+        dy = c * e * raw + ds * at.raw + _shared(more * at.z + less * dz)
+        before = c * e * at.raw + less * _shared(at.z)
         own, trace = (x[..., :3].sum(dim=-1, keepdim=True) for x in (before, dy))
         most = trace * first + across * slope * e + own * second * grown
         most = most + along * (bend * e * grown + slope * down * longer)
@@ -275,10 +275,15 @@ def _measures(J: Tensor, z: Tensor, size: Tensor) -> Tensor:
     below = J * J + 2.0
     first = 3.0 * J / (below * size) ** 2
     second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**5)
-    q = (z**2).sum(dim=-1, keepdim=True) / size**2
+    q = (_shared(z) * z).sum(dim=-1, keepdim=True) / size**2
     c = _rise((J - GONE) / (FADES - GONE), (FADES - GONE) * size**3)
     e = _rise((HUGE - q) / (HUGE - LARGE), (LARGE - HUGE) * 0.5 * size**2)
     return torch.cat([*c, first, second, *e], dim=-1)
+
+
+def _shared(z: Tensor) -> Tensor:
+    """Z's numbers times `SHARES`."""
+    return torch.cat([SHARES[0] * z[..., :6], z[..., 6:]], dim=-1)
 
 
 def _trace(A: Tensor) -> Tensor:
