@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -75,41 +75,54 @@ class Rollout:
         return self.reasons > 0
 
 
-def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> list[Rollout]:
+def roll_out(
+    hybrid: Hybrid,
+    stepper: BatchStepper,
+    steps: Sequence[int],
+    worth: Callable[[int, Tensor], Tensor] | None = None,
+) -> list[Rollout]:
     """All scenes of a stepper from their initial states, each for its number of steps.
 
     A failed scene is held at its last state, so its error is that of a simulation that has
     stopped: it is neither left out nor replaced by anything better.
+
+    Parameters
+    ----------
+    hybrid, stepper
+    steps : sequence of int
+    worth : callable, optional
+        Told each frame and the positions (B, N, 3) there, m: which scenes (B,) are to go on.
+        Others are held without having failed.
     """
-    rest = stepper.rest_state()
-    state = stepper.state([problem.initial_state() for problem in stepper.problems])
-    previous = None
+    rest, state, previous = stepper.rest_state(), stepper.initial_state(), None
     frames, reasons = [rest.positions], []
-    failed: list[int | None] = [None] * len(steps)
+    last = torch.tensor(steps, device=rest.positions.device)
+    failed, going = torch.zeros_like(last), torch.ones_like(last, dtype=torch.bool)
     for number in range(1, max(steps) + 1):
         result = hybrid(state, previous)
         fine = _fine(result) & _near(result.state.positions, rest.positions, stepper.node_mask)
-        for i, good in enumerate(fine.tolist()):
-            if not good and failed[i] is None and number <= steps[i]:
-                failed[i] = number
-        alive = torch.tensor([f is None for f in failed], device=fine.device) & fine
-        frames.append(_where(alive, result.state.positions, frames[-1]))
-        reasons.append(torch.where(alive, result.reasons, 0))
-        state = BatchState(
-            _where(alive, result.state.positions, rest.positions),
-            _where(alive, result.state.velocities, rest.velocities),
+        failed = torch.where(going & ~fine, number, failed)
+        going = going & fine
+        frames.append(_where(going, result.state.positions, frames[-1]))
+        reasons.append(torch.where(going, result.reasons, 0))
+        going = going & (last > number)
+        if worth is not None:
+            going = worth(number, frames[-1]) & going
+        state = BatchState(  # at rest scenes cost little
+            _where(going, result.state.positions, rest.positions),
+            _where(going, result.state.velocities, rest.velocities),
             result.state.times,
             {
-                name: _where(alive, x, torch.zeros_like(x))
+                name: _where(going, x, torch.zeros_like(x))
                 for name, x in result.state.memory.items()
             },
         )
-        previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
+        previous = torch.where(_by_node(stepper, going), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()
     told = torch.stack(reasons).cpu().numpy()
     return [
-        Rollout(positions[: count + 1, i, : stepper.node_counts[i]], told[:count, i], failed[i])
-        for i, count in enumerate(steps)
+        Rollout(positions[: n + 1, i, : stepper.node_counts[i]], told[:n, i], first or None)
+        for i, (n, first) in enumerate(zip(steps, failed.tolist(), strict=True))
     ]
 
 

@@ -18,6 +18,8 @@ from pdcorrect.training.recipe import Rate, Stage
 
 _TOLD = ("loss_sum", "count", "skipped", "row", "longest")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+LARGEST = 1.0
+"""Norm of the gradient; larger ones are scaled down to it."""
 
 
 def rate_at(rate: Rate, progress: float) -> float:
@@ -77,8 +79,7 @@ class Optimiser:
         self._world.mean([*grads, value])
         norm = torch.nn.utils.get_total_norm(grads)
         self._bad.copy_((~(torch.isfinite(norm) & torch.isfinite(value[0]))).float())
-        if self._stage.clip is not None:
-            torch.nn.utils.clip_grads_with_norm_(self._weights, self._stage.clip, norm)
+        torch.nn.utils.clip_grads_with_norm_(self._weights, LARGEST, norm)
         for group in self._adam.param_groups:
             group["lr"] = rate_at(self._stage.rate, progress)
         self._adam.step()

@@ -15,7 +15,6 @@ from torch import Tensor
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.placements import Velocity
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Base, Problem
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
@@ -69,7 +68,7 @@ class SceneGroup:
         self.nodes = sum(self.stepper.node_counts)
         self._rows = torch.arange(len(self), device=self.device)
         self._reference = self._padded([r.reference for r in recordings])
-        self._layers: dict[tuple[int, bool, Velocity], HybridLayer] = {}
+        self._layers: dict[tuple[int, bool], HybridLayer] = {}
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -79,16 +78,15 @@ class SceneGroup:
         """Seconds."""
         return self.stepper.time_step
 
-    def layer(self, corrector: Corrector, through_solver: bool, velocity: Velocity) -> HybridLayer:
+    def layer(self, corrector: Corrector, through_solver: bool) -> HybridLayer:
         """The hybrid's step; scenes that fail have no derivatives."""
-        key = id(corrector), through_solver, velocity
+        key = id(corrector), through_solver
         if key not in self._layers:
             self._layers = {
                 key: HybridLayer(
-                    self.stepper, corrector, through_solver=through_solver, velocity=velocity,
-                    on_failure="zero",
+                    self.stepper, corrector, through_solver=through_solver, on_failure="zero"
                 )
-            }  # fmt: skip
+            }
         return self._layers[key]
 
     def truth(self, frames: Frames) -> Tensor:
@@ -156,10 +154,10 @@ class SceneGroup:
         """Sums (B,) over the nodes of each scene of values (B, N)."""
         return torch.where(self.mask, values, 0.0).sum(dim=1)
 
-    def lost(self, positions: Tensor, frames: Frames, most: float) -> NDArray[np.bool_]:
-        """Which scenes are off by more than ``most`` times the base model's D, squared, (B,)."""
+    def lost(self, positions: Tensor, frames: Frames) -> NDArray[np.bool_]:
+        """Which scenes' mean squared distance is more than the base model's D, (B,)."""
         squares = self.sums((positions - self.truth(frames)).square().sum(dim=2)) / self.counts
-        far = ~(squares <= most * self.errors.largest)
+        far = ~(squares <= self.errors.largest)
         found: NDArray[np.bool_] = far.cpu().numpy()
         return found
 

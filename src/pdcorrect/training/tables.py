@@ -1,4 +1,4 @@
-"""`ResidentWindows`: windows of a data set in tables on a device, gathered by index."""
+"""`WindowTables`: windows of a data set in tables, gathered by index."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
+from pdcorrect.corrector.bodies import KNOWN, REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
 from pdcorrect.data.reader import TrajectoryDataset
 
 Numbers = NDArray[np.int64]
@@ -44,13 +44,22 @@ class StoredWindows:
     file: Tensor
     simulation: Tensor
 
-    @property
-    def num_graphs(self) -> int:
-        """B."""
-        return len(self.file)
+    def to(self, device: torch.device) -> StoredWindows:
+        """The same on a device."""
+        if self.file.device == device:
+            return self
+        moved = {
+            name: x.to(device, non_blocking=True)
+            for name, x in vars(self).items()
+            if name != "bodies"
+        }
+        bodies = self.bodies.to(device)
+        for name in KNOWN:
+            vars(bodies)[name] = vars(self.bodies)[name].to(device, non_blocking=True)
+        return StoredWindows(bodies, **moved)
 
 
-class ResidentWindows:
+class WindowTables:
     """All windows of a data set in one piece of memory.
 
     There is one table for each quantity: all nodes, edges and cells of the meshes side by
@@ -62,7 +71,7 @@ class ResidentWindows:
     dataset : TrajectoryDataset
         With predictions of a base model; its files are read one by one and not kept.
     alone : callable
-        The body, float64 and on the device, of the file of a window (its number).
+        The body, float64, of the file of a window (its number).
     device : torch.device
     """
 
@@ -89,7 +98,7 @@ class ResidentWindows:
         files, first = np.unique(dataset.shard_numbers(), return_index=True)
         bodies = []
         for file, window in zip(files.tolist(), first.tolist(), strict=True):
-            bodies.append(alone(window))
+            bodies.append(alone(window).to(device))
             self._keep(file)
             dataset.forget()
         self._place = np.zeros(len(headers), dtype=np.int64)
