@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.compare import cases_with
+from pdcorrect.evaluation.comparison_cases import cases_with
 from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]

@@ -93,15 +93,15 @@ def test_what_is_proposed_before_the_step_holds_the_clamps_where_the_coarse_step
     architecture = {"preset": "compact", "changes": changes}
     stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
     windows, _ = samples.windows(folder, samples.config(stage, corrector=architecture))
-    found = windows.windows([7, 26])
-    batch = windows.step_batch(found)
+    batch = windows.batch([7, 26])
     held, state = ~batch.bodies.free, batch.snapshot
     assert held.any()
     ahead = state.positions + 0.01 * state.velocities  # as clamps that do not move always were
     assert torch.equal(state.proposed[held], ahead[held])
-    found.predictions[-1][held] += 0.003
-    moved = windows.step_batch(found)
-    predicted = found.predictions[-1]
+    windows._frames["predictions"] += 0.003
+    moved = windows.batch([7, 26])
+    predicted = windows.dataset.batch([7, 26]).predictions[:, -1] + 0.003
+    predicted = predicted.to(torch.float64)
     assert torch.equal(moved.snapshot.proposed[held], predicted[held])
     assert torch.equal(moved.snapshot.proposed[~held], state.proposed[~held])
     if placement == "guess":
@@ -135,13 +135,14 @@ def test_windows_are_those_of_the_files_and_know_their_bodies_at_rest(folder):
         with pytest.raises(IndexError, match=str(index)):
             windows.batch([0, index])
     chosen = [45, 3, 18, 45, 20, 56, 0]  # both meshes, all simulations, first and last windows
-    stored, read = windows.windows(chosen), windows.dataset.batch(chosen)
-    for name in ("targets", "predictions", "forces"):
-        expected = getattr(read, name).transpose(0, 1).to(torch.float64)
-        assert torch.equal(getattr(stored, name), expected)
-    for name in ("positions", "velocities"):
-        assert torch.equal(getattr(stored, name), getattr(read, name).to(torch.float64))
-    bodies, alone = stored.bodies, BodyGraph.of_batch(read).to(dtype=torch.float64)
+    batch, read = windows.batch(chosen), windows.dataset.batch(chosen)
+    state, bodies = batch.snapshot, batch.bodies
+    assert torch.equal(state.positions, read.positions.to(torch.float64))
+    assert torch.equal(state.velocities, read.velocities.to(torch.float64))
+    assert torch.equal(state.proposed, read.predictions[:, 0].to(torch.float64))
+    assert torch.equal(state.forces, read.forces[:, 0].to(torch.float64))
+    assert torch.equal(batch.target, read.targets[:, 0].to(torch.float64) - state.proposed)
+    alone = BodyGraph.of_batch(read).to(dtype=torch.float64)
     for field in fields(bodies):
         x, y = getattr(bodies, field.name), getattr(alone, field.name)
         assert torch.equal(x, y) if not x.is_floating_point() else torch.allclose(x, y, rtol=1e-6)

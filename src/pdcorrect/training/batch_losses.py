@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,25 +19,6 @@ from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.windows import StepBatch, StepWindows
 
 
-class Source(Protocol):
-    """Losses of one batch after the other."""
-
-    failed: int
-    """Scenes that were left out because a step failed."""
-
-    def __len__(self) -> int:
-        """Batches of an epoch."""
-
-    def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
-        """Of batch number ``iteration`` of the stage, on which all that is drawn depends."""
-
-    def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """What the number of the batch does not tell: numbers, and tensors by name."""
-
-    def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-        """Go on where a state was taken."""
-
-
 class OneStepBatches:
     """Windows of the training split in random order, epoch after epoch.
 
@@ -49,6 +30,11 @@ class OneStepBatches:
     stage : Stage
     seed : int
     world : ProcessGroup
+
+    Attributes
+    ----------
+    failed : int
+        Zero: no step is taken.
     """
 
     def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
@@ -79,11 +65,11 @@ class OneStepBatches:
         return batch.with_noise(self._stage.noise.tau, self._generator)
 
     def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
-        """See `Source`."""
+        """The mean loss of a batch; what is drawn depends on ``iteration``."""
         return one_step_loss(corrector, self.batch(iteration), self._stage)
 
     def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Nothing."""
+        """Nothing: all depends on the number of the batch."""
         return {}, {}
 
     def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -99,6 +85,10 @@ def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tenso
     return each.mean()
 
 
+Source = OneStepBatches | UnrolledBatches
+"""Losses of one batch after the other, and states to go on from."""
+
+
 def make_source(
     number: int,
     config: TrainingConfig,
@@ -107,7 +97,7 @@ def make_source(
     world: ProcessGroup,
     teacher: Corrector | None = None,
 ) -> Source:
-    """The source of stage ``number`` of a training."""
+    """Where the losses of stage ``number`` of a training come from."""
     stage, seed = config.stages[number], _seed(config.seed, number)
     if stage.kind == "one-step":
         return OneStepBatches(windows, stage, seed, world)

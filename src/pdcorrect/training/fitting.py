@@ -13,8 +13,7 @@ from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureVi
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.errors import InputError
-from pdcorrect.training.tables import Numbers
-from pdcorrect.training.windows import StepBatch, StepWindows
+from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 
 _AT_ONCE = 32
 """Windows."""
@@ -127,7 +126,7 @@ def _averages(
 def _at_rest(windows: StepWindows) -> tuple[RunningMoments, RunningMoments]:
     """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
     shapes, steps = RunningMoments(), RunningMoments()
-    for batch in _batches(windows, windows.of_each_mesh(), last=False):
+    for batch in _batches(windows, windows.of_each_file(), last=False):
         shapes.add(batch.bodies.shapes)
         steps.add(batch.bodies.time_steps[:, None])
     return shapes, steps

@@ -98,17 +98,11 @@ class Optimiser:
         told["longest"].copy_(torch.maximum(told["longest"], told["row"]))
 
     def take_report(self) -> dict[str, float]:
-        """Mean loss, batches left out, and the longest row of them; counting starts anew."""
+        """The counts by name; counting starts anew."""
         values: dict[str, float] = dict(zip(_TOLD, self._told.tolist(), strict=True))
         for name, x in self._counts.items():
             x.fill_(values["row"] if name in ("row", "longest") else 0.0)
-        count = values["count"]
-        return {
-            "loss": values["loss_sum"] / count if count else math.nan,
-            "count": count,
-            "skipped": values["skipped"],
-            "longest": values["longest"],
-        }
+        return values
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's moments and the counts, by name."""

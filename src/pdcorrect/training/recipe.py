@@ -38,14 +38,11 @@ def _rising(steps: tuple[int, ...]) -> tuple[int, ...]:
 
 def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
-        if not _FILE.fullmatch(name):
+        if not _FILE.fullmatch(name) or names.count(name) > 1:
             raise ValueError(
-                f"{name!r}: expected files of the training and validation splits without their "
-                "ending, such as 'training/mesh-0042', with several data sets "
-                "'SET/training/mesh-0042'"
+                f"{name!r}: expected files of the training and validation splits, each once, such "
+                "as 'training/mesh-0042', with several data sets 'SET/training/mesh-0042'"
             )
-    if len(set(names)) < len(names):
-        raise ValueError("expected each file once")
     return names
 
 

@@ -97,7 +97,7 @@ def load_recordings(
     found = []
     for path in _paths(folder, split, without):
         _check_complete(read_header(path), base, scenes)
-        shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
+        shard = read_shard(path, verify=False, runs=_runs(base))
         for number, simulation in enumerate(shard.simulations):
             found.append(_recording(path, shard, simulation, number, split, base))
     return found
@@ -105,13 +105,8 @@ def load_recordings(
 
 def base_errors(recordings: Sequence[Recording], device: str | torch.device = "cpu") -> BaseErrors:
     """Of some simulations, in their order."""
-
-    def tensor(values: list[float]) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=device)
-
-    return BaseErrors(
-        tensor([r.one_step for r in recordings]), tensor([r.rollout for r in recordings])
-    )
+    values = [[r.one_step for r in recordings], [r.rollout for r in recordings]]
+    return BaseErrors(*torch.tensor(values, dtype=torch.float64, device=device))
 
 
 def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
@@ -144,26 +139,29 @@ def _paths(folder: Folders, split: str, without: Collection[str]) -> list[Path]:
 
 def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
     """Refuse a file of which a simulation lacks what a training of ``base`` needs."""
-    rollouts = tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
     for number, (positions, predictions) in enumerate(header.runs):
         lacks = ["scene"] if scenes and not header.scenes[number] else []
-        lacks += [f"rollout of run {name!r}" for name in rollouts if name not in positions]
+        lacks += [f"rollout of run {n!r}" for n in _runs(base) if n not in positions]
         lacks += [f"single steps of run {base!r}"] if base not in predictions else []
         if lacks:
-            runs = " and ".join(map(repr, rollouts[1:]))
             raise InputError(
-                f"{header.path}: simulation {number} has no {', no '.join(lacks)}: a training "
-                f"with base = {base!r} needs simulations with rollouts of {REFERENCE!r} and "
-                f"{runs}, single steps of {base!r}"
-                f"{', and scenes for stepping them again' if scenes else ''}."
+                f"{header.path}: simulation {number} has no {', no '.join(lacks)}: expected what a "
+                f"training with base = {base!r} needs."
             )
+
+
+def _runs(base: Base) -> tuple[str, ...]:
+    """Whose rollouts are needed."""
+    return tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
 
 
 def _recording(
     path: Path, shard: Shard, simulation: Simulation, number: int, split: str, base: Base
 ) -> Recording:
     """A simulation that lacks nothing, see `_check_complete`."""
-    reference, plain, rollout = (_positions(simulation, run) for run in (REFERENCE, PLAIN, base))
+    runs = simulation.runs
+    reference, plain, rollout = (np.asarray(runs[n].positions) for n in (REFERENCE, PLAIN, base))
+    mass = float(runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
     return Recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
@@ -175,16 +173,10 @@ def _recording(
         time_step=float(shard.attributes["time_step"]),
         reference=reference,
         plain=plain,
-        one_step=_mean_square(np.asarray(simulation.runs[base].predictions), reference[1:]),
+        one_step=_mean_square(np.asarray(runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
-        total_mass=(
-            float(simulation.runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
-        ),
+        total_mass=mass,
     )
-
-
-def _positions(simulation: Simulation, run: str) -> Array:
-    return np.asarray(simulation.runs[run].positions)
 
 
 def _mean_square(x: Array, y: Array) -> float:

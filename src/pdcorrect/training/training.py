@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 import time
@@ -119,8 +120,7 @@ class Training:
         self._recordings = load_recordings(
             data, TRAINING, config.base, scenes=unrolled, without=without
         )
-        if len(data) > 1:
-            _check_alike(self._recordings)
+        _check_alike(self._recordings)
         self._lineage = Lineage.of(config, start, self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
@@ -208,12 +208,12 @@ class Training:
         """For a stage that begins, or one that goes on from a checkpoint."""
         if self._waiting is None:
             self._averaged.load_state_dict(self.corrector.state_dict())
-            return Optimiser(self.corrector, stage, self._averaged, self.world)
-        numbers, tensors = self._waiting
         optimiser = Optimiser(self.corrector, stage, self._averaged, self.world)
-        optimiser.load_state_dict(_part(tensors, "optimiser."))
-        source.load_state_dict(numbers, _part(tensors, "source."))
-        self._waiting = None
+        if self._waiting is not None:
+            numbers, tensors = self._waiting
+            optimiser.load_state_dict(_part(tensors, "optimiser."))
+            source.load_state_dict(numbers, _part(tensors, "source."))
+            self._waiting = None
         return optimiser
 
     def _tick(self) -> float:
@@ -233,7 +233,7 @@ class Training:
             )
         failed = self.world.total(torch.tensor([source.failed], dtype=torch.float64))
         if told["count"] + told["skipped"]:
-            loss = {"loss": told["loss"]} if told["count"] else {}
+            loss = {"loss": told["loss_sum"] / told["count"]} if told["count"] else {}
             self._tell(
                 **loss, rate=rate_at(stage.rate, share), steps=stage.horizon(share),
                 skipped=int(told["skipped"]), failed_scenes=int(failed),
@@ -346,17 +346,14 @@ class Training:
 
 def _common_splits(folders: Sequence[Path]) -> list[str]:
     """Training and, if there is one, validation split."""
-    found = [TRAINING]
-    with_validation = [folder for folder in folders if VALIDATION in splits_of(folder)]
-    if with_validation:
-        found.append(VALIDATION)
-        for folder in folders:
-            if folder not in with_validation:
-                raise InputError(
-                    f"{folder}: no split {VALIDATION!r}, which {with_validation[0]} has: "
-                    "expected one in all data sets, or in none."
-                )
-    return found
+    without = [folder for folder in folders if VALIDATION not in splits_of(folder)]
+    if not without:
+        return [TRAINING, VALIDATION]
+    if len(without) < len(folders):
+        raise InputError(
+            f"{without[0]}: no split {VALIDATION!r}: expected one in all data sets, or in none."
+        )
+    return [TRAINING]
 
 
 def _check_left_out(names: Sequence[str], folders: Sequence[Path]) -> None:
@@ -382,14 +379,13 @@ def _check_alike(recordings: Sequence[Recording]) -> None:
     What else a batch asks to be the same is told when one is made, see `BatchStepper`.
     """
     first = recordings[0]
-    for other in recordings:
-        for name in ("setting", "time_step"):
-            here, there = getattr(first, name), getattr(other, name)
-            if here != there:
-                raise InputError(
-                    f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
-                    "the same in all data sets."
-                )
+    for other, name in itertools.product(recordings, ("setting", "time_step")):
+        here, there = getattr(first, name), getattr(other, name)
+        if here != there:
+            raise InputError(
+                f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
+                "the same in all data sets."
+            )
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -181,7 +181,7 @@ def unroll(
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
     total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
-    living = torch.ones(len(group), dtype=torch.bool, device=group.device)
+    living = torch.ones_like(total, dtype=torch.bool)
     for _ in range(steps):
         with network_precision(corrector, stage.amp):
             positions, velocities, correction = layer(

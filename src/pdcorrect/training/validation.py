@@ -47,21 +47,11 @@ class Scores:
         """Eq. 7-3, with `LEAST` as the least value."""
         return float(self.omegas.mean())
 
-    @property
-    def median(self) -> float:
-        """Per cent."""
-        return float(np.median(self.omegas))
-
-    @property
-    def least(self) -> float:
-        """Per cent."""
-        return float(self.omegas.min())
-
     def metrics(self) -> dict[str, float]:
         """By name, for tables and files."""
         return {
-            "omega_mean": self.mean, "omega_median": self.median, "omega_least": self.least,
-            "failed_rollouts": float(self.failed),
+            "omega_mean": self.mean, "omega_median": float(np.median(self.omegas)),
+            "omega_least": float(self.omegas.min()), "failed_rollouts": float(self.failed),
         }  # fmt: skip
 
 
@@ -119,7 +109,7 @@ class Validation:
         hybrid = BatchHybrid(group.stepper, corrector)
         runs = roll_out(hybrid, group.stepper, group.steps.tolist(), worth)
         # without a gate only corrections that are not finite are refused
-        failed = torch.tensor([r.failed is not None or bool(r.refused.any()) for r in runs])
+        failed = torch.tensor([r.failed is not None or bool(np.any(r.reasons)) for r in runs])
         omegas = (100.0 * (1.0 - total / plain)).clamp(min=LEAST).cpu()
         return torch.where(failed, LEAST, omegas), failed
 

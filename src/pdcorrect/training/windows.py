@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.corrector.architecture import CorrectorConfig
-from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
@@ -22,12 +23,15 @@ from pdcorrect.data.folder import Folders
 from pdcorrect.data.reader import TrajectoryDataset
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Base
-from pdcorrect.training.losses import BaseErrors
 from pdcorrect.training.recordings import Recording, base_errors
-from pdcorrect.training.tables import Numbers, StoredWindows, WindowTables
+
+Numbers = NDArray[np.int64]
 
 _SHARE_OF_DEVICE = 0.3
 """Of a GPU's free memory, which the windows may fill."""
+_FRAMES = ("positions", "velocities", "predictions", "forces")
+_BODY = ("rest", "free", "mass", "young", "poisson", "density", "cell_size", "time_step")
+_AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +69,11 @@ class StepBatch:
 
 
 class StepWindows:
-    """Windows of a data set's training split.
+    """Single steps of a data set's training split, in one piece of memory.
 
-    They are kept in memory: the device's, or the CPU's if they would fill more than 0.3 of what
-    is free on a GPU.
+    There is one table for each quantity, with all nodes of all frames.  It is on the device, or
+    on the CPU if all would fill more than 0.3 of what is free on a GPU.  Of bodies all that is
+    known at rest is computed once.
 
     Parameters
     ----------
@@ -99,31 +104,61 @@ class StepWindows:
     ) -> None:
         self.config, self.device = config, torch.device(device)
         self._history = "previous-correction" in config.node_features
-        steps = 2 if self._history else 1
-        self.dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=base, without=without)
-        numbers = {header.path: k for k, header in enumerate(self.dataset.headers)}
-        wanted = [(h.path, k) for h in self.dataset.headers for k in range(len(h.steps))]
+        self.dataset = TrajectoryDataset(
+            folder, TRAINING, window=2 if self._history else 1, base=base, without=without
+        )
+        headers = self.dataset.headers
+        wanted = [(h.path, k) for h in headers for k in range(len(h.steps))]
         if sorted((r.path, r.number) for r in recordings) != sorted(wanted):
             raise InputError(
                 f"{len(recordings)} recordings for {len(wanted)} simulations: expected those of "
                 "the same files, one each."
             )
-        columns = max(r.number for r in recordings) + 1
-        places = torch.full((len(numbers), columns), -1, dtype=torch.int64)
+        files = {header.path: k for k, header in enumerate(headers)}
+        self._numbers = np.zeros((len(headers), max(len(h.steps) for h in headers)), dtype=np.int64)
         for k, r in enumerate(recordings):
-            places[numbers[r.path], r.number] = k
-        self._recordings = places.to(self.device)
-        self._masses = {numbers[r.path]: r.total_mass for r in recordings}
+            self._numbers[files[r.path], r.number] = k
         self._errors = base_errors(recordings, self.device)
-        self._tables = WindowTables(self.dataset, self._alone, self._home())
+        masses = {files[r.path]: r.total_mass for r in recordings}
+        self._nodes = np.array([h.nodes for h in headers])
+        rows = np.zeros(self._numbers.shape, dtype=np.int64)
+        for row, h in zip(rows, headers, strict=True):
+            row[: len(h.steps)] = (np.array(h.steps) + 1) * h.nodes
+        self._starts = (np.cumsum(rows) - rows.reshape(-1)).reshape(rows.shape)
+        size, self._home = (int(rows.sum()), 3), self._chosen_home()
+        self._frames = {name: torch.zeros(size, device=self._home) for name in _FRAMES}
+        self._bodies: dict[int, BodyGraph] = {}
+        for window in self.of_each_file().tolist():
+            file = int(self.dataset.places([window])[0][0])
+            self._bodies[file] = self._alone(window, masses[file])
+            self._keep(file)
+            self.dataset.forget()
 
-    def _home(self) -> torch.device:
+    def _chosen_home(self) -> torch.device:
         """Where the tables are kept."""
-        size = int(self.dataset.shard_bytes().sum())
         if self.device.type != "cuda":
             return self.device
         free = torch.cuda.mem_get_info(self.device)[0]
-        return self.device if size < _SHARE_OF_DEVICE * free else torch.device("cpu")
+        fits = int(self.dataset.shard_bytes().sum()) < _SHARE_OF_DEVICE * free
+        return self.device if fits else torch.device("cpu")
+
+    def _alone(self, window: int, mass: float | None) -> BodyGraph:
+        """The body of a window, float64, of the base model's mass (kg)."""
+        body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
+        body = body.to(dtype=torch.float64)
+        if mass is None:
+            return body
+        factor = mass / body.mass.sum()
+        return replace(body, mass=factor * body.mass, density=factor * body.density)
+
+    def _keep(self, file: int) -> None:
+        """Copy a file's frames to their places; a last frame has no step that follows it."""
+        motions = self.dataset.decoded(file).motions
+        for start, motion in zip(self._starts[file][: len(motions)], motions, strict=True):
+            fields = {"positions": motion.positions, "velocities": motion.velocities}
+            for name, values in (fields | motion.steps).items():
+                flat = values.reshape(-1, 3)
+                self._frames[name][start : start + len(flat)] = flat
 
     def batch(self, indices: Sequence[int] | Numbers, *, last: bool = True) -> StepBatch:
         """The last steps of chosen windows, or the first.
@@ -131,52 +166,67 @@ class StepWindows:
         Windows have two where the network sees the correction of the step before, else one.  Of
         a window's first step that correction is None, as where a simulation begins.
         """
-        return self.step_batch(self.windows(indices), last=last)
+        files, simulations, frames = self.dataset.places(indices)
+        second = self._history and last
+        nodes = self._nodes[files]
+        starts = self._starts[files, simulations] + (frames + second) * nodes
+        first = np.cumsum(nodes) - nodes
+        rows = np.repeat(starts - first, nodes) + np.arange(nodes.sum())
+        step = np.repeat(nodes, nodes)
+        here, ahead = (torch.from_numpy(x).to(self._home) for x in (rows, rows + step))
 
-    def windows(self, indices: Sequence[int] | Numbers) -> StoredWindows:
-        """All steps of chosen windows."""
-        return self._tables.batch(indices).to(self.device)
-
-    def errors(self, stored: StoredWindows) -> BaseErrors:
-        """The base model's on the trajectory of each window."""
-        return self._errors.of(self._recordings[stored.file, stored.simulation])
-
-    def step_batch(self, stored: StoredWindows, *, last: bool = True) -> StepBatch:
-        """What windows say about a step of theirs."""
-        positions, velocities, previous = stored.positions, stored.velocities, None
-        bodies, step = stored.bodies, 0
-        if self._history and last:
-            step = 1
-            before, positions = positions, stored.targets[0]
-            previous = positions - stored.predictions[0]
-            velocities = (positions - before) / bodies.by_node(bodies.time_step)[:, None]
-        coarse = stored.predictions[step]
-        state = Snapshot(positions, velocities, coarse, stored.forces[step], previous)
-        target = stored.targets[step] - coarse
+        positions, velocities, coarse, forces = (self._taken(name, here) for name in _FRAMES)
+        previous = None
+        if second:
+            before = torch.from_numpy(rows - step).to(self._home)
+            previous = positions - self._taken("predictions", before)
+        bodies = joined([self._bodies[file] for file in files.tolist()])
+        state = Snapshot(positions, velocities, coarse, forces, previous)
+        target = self._taken("positions", ahead) - coarse
         if self.config.placement != "state":
             h: Any = bodies.by_node(bodies.time_step)[:, None]
             # the clamps of the stored coarse step are where they are prescribed
             start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
-        return StepBatch(bodies, state, target, self.errors(stored).after(1))
+        which = torch.from_numpy(self._numbers[files, simulations]).to(self.device)
+        return StepBatch(bodies, state, target, self._errors.of(which).after(1))
+
+    def _taken(self, name: str, rows: Tensor) -> Tensor:
+        """Rows of a table, float64, on the device."""
+        found = self._frames[name].index_select(0, rows).to(self.device, non_blocking=True)
+        return found.to(torch.float64)
 
     def beginnings(self) -> Numbers:
         """Numbers of the windows with which simulations begin."""
         every = np.arange(len(self.dataset))
         return every[self.dataset.places(every)[2] == 0]
 
-    def of_each_mesh(self) -> Numbers:
+    def of_each_file(self) -> Numbers:
         """Numbers of one window of each file."""
         files, _, _ = self.dataset.places(np.arange(len(self.dataset)))
         return np.unique(files, return_index=True)[1]
 
-    def _alone(self, window: int) -> BodyGraph:
-        """The body of a window, of the base model's mass."""
-        found = self.dataset.batch([window])
-        body = BodyGraph.of_batch(found).to(dtype=torch.float64)
-        mass = self._masses[int(found.file)]
-        if mass is None:
-            return body
-        factor = mass / body.mass.sum()
-        return replace(body, mass=factor * body.mass, density=factor * body.density)
+
+def joined(bodies: Sequence[BodyGraph]) -> BodyGraph:
+    """Graphs of one body each as one graph, with what they know of their bodies at rest."""
+    device = bodies[0].rest.device
+    nodes = np.array([len(b.rest) for b in bodies])
+    first = np.cumsum(nodes) - nodes
+
+    def each(values: Numbers, counts: Sequence[int] | Numbers) -> Tensor:
+        return torch.from_numpy(np.repeat(values, counts)).to(device, non_blocking=True)
+
+    edges, cells = (
+        torch.cat([getattr(b, name) for b in bodies], dim)
+        for name, dim in (("edge_index", 1), ("cells", 0))
+    )
+    found = BodyGraph(
+        **{name: torch.cat([getattr(b, name) for b in bodies]) for name in _BODY},
+        edge_index=edges + each(first, [b.edge_index.shape[1] for b in bodies]),
+        cells=cells + each(first, [len(b.cells) for b in bodies])[:, None],
+        graph=each(np.arange(len(bodies)), nodes),
+    )
+    known = {name: torch.cat([getattr(b, name) for b in bodies]) for name in _AT_REST}
+    vars(found).update(known)
+    return found
