@@ -34,7 +34,9 @@ def slope(f, e=1e-4):
 
 
 @pytest.mark.parametrize(
-    ("squeezed", "bent"), [(1.0, 0.5), (0.5, 0.5), (1.0, 2.0)], ids=["mild", "crushed", "folded"]
+    ("squeezed", "bent"),
+    [(1.0, 0.3), (0.5, 0.5), (1.0, 1.0), (1.6, 0.2)],
+    ids=["mild", "crushed", "folded", "drawn out"],
 )
 @pytest.mark.parametrize("shifted", [False, True])
 def test_forces_and_tangent_are_the_derivatives_of_the_potential(cells, shifted, squeezed, bent):
@@ -45,7 +47,7 @@ def test_forces_and_tangent_are_the_derivatives_of_the_potential(cells, shifted,
     u, x = bent * moved() + (squeezed - 1.0) * rest, 0.02 * rng.normal(size=(8 * CELLS, 3))
     full, left = (np.linalg.norm(correction.strains(v)[:, 6:], axis=1) for v in (0.05 * moved(), u))
     faded = (left > 0.0) & (left < 0.9 * bent / 0.05 * full)  # rotations leave lengths
-    assert (faded.sum() > 3) == ((squeezed, bent) != (1.0, 0.5)), faded.sum()
+    assert (faded.sum() > 3) == ((squeezed, bent) != (1.0, 0.3)), faded.sum()
 
     def forces(t):
         return correction.energy_and_forces(u + t * x, shift)[1]
@@ -86,7 +88,7 @@ def test_strains_do_not_change_in_rigid_motions_and_vanish_in_them(cells):
 
 def test_affine_displacements_have_no_other_strains_than_stretch(cells):
     correction, rest = cells
-    F = np.eye(3) + 0.3 * np.random.default_rng(3).normal(size=(3, 3))
+    F = np.eye(3) + 0.08 * np.random.default_rng(3).normal(size=(3, 3))
     z = correction.strains(rest @ F.T - rest)
     assert z[:, 6:] == pytest.approx(0.0, abs=1e-15)
     _, s, Vt = np.linalg.svd(F)
@@ -98,9 +100,9 @@ def test_affine_displacements_have_no_other_strains_than_stretch(cells):
     )
 
 
-def test_crushed_cells_have_no_strains(cells):
+def test_crushed_and_drawn_out_cells_have_no_strains(cells):
     correction, rest = cells
-    for F in (np.zeros((3, 3)), np.diag([1.0, 1.0, -0.9])):
+    for F in (np.zeros((3, 3)), np.diag([1.0, 1.0, -0.9]), np.diag([2.2, 0.7, 0.7])):
         assert not correction.strains(rest @ F.T - rest).any()
         energy, forces = correction.energy_and_forces(rest @ F.T - rest)
         assert energy == 0.0

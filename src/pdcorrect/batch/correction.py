@@ -18,7 +18,7 @@ from pdcorrect.batch.points import Components, computed, moved
 from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
-from pdcorrect.fem.turned_strains import BENT, FADES, FOLDED, GONE, KINK
+from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE, SHARES
 
 _SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 8)
 """Of what `_State` has."""
@@ -114,8 +114,8 @@ class BatchCorrection:
         state = self._state(local)
         dz, _, grown, _, _ = self._rates(state, small_products(self._shapes, x))
         c, slope, _, _, _, e, down, _ = torch.split(state.fades, 1, dim=-1)
-        bent = (state.z[..., 6:] * dz[..., 6:]).sum(dim=-1, keepdim=True)
-        return c * e * dz + (slope * e * grown + c * down * bent) * state.z
+        longer = (_shared(state.z) * dz).sum(dim=-1, keepdim=True)
+        return c * e * dz + (slope * e * grown + c * down * longer) * state.z
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
@@ -163,31 +163,35 @@ class BatchCorrection:
         identity = torch.eye(3, dtype=v.dtype, device=v.device)
         A = _adjugates(S, S)
         turned = small_products(v[..., 3:, :], R).flatten(2)
-        g, fades = _measures(_contracted(S, A) / 3.0, turned, self._sizes[..., None])
-        E = S + ((g - _trace(S)) / 3.0)[..., None] * identity
+        J, size = _contracted(S, A) / 3.0 / self._sizes[..., None] ** 3, self._sizes[..., None]
+        E = (
+            S
+            + ((1.5 * size * (J * J - 1.0) / (J * J + 2.0) - _trace(S)) / 3.0)[..., None] * identity
+        )
         strain = torch.einsum("nij,bcij->bcn", self._mandel, E)
         z = torch.cat([strain, turned], dim=2)
+        fades = _measures(J, z, size)
         at = _State(R, S, inverse, A, z, z, z, S, z, fades)
         return self._with(at, self.stress(at.strains))
 
     def _with(self, at: _State, raw: Tensor) -> _State:
         """The state with derivatives by what is left of z."""
         c, slope, _, first, _, e, down, _ = torch.split(at.fades, 1, dim=-1)
-        y = c * e * raw
-        along, trace = (raw * at.z).sum(dim=-1, keepdim=True), y[..., :3].sum(dim=-1, keepdim=True)
-        tensor = (trace * first + along * slope * e)[..., None] * at.adjugate
-        y = self._added(y, tensor, trace, along * c * down * at.z[..., 6:])
+        along = (raw * at.z).sum(dim=-1, keepdim=True)
+        y = c * e * raw + along * c * down * _shared(at.z)
+        trace = y[..., :3].sum(dim=-1, keepdim=True)
+        y = self._added(y, (trace * first + along * slope * e)[..., None] * at.adjugate, trace)
         tensor = torch.einsum("nij,bcn->bcij", self._mandel, y[..., :6])
         torque = self._torque(at.S, tensor, _vectors(at.z), _vectors(y))
         w = small_products(at.inverse, torque[..., None])[..., 0]
         return at._replace(raw=raw, y=y, tensor=tensor, w=w)
 
-    def _added(self, y: Tensor, tensor: Tensor, trace: Tensor, vectors: Tensor) -> Tensor:
-        """Y with a tensor, less a third of a trace, and vectors more."""
+    def _added(self, y: Tensor, tensor: Tensor, trace: Tensor) -> Tensor:
+        """Y with a tensor more, less a third of a trace."""
         identity = torch.eye(3, dtype=y.dtype, device=y.device)
         tensor = tensor - trace[..., None] / 3.0 * identity
         more = torch.einsum("nij,bcij->bcn", self._mandel, tensor)
-        return torch.cat([y[..., :6] + more, y[..., 6:] + vectors], dim=-1)
+        return torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
 
     def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
         return self._with(at, self.viscous_stress(at.strains - before, rate))
@@ -214,20 +218,21 @@ class BatchCorrection:
         dz, dS, grown, dh, turn = self._rates(at, dv)
         h, y = _vectors(at.z), _vectors(at.y)
         c, slope, bend, first, second, e, down, turned = torch.split(at.fades, 1, dim=-1)
-        bent = (at.z[..., 6:] * dz[..., 6:]).sum(dim=-1, keepdim=True)
-        ds = slope * e * grown + c * down * bent
+        longer = (_shared(at.z) * dz).sum(dim=-1, keepdim=True)
+        ds = slope * e * grown + c * down * longer
         strains = c * e * dz + ds * at.z
         raw = self.stress(strains) if rate is None else self.viscous_stress(strains, rate)
-        dy = c * e * raw + ds * at.raw
-        own, trace = (x[..., :3].sum(dim=-1, keepdim=True) for x in (c * e * at.raw, dy))
         along = (at.raw * at.z).sum(dim=-1, keepdim=True)
         across = (raw * at.z + at.raw * dz).sum(dim=-1, keepdim=True)
+        less = along * c * down
+        more = across * c * down + along * (slope * grown * down + c * turned * longer)
+        dy = c * e * raw + ds * at.raw + _shared(more * at.z + less * dz)
+        before = c * e * at.raw + less * _shared(at.z)
+        own, trace = (x[..., :3].sum(dim=-1, keepdim=True) for x in (before, dy))
         most = trace * first + across * slope * e + own * second * grown
-        most = most + along * (bend * e * grown + slope * down * bent)
+        most = most + along * (bend * e * grown + slope * down * longer)
         change = 2.0 * (own * first + along * slope * e)[..., None] * _adjugates(at.S, dS)
-        more = across * c * down + along * (slope * grown * down + c * turned * bent)
-        vectors = more * at.z[..., 6:] + along * c * down * dz[..., 6:]
-        dy = self._added(dy, most[..., None] * at.adjugate + change, trace, vectors)
+        dy = self._added(dy, most[..., None] * at.adjugate + change, trace)
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
@@ -265,19 +270,20 @@ def _rise(t: Tensor, width: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), first, second
 
 
-def _measures(J: Tensor, vectors: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
-    """The trace of E times the size, and eight numbers (B, C, 8), see `turned_strains`.
-
-    Of J times the cells' volume, and z's last twelve numbers.
-    """
-    J = J / size**3
+def _measures(J: Tensor, z: Tensor, size: Tensor) -> Tensor:
+    """Eight numbers (B, C, 8), see `turned_strains`, of J and the cells' strains."""
     below = J * J + 2.0
     first = 3.0 * J / (below * size) ** 2
     second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**5)
-    q = (vectors**2).sum(dim=-1, keepdim=True) / size**2
+    q = (_shared(z) * z).sum(dim=-1, keepdim=True) / size**2
     c = _rise((J - GONE) / (FADES - GONE), (FADES - GONE) * size**3)
-    e = _rise((FOLDED - q) / (FOLDED - BENT), (BENT - FOLDED) * 0.5 * size**2)
-    return 1.5 * size * (J * J - 1.0) / below, torch.cat([*c, first, second, *e], dim=-1)
+    e = _rise((HUGE - q) / (HUGE - LARGE), (LARGE - HUGE) * 0.5 * size**2)
+    return torch.cat([*c, first, second, *e], dim=-1)
+
+
+def _shared(z: Tensor) -> Tensor:
+    """Z's numbers times `SHARES`."""
+    return torch.cat([SHARES[0] * z[..., :6], z[..., 6:]], dim=-1)
 
 
 def _trace(A: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from pdcorrect.fem import turned_strains
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.cube_symmetry import PATTERNS
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
+from pdcorrect.fem.turned_strains import SHARES
 
 Array = NDArray[np.float64]
 
@@ -113,9 +114,13 @@ class CellCorrection:
     def whole(self, u: Array) -> NDArray[np.bool_]:
         """Cells (C,) whose strains do not fade, see `turned_strains`."""
         v = self.shapes @ u[self.cells] / self.sizes[:, None, None]
+        s = np.linalg.svd(np.eye(3) + v[:, :3], compute_uv=False)
         J = np.linalg.det(np.eye(3) + v[:, :3])
-        bent = np.square(v[:, 3:]).sum(axis=(1, 2))
-        return np.asarray((J >= turned_strains.FADES) & (bent <= turned_strains.BENT))
+        volume = 1.5 * (J**2 - 1.0) / (J**2 + 2.0)
+        E = s - s.mean(axis=1, keepdims=True) + volume[:, None] / 3.0
+        squares = np.square(E).sum(axis=1), np.square(v[:, 3:]).sum(axis=(1, 2))
+        q = SHARES[0] * squares[0] + SHARES[-1] * squares[1]
+        return np.asarray((J >= turned_strains.FADES) & (q <= turned_strains.LARGE))
 
     def scaled(self, factor: float | Array) -> CellCorrection:
         """A multiple of the matrices, or one of each, (C,)."""
