@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.compare import cases_with
+from pdcorrect.evaluation.comparison_cases import cases_with
 from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]
@@ -94,8 +94,7 @@ def save_silent(published, folder):
     save_model(samples.fitted(published, settings(), silent=True), folder, record=record)
 
 
-@pytest.mark.parametrize("resident", [False, True])
-def test_single_steps_are_shown_the_masses_that_rollouts_have(published, resident):
+def test_single_steps_are_shown_the_masses_that_rollouts_have(published):
     """What the network sees of a stored step is what it sees when the scene is stepped."""
     import torch
 
@@ -103,7 +102,7 @@ def test_single_steps_are_shown_the_masses_that_rollouts_have(published, residen
     from pdcorrect.corrector.bodies import BodyGraph
     from pdcorrect.training.recordings import make_problems
 
-    windows, recordings = samples.windows(published, settings(), resident=resident)
+    windows, recordings = samples.windows(published, settings())
     problems = make_problems(recordings, "total-mass")
     for problem, recording in zip(problems, recordings, strict=True):
         assert problem.mass.sum() == pytest.approx(recording.total_mass, rel=1e-12)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
@@ -14,7 +13,7 @@ from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureVi
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.errors import InputError
-from pdcorrect.training.windows import StepBatch, StepWindows
+from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 
 _AT_ONCE = 32
 """Windows."""
@@ -37,14 +36,13 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
         Windows; if there are more, so many are drawn without replacement by ``seed``.  The same
         limit holds for first steps.
     """
-    every = np.arange(len(windows.dataset))
-    chosen = _chosen(every, most, seed)
+    chosen = _chosen(np.arange(len(windows.dataset)), most, seed)
     corrector.normaliser.fit(*_moments(corrector, windows, chosen))
     corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
     shapes, steps = _at_rest(windows)
     corrector.normaliser.fit_shapes(shapes)
     corrector.normaliser.fit_time_steps(steps)
-    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
+    _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
 
 @torch.no_grad()
@@ -54,15 +52,14 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
-    every = np.arange(len(windows.dataset))
     shapes, steps = _at_rest(windows)
     corrector.normaliser.widen_shapes(shapes)
     corrector.normaliser.widen_time_steps(steps)
-    _widen(corrector, windows, _chosen(every, most, seed))
-    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
+    _widen(corrector, windows, _chosen(np.arange(len(windows.dataset)), most, seed))
+    _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
 
-def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> None:
+def check_time_steps(corrector: Corrector, windows: StepWindows) -> None:
     """Refuse data whose time step a default gate refuses, by the ranges of a corrector that stay.
 
     Raises
@@ -79,36 +76,26 @@ def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> N
         for each in (steps.exp().tolist(), corrector.normaliser.time_steps)
     )
     raise InputError(
-        f"{what} with fitting.widen = false: the data's time step over the cell size is {here} "
-        f"s/m, that of the ranges that stay {there} s/m, so a gate would refuse every step of "
-        "bodies that are learned: expected data of that time step, widen = true, or anew = true."
+        f"fitting.widen = false: the data's time step over the cell size is {here} s/m, that of "
+        f"the ranges that stay {there} s/m, so a gate would refuse every step: expected data of "
+        "that time step, or widen = true."
     )
 
 
-def _widen(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
-) -> None:
+def _widen(corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True) -> None:
     corrector.normaliser.widen(_moments(corrector, windows, chosen, last)[0])
     corrector.normaliser.widen_averages(_averages(corrector, windows, chosen, last))
 
 
-def _beginnings(windows: StepWindows) -> NDArray[np.int64]:
-    """Numbers of the windows with which simulations begin."""
-    every = np.arange(len(windows.dataset))
-    _, _, steps = windows.dataset.places(every)
-    return every[steps == 0]
-
-
-def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
+def _chosen(numbers: Numbers, most: int, seed: int) -> Numbers:
     """At most so many of some windows."""
     if len(numbers) > most:
         numbers = np.random.default_rng((seed, 1)).choice(numbers, most, replace=False)
-    found: list[int] = np.sort(numbers).tolist()
-    return found
+    return np.sort(numbers)
 
 
 def _moments(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+    corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True
 ) -> tuple[dict[str, RunningMoments], RunningMoments]:
     """Of features by name, and of targets (m, 1)."""
     config = corrector.config
@@ -126,7 +113,7 @@ def _moments(
 
 
 def _averages(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+    corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True
 ) -> RunningMoments:
     """Of bodies' mean inputs (m, a), for which the normalisation has to be there."""
     averages = RunningMoments()
@@ -138,14 +125,13 @@ def _averages(
 
 def _at_rest(windows: StepWindows) -> tuple[RunningMoments, RunningMoments]:
     """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
-    meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
     shapes, steps = RunningMoments(), RunningMoments()
-    for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
+    for batch in _batches(windows, windows.of_each_file(), last=False):
         shapes.add(batch.bodies.shapes)
         steps.add(batch.bodies.time_steps[:, None])
     return shapes, steps
 
 
-def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:
+def _batches(windows: StepWindows, chosen: Numbers, last: bool) -> Iterator[StepBatch]:
     for first in range(0, len(chosen), _AT_ONCE):
         yield windows.batch(chosen[first : first + _AT_ONCE], last=last)
