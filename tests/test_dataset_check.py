@@ -17,7 +17,7 @@ from pdcorrect.data.check_file import same_scene
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import Run, write_shard
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.shard_reader import read_header, read_shard
 from pdcorrect.errors import InputError
 
 FIRST = "training/mesh-0000.h5"
@@ -347,7 +347,7 @@ def test_files_of_different_code_or_devices_are_pointed_out(dataset, what, value
 
 def test_a_content_other_than_the_manifest_has_is_found(dataset):
     names = [plan.name for plan in make_plan(sample_config())]
-    hashes = {name: stored_hashes(dataset / f"{name}.h5")[1] for name in names}
+    hashes = {name: read_header(dataset / f"{name}.h5").content_hash for name in names}
     content = manifest_content(sample_config(), hashes)
     (dataset / "manifest.json").write_text(json.dumps(content))
     assert findings(dataset) == []

@@ -21,7 +21,7 @@ from pdcorrect.data.reader import (  # noqa: E402
     TrajectoryDataset,
     TrajectoryLoader,
 )
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
 
@@ -132,9 +132,8 @@ def test_numbers_come_in_the_type_asked_for_and_are_stored_in_the_files_own(fold
     }
     assert found.edge_index.dtype == found.cells.dtype == torch.int64
     samples.write(tmp_path, [samples.shard()], "float32")
-    _, motions = read_arrays(tmp_path / "training" / "mesh-0000.h5", ("plain",))
-    assert motions[0].positions.dtype == motions[0].predictions["plain"].dtype == np.float32
-    assert motions[0].velocities.dtype == np.float64
+    runs = read_shard(tmp_path / "training" / "mesh-0000.h5").simulations[0].runs
+    assert runs["reference"].positions.dtype == runs["plain"].predictions.dtype == np.float32
 
 
 def test_what_is_not_there_is_named(folder, tmp_path):
@@ -144,7 +143,6 @@ def test_what_is_not_there_is_named(folder, tmp_path):
         ({"runs": ["fine"]}, "'fine'"),
         ({"window": 0}, "window = 0"),
         ({"window": 2.5}, r"window = 2\.5"),
-        ({"runs": "best"}, "runs = 'best'"),
     ):
         with pytest.raises(InputError, match=words):
             opened(folder, **options)

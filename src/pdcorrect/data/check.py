@@ -25,7 +25,7 @@ from pdcorrect.data.schema import (
     Shard,
     Simulation,
 )
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.shard_reader import read_header, read_shard
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
@@ -193,7 +193,7 @@ class _Check:
         """Whether the first file that can be read says that other solvers made the data."""
         for path in all_shards(self.folder):
             try:
-                return not stored_hashes(path)[0]
+                return not read_header(path).config_hash
             except InputError:
                 continue
         return False
@@ -279,7 +279,7 @@ class _Check:
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
         name = self._short(path).removesuffix(SUFFIX)
-        if self.hashes is not None and self.hashes.get(name) != stored_hashes(path)[1]:
+        if self.hashes is not None and self.hashes.get(name) != shard.content_hash:
             yield f"its content is not that of which {MANIFEST} has the hash"
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"

@@ -18,8 +18,7 @@ from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.shard_arrays import read_header
-from pdcorrect.data.shard_reader import stored_hashes
+from pdcorrect.data.shard_reader import read_header
 from pdcorrect.data.simulate import lacking, work_per_node
 from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, shard_path
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
@@ -172,17 +171,16 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     if not path.exists():
         return None
     try:
-        config_hash, content_hash = stored_hashes(path)
-        header = read_header(path)
+        header = read_header(path, verify=True)
     except FileVersionError:
         raise
     except FileFormatError:
         return None
-    if config_hash != config.hash():
+    if header.config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
     if any(lacking(config, plan, number, *has) for number, has in enumerate(header.runs)):
         return None
-    return content_hash
+    return header.content_hash
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:

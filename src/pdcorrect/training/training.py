@@ -103,7 +103,14 @@ class Training:
                 check_whole(folder, (TRAINING, VALIDATION))
         splits, without = _common_splits(data), config.without
         _check_left_out(without, data)
-        digest = data_hash(data, splits, without)
+        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
+        self._recordings = load_recordings(
+            data, TRAINING, config.base, scenes=unrolled, without=without
+        )
+        validated: list[Recording] = []
+        if VALIDATION in splits:
+            validated = load_recordings(data, VALIDATION, config.base, without=without)
+        digest = data_hash([*self._recordings, *validated])
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
@@ -114,10 +121,6 @@ class Training:
         if self._teachers:
             self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
-        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
-        self._recordings = load_recordings(
-            data, TRAINING, config.base, scenes=unrolled, without=without
-        )
         if len(data) > 1:
             _check_alike(self._recordings)
         self._lineage = lineage_of(config, start, self._recordings)
@@ -133,10 +136,10 @@ class Training:
         self._averaged = copy.deepcopy(self.corrector)
         self._best: dict[str, Tensor] = {}
         self._validation: Validation | None = None
-        if VALIDATION in splits:
+        if validated:
             self._validation = Validation(
-                load_recordings(data, VALIDATION, config.base, without=without), config.base,
-                velocity=config.velocity, device=self.device, world=self.world,
+                validated, config.base, velocity=config.velocity, device=self.device,
+                world=self.world,
             )  # fmt: skip
         self.progress = Progress()
         self._waiting: tuple[dict[str, Any], dict[str, Tensor]] | None = None
