@@ -134,7 +134,6 @@ def test_a_manifest_of_something_else_is_found(tmp_path, key):
     manifest.write_text(json.dumps({**json.loads(before), key: "other"}))
     (finding,) = check_dataset(folder, repeat=0)
     assert finding.path == manifest
-    assert key in finding.message
     if key == "content_hash":
         with pytest.raises(ValueError, match="repeat = -1"):
             check_dataset(folder, repeat=-1)

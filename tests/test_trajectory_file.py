@@ -465,7 +465,6 @@ def replace(file, name, data):
         (lambda f: f.attrs.__setitem__("format_version", 2), "version 2"),
         (lambda f: f.__delitem__("velocities"), "'velocities'"),
         (lambda f: f.__delitem__("mesh"), "'mesh/points'"),
-        (lambda f: f.__delitem__("stats"), "'stats'"),
         (lambda f: replace(f, "times", f["times"][:][:, None]), "'times'"),
         (lambda f: replace(f, "times", f["times"][:].astype(int)), "'times'"),
         (lambda f: replace(f, "times", f["times"][:][::-1]), "times"),

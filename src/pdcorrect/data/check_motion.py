@@ -17,7 +17,7 @@ from pdcorrect.data.engines import MOST_ITERATIONS, step_forces
 from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.schema import REFERENCE, STATISTICS, Array, Shard, Simulation
-from pdcorrect.data.simulate import FORCE_ERROR, models, rebuilt_problems
+from pdcorrect.data.simulate import models, rebuilt_problems
 from pdcorrect.errors import InputError
 from pdcorrect.fem.hexahedron import shape_derivatives
 from pdcorrect.fem.problem import BASES, Problem
@@ -25,8 +25,6 @@ from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State
 
 _CENTRE = np.full((1, 3), 0.5)
-_LOADS_COMPARED = 8
-"""Steps of each simulation, the first and the last among them."""
 _STEP_ERROR = 10.0
 """Largest distance from a step that is taken again, in tolerances of the data set."""
 _ROUNDINGS = 16.0
@@ -81,17 +79,6 @@ def model_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterato
                     )
             for key in sorted(STATISTICS.keys() - run.statistics.keys()):
                 yield f"simulation {k:04d}: {name}: no {key}: expected those of its steps"
-
-
-def load_faults(problem: Problem, shard: Shard, simulation: Simulation) -> Iterator[str]:
-    """Forces that are not those of the loads of a problem, which is the simulation's own."""
-    h = float(shard.attributes["time_step"])
-    steps = np.unique(np.linspace(0, simulation.steps - 1, _LOADS_COMPARED).astype(int))
-    wanted = np.stack([problem.external_forces(k * h, (k + 1) * h) for k in steps])
-    away = np.abs(wanted - simulation.forces[steps]).max(axis=(1, 2))
-    wrong = steps[away > FORCE_ERROR * np.abs(wanted).max()]
-    if len(wrong):
-        yield f"its forces in step {wrong[0] + 1} are not what config.toml draws"
 
 
 def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:

@@ -117,21 +117,6 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
     return tuple(tuple(levels[count]) for count in sorted(levels))
 
 
-def count_bodies(family: FamilyName, nodes: tuple[int, int]) -> int:
-    """Different bodies, by `Design.key`, that a family has in a range of nodes."""
-    return sum(_places(family, size) for level in node_levels(family, nodes) for size in level)
-
-
-def _places(family: FamilyName, size: Size) -> int:
-    """Different bodies of one size: places of the branches, or of the pendulum and its weight."""
-    if family == "beam":
-        return 1
-    if family == "cross":
-        return size[0] - 3
-    support, _, pendulum, _, high = size
-    return (support - 2) // 2 * (pendulum - high)
-
-
 def _beam_sizes() -> Iterator[Size]:
     """Length."""
     return ((length,) for length in range(4, 57))

@@ -13,16 +13,11 @@ from numpy.typing import NDArray
 from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
 from pdcorrect.data.samples import (
     DecodedShard,
-    GraphSizes,
     MeshSample,
-    PackedBatch,
     WindowPlace,
     batch_of,
     decode,
     decoded_bytes,
-    graph_sizes,
-    joined_along,
-    joined_fields,
     window_numbers,
 )
 from pdcorrect.data.schema import REFERENCE
@@ -32,7 +27,6 @@ from pdcorrect.errors import InputError, require_extra
 require_extra("torch_geometric", "learn")
 
 import torch  # noqa: E402
-from torch import Tensor  # noqa: E402
 from torch.utils.data import BatchSampler, DataLoader, Sampler, SequentialSampler  # noqa: E402
 from torch_geometric.data import Batch, Dataset  # noqa: E402
 
@@ -287,21 +281,9 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def batch(self, indices: Sequence[int] | NDArray[np.int64]) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
-        parts, sizes = self._collect(indices)
-        values = {name: torch.cat(found, joined_along(name)) for name, found in parts.items()}
-        return batch_of(values, sizes)
-
-    def packed(self, indices: Sequence[int]) -> PackedBatch:
-        """The same for another process."""
-        return PackedBatch.join(*self._collect(indices))
-
-    def _collect(
-        self, indices: Sequence[int] | NDArray[np.int64]
-    ) -> tuple[dict[str, list[Tensor]], GraphSizes]:
         chosen = self.indices()
         places = [self._place(chosen[int(i)]) for i in indices]
-        sizes = graph_sizes(places)
-        return joined_fields(places, sizes, self.window, self.dtype), sizes
+        return batch_of(places, self.window, self.dtype)
 
     def places(
         self, indices: Sequence[int] | NDArray[np.int64]
@@ -443,7 +425,7 @@ class TrajectoryLoader(DataLoader[Any]):
         order = SequentialSampler(dataset) if sampler is None else sampler
         self._position = 0 if sampler is None else sampler.position
         super().__init__(
-            _Batches(dataset, assemble or dataset.batch),
+            _Batches(assemble or dataset.batch),
             batch_size=None,
             sampler=BatchSampler(order, batch_size, drop_last),
             collate_fn=_unchanged,
@@ -453,8 +435,7 @@ class TrajectoryLoader(DataLoader[Any]):
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
         """One epoch, or what is left of it."""
         done = 0 if self.shuffle is None else self.shuffle.start
-        for found in super().__iter__():
-            batch = found.batch() if isinstance(found, PackedBatch) else found
+        for batch in super().__iter__():
             done += batch.num_graphs
             self._position = done
             yield batch
@@ -483,16 +464,13 @@ class TrajectoryLoader(DataLoader[Any]):
 
 
 class _Batches(torch.utils.data.Dataset[Any]):
-    """Lists of indices -> batches, from a worker packed."""
+    """Lists of indices -> batches."""
 
-    def __init__(
-        self, dataset: TrajectoryDataset, assemble: Callable[[Sequence[int]], Any]
-    ) -> None:
-        self.dataset, self.assemble = dataset, assemble
+    def __init__(self, assemble: Callable[[Sequence[int]], Any]) -> None:
+        self.assemble = assemble
 
     def __getitem__(self, indices: list[int]) -> Any:
-        in_worker = torch.utils.data.get_worker_info() is not None
-        return self.dataset.packed(indices) if in_worker else self.assemble(indices)
+        return self.assemble(indices)
 
 
 def _unchanged(batch: Any) -> Any:
