@@ -160,12 +160,7 @@ def test_wrong_arrays_are_refused_with_the_place(changes, words):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["coarse", "predictions"])
-def test_wrong_meshes_and_simulations_of_unlike_runs_are_refused(name):
-    first, second = arguments()["motions"]
-    with pytest.raises(InputError, match=f"simulation 1 .* {name}"):
-        shard_from_arrays(**arguments(motions=[first, replace(second, **{name: None})]))
-
+def test_wrong_meshes_are_refused():
     cells = arguments()["cells"].copy()
     cells[2] = cells[2][[4, 5, 6, 7, 0, 1, 2, 3]]
     with pytest.raises(MeshError, match="cell 2 "):

@@ -11,8 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.check_file import cell_size, file_faults, plan_faults
-from pdcorrect.data.check_motion import step_faults
+from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, step_faults
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
@@ -238,16 +237,10 @@ class _Check:
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
         """Where a file is not what the configuration asks for."""
-        wanted: dict[str, Any] = {"split": path.parent.name, "number": shard_number(path)}
-        plan = self.plans.get(path) if self.plans is not None else None
-        if self.config is not None:
-            wanted |= {name: getattr(self.config, name) for name in ("setting", "tolerance")}
-            wanted["dataset"] = self.config.name
-        if plan is not None:
-            wanted["time_step"] = plan.step
-        for name, value in wanted.items():
+        for name, value in {"split": path.parent.name, "number": shard_number(path)}.items():
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
+        plan = self.plans.get(path) if self.plans is not None else None
         name = self._short(path).removesuffix(SUFFIX)
         if self.hashes is not None and self.hashes.get(name) != shard.content_hash:
             yield f"its content is not that of which {MANIFEST} has the hash"

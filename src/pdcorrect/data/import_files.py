@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -224,14 +223,12 @@ def _scene(name: str, run: Trajectory) -> Scene:
             "the scene's; for others use shard_from_arrays."
         )
     scene = Scene.from_toml(run.scene_toml)
-    integrator = run.attributes.get("integrator", scene.time.integrator)
-    if {integrator, scene.time.integrator} != {INTEGRATOR}:
-        other = scene.time.integrator if integrator == INTEGRATOR else integrator
-        raise InputError(
-            f"{name} has the integrator {other!r}: expected {INTEGRATOR!r}, for the velocities of "
-            "a data set are backward differences of its positions, and its predictions start "
-            "from them."
-        )
+    for found in (scene.time.integrator, run.attributes.get("integrator", INTEGRATOR)):
+        if found != INTEGRATOR:
+            raise InputError(
+                f"{name} has the integrator {found!r}: expected {INTEGRATOR!r}, for the velocities "
+                "of a data set are backward differences of its positions."
+            )
     if run.times[0] != 0 or run.velocities[0].any():
         raise InputError(
             f"{name} starts at {run.times[0]:g} s with velocities up to "
@@ -275,9 +272,5 @@ def _check_same_body(k: int, shard: Shard, first: Shard) -> None:
                 f"simulations 0 and {k} differ in {name}: expected one mesh, material and clamps "
                 "in a file."
             )
-    steps = [float(each.attributes["time_step"]) for each in (first, shard)]
-    if not math.isclose(*steps, rel_tol=1e-6):
-        raise InputError(
-            f"simulations 0 and {k} have steps of {steps[0]:g} and {steps[1]:g} s: expected equal "
-            "ones in a file."
-        )
+    if not np.isclose(shard.attributes["time_step"], first.attributes["time_step"], rtol=1e-6):
+        raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")

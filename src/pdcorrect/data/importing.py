@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities
-from pdcorrect.fem.hexahedron import VTK_CORNERS, gauss_points, jacobians, shortest_edges
+from pdcorrect.fem.hexahedron import gauss_points, jacobians, shortest_edges
 from pdcorrect.fem.mesh import HexMesh
+from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -169,7 +170,9 @@ def shard_from_arrays(
     if mass is not None:
         masses = _array("mass", mass, (nodes,))
     else:
-        masses = _lumped(mesh, moduli["density"]) if model is None else model.problem.mass
+        masses = (
+            lumped(Space(mesh).mass(moduli["density"])) if model is None else model.problem.mass
+        )
     for name, values in {**moduli, "mass": masses, "time_step": np.array(time_step)}.items():
         if name != "poisson" and (values <= 0).any():
             raise InputError(f"{name}: {values.min():g}: expected more than 0.")
@@ -177,7 +180,6 @@ def shard_from_arrays(
     simulations = tuple(
         _simulation(f"simulation {k}", motion, body) for k, motion in enumerate(motions)
     )
-    _check_alike(simulations)
     if scene is not None:
         text = portable(scene).to_toml()
         simulations = tuple(replace(one, scene_toml=text) for one in simulations)
@@ -307,18 +309,6 @@ def _simulation(where: str, motion: ImportedMotion, body: _Body) -> Simulation:
     return Simulation(forces, runs)
 
 
-def _check_alike(simulations: Sequence[Simulation]) -> None:
-    """Refuse simulations of which one has a rollout or predictions and another has not."""
-    for name in ("positions", "predictions"):
-        given = [getattr(one.runs.get(PLAIN), name, None) is not None for one in simulations]
-        if any(given) and not all(given):
-            word = "coarse" if name == "positions" else name
-            raise InputError(
-                f"simulation {given.index(False)} has no {word}, unlike simulation "
-                f"{given.index(True)}: expected {word} of all simulations of a mesh, or of none."
-            )
-
-
 def _in_step(scene: Scene, time_step: float) -> tuple[Scene, float]:
     """A scene and a time step (s) that agree: where they nearly do, by the scene's."""
     check_scene(scene)
@@ -406,14 +396,3 @@ def _loads(problem: Problem, reference: Array, time_step: float) -> Array:
         problem.external_forces(t * time_step, (t + 1) * time_step, reference[t])
         for t in range(len(reference) - 1)
     ])  # fmt: skip
-
-
-def _lumped(mesh: HexMesh, density: Array) -> NDArray[np.float64]:
-    """Density times the integral of each node's shape functions, (N,), kg."""
-    points = gauss_points(2)
-    factors = np.where(VTK_CORNERS == 1, points[:, None], 1 - points[:, None])
-    shapes = factors.prod(axis=-1)  # (8 points, 8 corners)
-    volumes = jacobians(mesh.positions, mesh.cells, points) / len(points)
-    shares = density[:, None] * (volumes @ shapes)
-    masses = np.bincount(mesh.cells.ravel(), shares.ravel(), minlength=len(mesh.positions))
-    return np.asarray(masses, dtype=np.float64)

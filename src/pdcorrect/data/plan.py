@@ -8,7 +8,7 @@ generated alone, in any order.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -162,10 +162,7 @@ def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
     """The same with the last ``share`` of the training meshes as validation split."""
     count = round(share * len(meshes))
     kept = len(meshes) - count
-    moved = [
-        MeshPlan(**{**vars(mesh), "split": VALIDATION, "number": i})
-        for i, mesh in enumerate(meshes[kept:])
-    ]
+    moved = [replace(mesh, split=VALIDATION, number=i) for i, mesh in enumerate(meshes[kept:])]
     return meshes[:kept] + moved
 
 

@@ -298,9 +298,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
-        for idx in numbers[(numbers < 0) | (numbers >= self.len())]:
-            raise self._no_window(int(idx))
-        rows = np.searchsorted(self._starts, numbers, side="right") - 1
+        rows = self._row(numbers)
         files, simulations = self._owners[rows].T
         return files, simulations, numbers - self._starts[rows]
 
@@ -327,9 +325,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         ])  # fmt: skip
 
     def _place(self, idx: int) -> WindowPlace:
-        if not 0 <= idx < self.len():
-            raise self._no_window(idx)
-        row = int(np.searchsorted(self._starts, idx, side="right")) - 1
+        row = self._row(np.int64(idx))
         number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
         return WindowPlace(
@@ -337,8 +333,11 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             idx - int(self._starts[row]),
         )  # fmt: skip
 
-    def _no_window(self, idx: int) -> IndexError:
-        return IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
+    def _row(self, numbers: Any) -> Any:
+        """Rows of `_owners` of some windows."""
+        if np.size(numbers) and not 0 <= np.min(numbers) <= np.max(numbers) < self.len():
+            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
+        return np.searchsorted(self._starts, numbers, side="right") - 1
 
     def _load(self, number: int) -> DecodedShard:
         wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))

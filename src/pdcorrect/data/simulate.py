@@ -305,15 +305,13 @@ def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Ste
     """One run of some drafts; each by the engine that its mesh needs."""
     jobs = [draft.job(name) for draft in drafts]
     model, frames = drafts[0].meshed.models[name], drafts[0].meshed.plan.frames
-    by_engine: dict[int, list[int]] = {}
-    for i, job in enumerate(jobs):
-        by_engine.setdefault(id(engines.of(model, job.problem)), []).append(i)
-    out: dict[int, Steps] = {}
-    for chosen in by_engine.values():
-        engine = engines.of(model, jobs[chosen[0]].problem)
-        found = engine.rollouts([jobs[i] for i in chosen], frames, model.divisor)
-        out |= dict(zip(chosen, found, strict=True))
-    return [out[i] for i in range(len(jobs))]
+    chosen = [engines.of(model, job.problem) for job in jobs]
+    found: dict[int, Steps] = {}
+    for engine in {id(each): each for each in chosen}.values():
+        own = [i for i, each in enumerate(chosen) if each is engine]
+        steps = engine.rollouts([jobs[i] for i in own], frames, model.divisor)
+        found |= dict(zip(own, steps, strict=True))
+    return [found[i] for i in range(len(jobs))]
 
 
 def _states(reference: Steps, meshed: _Meshed) -> list[State]:

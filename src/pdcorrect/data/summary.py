@@ -162,17 +162,17 @@ def dataset_info(
         If one of them is damaged; with ``skip_damaged`` if all are.
     """
 
-    def read(path: Path) -> _Mesh:
-        shard = read_shard(path)
+    def read(path: Path) -> _Numbers:
+        found = _of_mesh(read_shard(path), path.stat().st_size)
         if on_file:
             on_file(path)
-        return _Mesh.of(shard, path.stat().st_size)
+        return found
 
     damaged: Damage = {}
     meshes = read_files(dataset_files(folder), read, damaged if skip_damaged else None)
     splits = {
-        name: _summary([mesh for mesh in meshes if mesh.split == name])
-        for name in dict.fromkeys(mesh.split for mesh in meshes)
+        name: _summary([mesh for mesh in meshes if mesh["split"] == name])
+        for name in dict.fromkeys(mesh["split"] for mesh in meshes)
     }
     left_out = {f"{p.parent.name}/{p.name}": text for p, text in damaged.items()}
     return DatasetInfo(Path(folder).resolve().name, _summary(meshes), splits, left_out)
@@ -180,61 +180,45 @@ def dataset_info(
 
 # --- one file ----------------------------------------------------------------------------
 
-_OF_MESHES = ("young", "poisson", "density")
+_Numbers = dict[str, Any]
+"""Of a file, a simulation or a run, by the names in `SplitInfo` and `RunInfo`."""
 _OF_MOTIONS = ("displacement", "speed", "force")
 
 
-@dataclass(frozen=True)
-class _Mesh:
-    """The numbers of a file, without its arrays."""
-
-    split: str
-    bytes: int
-    ranges: Mapping[str, Range]
-    simulations: Sequence[_Motion]
-
-    @classmethod
-    def of(cls, shard: Shard, size: int) -> _Mesh:
-        ranges = {name: _range(getattr(shard, name)) for name in _OF_MESHES}
-        ranges |= {"nodes": _range(len(shard.points)), "cells": _range(len(shard.cells))}
-        step = float(shard.attributes["time_step"])
-        motions = [_Motion.of(simulation, step) for simulation in shard.simulations]
-        return cls(str(shard.attributes["split"]), size, ranges, motions)
+def _of_mesh(shard: Shard, size: int) -> _Numbers:
+    step = float(shard.attributes["time_step"])
+    return {
+        "split": str(shard.attributes["split"]),
+        "bytes": size,
+        "simulations": [_of_simulation(simulation, step) for simulation in shard.simulations],
+        "ranges": {
+            "nodes": _range(len(shard.points)), "cells": _range(len(shard.cells)),
+            "young": _range(shard.young), "poisson": _range(shard.poisson),
+            "density": _range(shard.density),
+        },
+    }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Motion:
-    """The numbers of a simulation, and by run those of `RunInfo`."""
-
-    frames: int
-    rejected: tuple[str, ...]
-    largest: Mapping[str, float]
-    runs: Mapping[str, Mapping[str, float]]
-    seconds: Mapping[str, float]
-
-    @classmethod
-    def of(cls, simulation: Simulation, step: float) -> _Motion:
-        run = simulation.runs.get(REFERENCE)
-        if run is None or run.positions is None:
-            raise InputError(f"a simulation has no rollout {REFERENCE!r}: expected one of each.")
-        reference = run.positions.astype(np.float64)
-        speeds = np.linalg.norm(np.diff(reference, axis=0), axis=2) / step
-        forces = np.linalg.norm(simulation.forces.astype(np.float64), axis=2)
-        return cls(
-            simulation.steps,
-            simulation.rejected,
-            {
-                "displacement": largest_displacement(reference),
-                "speed": float(speeds.max()),
-                "force": float(forces.max()),
-            },
-            {name: _measured(simulation, name, reference) for name in simulation.runs},
-            simulation.seconds,
-        )
+def _of_simulation(simulation: Simulation, step: float) -> _Numbers:
+    run = simulation.runs.get(REFERENCE)
+    if run is None or run.positions is None:
+        raise InputError(f"a simulation has no rollout {REFERENCE!r}: expected one of each.")
+    reference = run.positions.astype(np.float64)
+    speeds = np.linalg.norm(np.diff(reference, axis=0), axis=2) / step
+    return {
+        "frames": simulation.steps,
+        "rejected": simulation.rejected,
+        "seconds": simulation.seconds,
+        "displacement": largest_displacement(reference),
+        "speed": speeds.max(),
+        "force": np.linalg.norm(simulation.forces.astype(np.float64), axis=2).max(),
+        "runs": {name: _of_run(simulation, name, reference) for name in simulation.runs},
+    }
 
 
-def _measured(simulation: Simulation, name: str, reference: Any) -> dict[str, float]:
-    run, found = simulation.runs[name], {}
+def _of_run(simulation: Simulation, name: str, reference: Any) -> _Numbers:
+    run = simulation.runs[name]
+    found: _Numbers = {}
     if "iterations" in run.statistics:
         found["iterations"] = float(run.statistics["iterations"].mean())
     if name == REFERENCE:
@@ -256,24 +240,24 @@ def _measured(simulation: Simulation, name: str, reference: Any) -> dict[str, fl
 # --- summing up --------------------------------------------------------------------------
 
 
-def _summary(meshes: Sequence[_Mesh]) -> SplitInfo:
-    motions = [motion for mesh in meshes for motion in mesh.simulations]
+def _summary(meshes: Sequence[_Numbers]) -> SplitInfo:
+    motions = [motion for mesh in meshes for motion in mesh["simulations"]]
     names = sorted(
-        {name for motion in motions for name in motion.runs},
+        {name for motion in motions for name in motion["runs"]},
         key=lambda name: (name != REFERENCE, name != PLAIN, name),
     )
-    rejections = Counter(re.sub(r"step \d+: ", "", text) for m in motions for text in m.rejected)
+    reasons = [re.sub(r"step \d+: ", "", text) for m in motions for text in m["rejected"]]
     return SplitInfo(
         meshes=len(meshes),
         simulations=len(motions),
-        frames=sum(motion.frames for motion in motions),
-        bytes=sum(mesh.bytes for mesh in meshes),
-        **{name: _range([m.ranges[name] for m in meshes]) for name in meshes[0].ranges},
-        **{name: _range([motion.largest[name] for motion in motions]) for name in _OF_MOTIONS},
-        rejection_rate=rejections.total() / (rejections.total() + len(motions)),
+        frames=sum(motion["frames"] for motion in motions),
+        bytes=sum(mesh["bytes"] for mesh in meshes),
+        **{n: _range([mesh["ranges"][n] for mesh in meshes]) for n in meshes[0]["ranges"]},
+        **{n: _range([motion[n] for motion in motions]) for n in _OF_MOTIONS},
+        rejection_rate=len(reasons) / (len(reasons) + len(motions)),
         runs={name: _run_info(name, motions) for name in names},
-        seconds=sum(sum(motion.seconds.values()) for motion in motions),
-        rejections=dict(sorted(rejections.items())),
+        seconds=sum(sum(motion["seconds"].values()) for motion in motions),
+        rejections=dict(sorted(Counter(reasons).items())),
     )
 
 
@@ -281,14 +265,14 @@ def _range(values: Any) -> Range:
     return float(np.min(values)), float(np.max(values))
 
 
-def _run_info(name: str, motions: Sequence[_Motion]) -> RunInfo:
-    runs = [motion.runs[name] for motion in motions if name in motion.runs]
+def _run_info(name: str, motions: Sequence[_Numbers]) -> RunInfo:
+    runs = [motion["runs"][name] for motion in motions if name in motion["runs"]]
 
     def mean(what: str) -> float | None:
         values = [run[what] for run in runs if what in run]
         return float(np.mean(values)) if values else None
 
-    costs = [motion.seconds.get(key, 0.0) for motion in motions for key in (name, f"{name} steps")]
+    keys = (name, f"{name} steps")
     return RunInfo(
         simulations=len(runs),
         iterations=mean("iterations"),
@@ -297,7 +281,7 @@ def _run_info(name: str, motions: Sequence[_Motion]) -> RunInfo:
         step_error=mean("step_error"),
         omega=mean("omega"),
         worst_omega=min((run["omega"] for run in runs if "omega" in run), default=None),
-        seconds=sum(costs),
+        seconds=sum(motion["seconds"].get(key, 0.0) for motion in motions for key in keys),
     )
 
 

@@ -195,9 +195,12 @@ def evaluate(
     if workers < 1:
         raise InputError(f"workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
-    if not incomplete:
+    missing: tuple[Path, ...] = ()
+    if incomplete:
+        with contextlib.suppress(InputError):  # of a configuration that cannot be used
+            missing = tuple(missing_files(folder, split))
+    else:
         check_whole(folder, [split])
-    missing = tuple(missing_files(folder, split))
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
     stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
     names = [candidate.name for candidate in candidates]

@@ -23,8 +23,6 @@ VERSION = 1
 RESERVED = frozenset({"format", "format_version", "scene_toml", "pdcorrect_version"})
 """Attributes of the file that are not the run's."""
 
-_FRAMES = {"positions": 3, "velocities": 3, "times": 1}  # and their dimensions
-
 
 def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
     """Read a trajectory file, finished or not.
@@ -60,10 +58,9 @@ def read_storage(path: Path) -> Storage:
     """What rewriting a trajectory file has to keep; raises as `load_trajectory`."""
     with _opened(path) as (file, _):
         _check_format(file)
-        positions = _dataset(file, "positions", "f", 3)
         known = "pdcorrect_version" in file.attrs
         version = _attribute(file, "pdcorrect_version") if known else "of an unknown version"
-        return Storage(positions.compression is not None, version)
+        return Storage(file["positions"].compression is not None, version)
 
 
 @contextlib.contextmanager
@@ -144,15 +141,11 @@ def _stats_fault(trajectory: Trajectory, steps: int) -> str | None:
 
 def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     _check_format(file)
-    datasets = {name: _dataset(file, name, "f", ndim) for name, ndim in _FRAMES.items()}
     remembered = list(file["memory"]) if "memory" in file else []
-    datasets |= {f"memory/{n}": _dataset(file, f"memory/{n}", "f", 3) for n in remembered}
-    points = _dataset(file, "mesh/points", "f", 2)[...]
-    cells = _dataset(file, "mesh/cells", "iu", 2)[...]
-    names = list(file["stats"]) if "stats" in file else []
-    stats = {n: _dataset(file, f"stats/{n}", "S" if n == "status" else "fi", 1) for n in names}
+    names = ("positions", "velocities", "times", *(f"memory/{name}" for name in remembered))
+    datasets = {name: file[name] for name in names}
+    stats = dict(file["stats"].items()) if "stats" in file else {}
     frames = datasets["times"].shape[0]
-    _check_lengths(datasets, stats, frames)
     if salvage or block.truncated or block.in_writing:
         intact = _intact_frames([*datasets.values()], [*stats.values()], frames, block.size)
         if not salvage and block.truncated and (intact < frames or not block.in_writing):
@@ -176,8 +169,8 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
         velocities=arrays["velocities"],
         times=arrays["times"],
         stats={name: _text(v) if v.dtype.kind == "S" else v for name, v in values.items()},
-        points=points,
-        cells=cells.astype(np.int64, copy=False),
+        points=file["mesh/points"][...],
+        cells=file["mesh/cells"][...].astype(np.int64, copy=False),
         scene_toml=_attribute(file, "scene_toml"),
         attributes={name: _attribute(file, name) for name in file.attrs if name not in RESERVED},
         memory={
@@ -207,31 +200,10 @@ def _attribute(file: Any, name: str) -> str:
     return value.decode("utf-8") if isinstance(value, bytes) else str(value)
 
 
-def _dataset(file: Any, name: str, kinds: str, ndim: int) -> Any:
-    if name not in file or not isinstance(file[name], h5py.Dataset):
-        raise FileFormatError(f"the dataset {name!r} is missing")
-    dataset = file[name]
-    if dataset.dtype.kind not in kinds or dataset.ndim != ndim:
-        raise FileFormatError(
-            f"{name!r} has {dataset.dtype} of shape {dataset.shape}: expected kind {kinds!r} "
-            f"with {ndim} dimensions"
-        )
-    return dataset
-
-
 def _written(times: Any) -> int:
     """Number of frames that were complete: a time that was not written yet is NaN."""
     written = np.flatnonzero(~np.isnan(times))
     return int(written[-1]) + 1 if len(written) else 0
-
-
-def _check_lengths(datasets: dict[str, Any], stats: dict[str, Any], frames: int) -> None:
-    """Nothing may be shorter than ``times`` says; an interrupted writer leaves more."""
-    expected = {name: (dataset, frames) for name, dataset in datasets.items()}
-    expected |= {f"stats/{name}": (dataset, max(0, frames - 1)) for name, dataset in stats.items()}
-    for name, (dataset, length) in expected.items():
-        if dataset.shape[0] < length:
-            raise FileFormatError(f"{name!r} has {dataset.shape[0]} entries, expected {length}")
 
 
 def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int, size: int) -> int:
