@@ -125,11 +125,7 @@ def import_trajectories(
             raise InputError(
                 f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
             )
-        if best:
-            raise InputError(
-                f"{files[0]}: has no scene: the best coarse model is computed of trajectories only."
-            )
-        shard = _shard_of_npz(files[0], name, split, number)
+        shard = _shard_of_npz(files[0], name, split, number, best)
     else:
         runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
         shard = shard_from_trajectories(
@@ -145,7 +141,7 @@ _BODY = ("body", "material", "materials", "clamps", "loads", "damping")
 """Sections of a scene in which a reference and its coarse run must agree."""
 
 
-def _shard_of_npz(path: Path, dataset: str, split: str, number: int) -> Shard:
+def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool) -> Shard:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -166,8 +162,9 @@ def _shard_of_npz(path: Path, dataset: str, split: str, number: int) -> Shard:
         )
     try:
         return shard_from_arrays(
-            motions=motions, mass=mass, dataset=dataset, split=split, number=number, **arrays
-        )
+            motions=motions, mass=mass, dataset=dataset, split=split, number=number, best=best,
+            **arrays,
+        )  # fmt: skip
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
 

@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
 from pdcorrect.data.samples import (
     DecodedShard,
+    GraphSizes,
     MeshSample,
+    PackedBatch,
     WindowPlace,
     batch_of,
     decode,
     decoded_bytes,
+    graph_sizes,
+    joined_along,
+    joined_fields,
     window_numbers,
 )
 from pdcorrect.data.schema import REFERENCE
@@ -27,6 +32,7 @@ from pdcorrect.errors import InputError, require_extra
 require_extra("torch_geometric", "learn")
 
 import torch  # noqa: E402
+from torch import Tensor  # noqa: E402
 from torch.utils.data import BatchSampler, DataLoader, Sampler, SequentialSampler  # noqa: E402
 from torch_geometric.data import Batch, Dataset  # noqa: E402
 
@@ -59,7 +65,7 @@ class ShardShuffle(Sampler[int]):
     Raises
     ------
     InputError
-        If a number is out of range, or there are fewer windows than ranks.
+        If there is no such rank, or there are fewer windows than ranks.
     """
 
     def __init__(
@@ -71,12 +77,8 @@ class ShardShuffle(Sampler[int]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        if seed < 0:
-            raise InputError(f"seed = {seed}: expected 0 or more.")
         if not 0 <= rank < world_size:
             raise InputError(f"rank = {rank} of {world_size}: expected 0 to {world_size - 1}.")
-        if block is not None and block < 1:
-            raise InputError(f"block = {block}: expected 1 file or more.")
         self._owners = dataset.shard_numbers()
         if len(self._owners) < world_size:
             raise InputError(f"{len(self._owners)} windows for {world_size} ranks: expected more.")
@@ -281,9 +283,21 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def batch(self, indices: Sequence[int] | NDArray[np.int64]) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
+        parts, sizes = self._collect(indices)
+        values = {name: torch.cat(found, joined_along(name)) for name, found in parts.items()}
+        return batch_of(values, sizes)
+
+    def packed(self, indices: Sequence[int]) -> PackedBatch:
+        """The same for another process."""
+        return PackedBatch.join(*self._collect(indices))
+
+    def _collect(
+        self, indices: Sequence[int] | NDArray[np.int64]
+    ) -> tuple[dict[str, list[Tensor]], GraphSizes]:
         chosen = self.indices()
         places = [self._place(chosen[int(i)]) for i in indices]
-        return batch_of(places, self.window, self.dtype)
+        sizes = graph_sizes(places)
+        return joined_fields(places, sizes, self.window, self.dtype), sizes
 
     def places(
         self, indices: Sequence[int] | NDArray[np.int64]
@@ -298,7 +312,9 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
-        rows = self._row(numbers)
+        if len(numbers) and not 0 <= numbers.min() <= numbers.max() < self.len():
+            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
+        rows = np.searchsorted(self._starts, numbers, side="right") - 1
         files, simulations = self._owners[rows].T
         return files, simulations, numbers - self._starts[rows]
 
@@ -325,19 +341,15 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         ])  # fmt: skip
 
     def _place(self, idx: int) -> WindowPlace:
-        row = self._row(np.int64(idx))
+        if not 0 <= idx < self.len():
+            raise IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
+        row = int(np.searchsorted(self._starts, idx, side="right")) - 1
         number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
         return WindowPlace(
             number, self.headers[number], shard, simulation, shard.motions[simulation],
             idx - int(self._starts[row]),
         )  # fmt: skip
-
-    def _row(self, numbers: Any) -> Any:
-        """Rows of `_owners` of some windows."""
-        if np.size(numbers) and not 0 <= np.min(numbers) <= np.max(numbers) < self.len():
-            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
-        return np.searchsorted(self._starts, numbers, side="right") - 1
 
     def _load(self, number: int) -> DecodedShard:
         wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))
@@ -398,11 +410,6 @@ class TrajectoryLoader(DataLoader[Any]):
     **options
         Of ``torch.utils.data.DataLoader``, such as ``num_workers``, ``persistent_workers``,
         ``multiprocessing_context`` and ``pin_memory``.
-
-    Raises
-    ------
-    InputError
-        If ``shuffle`` is among them: a `ShardShuffle` does that.
     """
 
     def __init__(
@@ -415,16 +422,11 @@ class TrajectoryLoader(DataLoader[Any]):
         assemble: Callable[[Sequence[int]], Any] | None = None,
         **options: Any,
     ) -> None:
-        if options.pop("shuffle", False):
-            raise InputError(
-                "shuffle = True: expected a sampler that reads file by file, such as "
-                "TrajectoryLoader(dataset, batch_size, ShardShuffle(dataset))."
-            )
         self.shuffle, self.windows = sampler, batch_size
         order = SequentialSampler(dataset) if sampler is None else sampler
         self._position = 0 if sampler is None else sampler.position
         super().__init__(
-            _Batches(assemble or dataset.batch),
+            _Batches(dataset, assemble or dataset.batch),
             batch_size=None,
             sampler=BatchSampler(order, batch_size, drop_last),
             collate_fn=_unchanged,
@@ -434,7 +436,8 @@ class TrajectoryLoader(DataLoader[Any]):
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
         """One epoch, or what is left of it."""
         done = 0 if self.shuffle is None else self.shuffle.start
-        for batch in super().__iter__():
+        for found in super().__iter__():
+            batch = found.batch() if isinstance(found, PackedBatch) else found
             done += batch.num_graphs
             self._position = done
             yield batch
@@ -463,13 +466,16 @@ class TrajectoryLoader(DataLoader[Any]):
 
 
 class _Batches(torch.utils.data.Dataset[Any]):
-    """Lists of indices -> batches."""
+    """Lists of indices -> batches, from a worker packed."""
 
-    def __init__(self, assemble: Callable[[Sequence[int]], Any]) -> None:
-        self.assemble = assemble
+    def __init__(
+        self, dataset: TrajectoryDataset, assemble: Callable[[Sequence[int]], Any]
+    ) -> None:
+        self.dataset, self.assemble = dataset, assemble
 
     def __getitem__(self, indices: list[int]) -> Any:
-        return self.assemble(indices)
+        in_worker = torch.utils.data.get_worker_info() is not None
+        return self.dataset.packed(indices) if in_worker else self.assemble(indices)
 
 
 def _unchanged(batch: Any) -> Any:

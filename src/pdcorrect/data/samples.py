@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ _MESH = ("rest", "free", "mass", *_MODULI)
 _CELLS = tuple(f"cell_{name}" for name in _MODULI)
 _GRAPHS = ("file", "mesh", "simulation", "frame", "time", "time_step")
 _INDICES = ("cells", "edge_index")
+_ALIGNMENT = 64
+"""Bytes."""
 
 
 class MeshSample(Data):
@@ -143,24 +146,49 @@ def window_numbers(places: Sequence[WindowPlace], dtype: torch.dtype) -> dict[st
     }  # fmt: skip
 
 
-def batch_of(places: Sequence[WindowPlace], length: int, dtype: torch.dtype) -> Batch:
-    """What ``Batch.from_data_list`` makes of the samples of some windows, at once."""
+class GraphSizes(NamedTuple):
+    """Of each graph of a batch."""
+
+    nodes: list[int]
+    cells: list[int]
+    edges: list[int]
+
+
+def graph_sizes(places: Sequence[WindowPlace]) -> GraphSizes:
+    """Of the graphs of some windows."""
+    return GraphSizes(
+        [len(place.shard.nodal["rest"]) for place in places],
+        [len(place.shard.cells) for place in places],
+        [place.shard.edge_index.shape[1] for place in places],
+    )
+
+
+def joined_fields(
+    places: Sequence[WindowPlace], sizes: GraphSizes, length: int, dtype: torch.dtype
+) -> dict[str, list[Tensor]]:
+    """By field what is to be joined, in the order of `MeshSample`'s fields."""
     shards = [place.shard for place in places]
     windows = [place.motion.window(place.frame, length) for place in places]
-    counts = [len(shard.nodal["rest"]) for shard in shards]
-    nodes = _ends(counts)
-    cells = _ends([len(shard.cells) for shard in shards])
-    edges = _ends([shard.edge_index.shape[1] for shard in shards])
-    graphs, offsets = torch.arange(len(nodes)), nodes[:-1]
-    raised = list(zip(shards, offsets.tolist(), strict=True))
-    fields = {
-        **{name: torch.cat([window[name] for window in windows]) for name in windows[0]},
-        **window_numbers(places, dtype),
-        **{name: torch.cat([shard.nodal[name] for shard in shards]) for name in _MESH},
-        **{name: torch.cat([shard.cellwise[name] for shard in shards]) for name in _CELLS},
-        "cells": torch.cat([shard.cells + first for shard, first in raised]),
-        "edge_index": torch.cat([shard.edge_index + first for shard, first in raised], dim=1),
+    raised = list(zip(shards, _ends(sizes.nodes)[:-1].tolist(), strict=True))
+    return {
+        **{name: [fields[name] for fields in windows] for name in windows[0]},
+        **{name: [values] for name, values in window_numbers(places, dtype).items()},
+        **{name: [shard.nodal[name] for shard in shards] for name in _MESH},
+        **{name: [shard.cellwise[name] for shard in shards] for name in _CELLS},
+        "cells": [shard.cells + first for shard, first in raised],
+        "edge_index": [shard.edge_index + first for shard, first in raised],
     }
+
+
+def joined_along(name: str) -> int:
+    """The dimension in which a field's parts are put side by side."""
+    return 1 if name == "edge_index" else 0
+
+
+def batch_of(values: dict[str, Tensor], sizes: GraphSizes) -> Batch:
+    """What ``Batch.from_data_list`` makes of the joined fields."""
+    nodes, cells, edges = (_ends(each) for each in sizes)
+    graphs, offsets = torch.arange(len(nodes)), nodes[:-1]
     ends = {
         **dict.fromkeys(_GRAPHS, graphs), **dict.fromkeys((*_CELLS, "cells"), cells),
         "edge_index": edges,
@@ -168,14 +196,53 @@ def batch_of(places: Sequence[WindowPlace], length: int, dtype: torch.dtype) -> 
     same = torch.zeros_like(offsets)
     batch = Batch(_base_cls=MeshSample)
     store = batch._store
-    store.update(fields)
-    store._num_nodes, store.num_nodes = counts, sum(counts)
-    store.batch = torch.repeat_interleave(torch.tensor(counts))
+    store.update(values)
+    store._num_nodes, store.num_nodes = sizes.nodes, sum(sizes.nodes)
+    store.batch = torch.from_numpy(np.repeat(np.arange(len(offsets)), sizes.nodes))
     store.ptr = nodes
     batch._num_graphs = len(offsets)
-    batch._slice_dict = {name: ends.get(name, nodes) for name in fields}
-    batch._inc_dict = {name: offsets if name in _INDICES else same for name in fields}
+    batch._slice_dict = {name: ends.get(name, nodes) for name in values}
+    batch._inc_dict = {name: offsets if name in _INDICES else same for name in values}
     return batch
+
+
+@dataclass(frozen=True)
+class PackedBatch:
+    """A batch in one piece of shared memory, which passes between processes quickly."""
+
+    memory: Tensor
+    layout: dict[str, tuple[int, int, torch.dtype, list[int]]]
+    sizes: GraphSizes
+
+    @classmethod
+    def join(cls, parts: dict[str, list[Tensor]], sizes: GraphSizes) -> PackedBatch:
+        """Join the parts of each field, side by side."""
+        layout, end = {}, 0
+        for name, tensors in parts.items():
+            dim, first = joined_along(name), tensors[0]
+            shape = list(first.shape)
+            shape[dim] = sum(tensor.shape[dim] for tensor in tensors)
+            start = -(-end // _ALIGNMENT) * _ALIGNMENT
+            end = start + math.prod(shape) * first.element_size()
+            layout[name] = (start, end, first.dtype, shape)
+        storage = torch.UntypedStorage._new_shared(end)  # type: ignore[no-untyped-call]
+        packed = cls(torch.empty(0, dtype=torch.uint8).set_(storage), layout, sizes)
+        for name, tensors in parts.items():
+            torch.cat(tensors, joined_along(name), out=packed.field(name))
+        return packed
+
+    def field(self, name: str) -> Tensor:
+        """A field, as a view."""
+        start, end, dtype, shape = self.layout[name]
+        return self.memory[start:end].view(dtype).view(shape)
+
+    def pin_memory(self) -> PackedBatch:
+        """The same in page-locked memory."""
+        return replace(self, memory=self.memory.pin_memory())
+
+    def batch(self) -> Batch:
+        """The batch; its fields are views of the one piece."""
+        return batch_of({name: self.field(name) for name in self.layout}, self.sizes)
 
 
 def _ends(sizes: Sequence[int]) -> Tensor:
