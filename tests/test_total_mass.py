@@ -117,7 +117,7 @@ def test_single_steps_are_shown_the_masses_that_rollouts_have(published):
 def test_a_silent_corrector_of_it_has_its_omega(published):
     pytest.importorskip("torch_geometric")
     import training_samples as samples
-    from pdcorrect.data.shard_arrays import read_arrays
+    from pdcorrect.data.shard_reader import read_shard
     from pdcorrect.training.recordings import load_recordings
     from pdcorrect.training.validation import Validation
 
@@ -126,10 +126,10 @@ def test_a_silent_corrector_of_it_has_its_omega(published):
         samples.fitted(published, settings(), silent=True)
     )
     (path,) = published.glob("validation/*.h5")
-    _, motions = read_arrays(path, (), ("plain", "total-mass"))
+    names = ("total-mass", "plain", "reference")
     expected = [
-        pc.metrics.error_corrected(m.rollouts["total-mass"], m.rollouts["plain"], m.positions)
-        for m in motions
+        pc.metrics.error_corrected(*(s.runs[name].positions for name in names))
+        for s in read_shard(path).simulations
     ]
     np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
     assert scores.mean > 30.0  # it is nearer than the plain mesh

@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError  # noqa: E402
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
 from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402
@@ -205,12 +205,13 @@ def test_expected_errors_of_the_base_model_grow_to_those_of_its_rollout():
 def test_recorded_errors_are_mean_squared_distances(tmp_path, base):
     folder = samples.dataset(tmp_path)
     recordings = load_recordings(folder, "training", base)
-    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", (base,), (base,))
-    for recording, motion in zip(recordings[1:], motions, strict=True):
-        truth = motion.positions[1:].astype(np.float64)
+    simulations = read_shard(folder / "training" / "mesh-0003.h5").simulations
+    for recording, simulation in zip(recordings[1:], simulations, strict=True):
+        truth = simulation.runs["reference"].positions[1:].astype(np.float64)
+        stored = simulation.runs[base]
         for found, run in (
-            (recording.one_step, motion.predictions[base]),
-            (recording.rollout, motion.rollouts[base][1:]),
+            (recording.one_step, stored.predictions),
+            (recording.rollout, stored.positions[1:]),
         ):
             assert found == pytest.approx(((run - truth) ** 2).sum(axis=2).mean(), rel=1e-6)
 

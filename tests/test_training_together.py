@@ -20,14 +20,13 @@ from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.plan import make_plan  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_arrays import read_header  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.shard_reader import read_header, read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.training.batch_losses import OneStepBatches  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
-from pdcorrect.training.recordings import data_hash, load_recordings, make_problems  # noqa: E402
+from pdcorrect.training.recordings import load_recordings, make_problems  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, grouped  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402
@@ -156,7 +155,6 @@ def test_a_training_learns_several_data_sets_and_goes_on_bit_by_bit(folders, tmp
             digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
     assert record.dataset_hash == digest.hexdigest()
     assert record.dataset == "tiny+other"
-    assert record.dataset_hash == data_hash(folders, ("training", "validation"))
     own = load_recordings(folders[0], "training", "plain")[0].config_hash
     assert one.data_sets == [("tiny", own), ("other", "0" * 64)]
     with pytest.raises(InputError, match="data = "):
@@ -206,9 +204,8 @@ def test_readers_leave_out_files_by_name_and_of_several_sets_by_the_folders(seve
         (kept,) = {header.path for header in found.headers}
         assert {recording.path for recording in recordings} == {kept}
         assert kept != several / f"{name}.h5"
-        for without in ([name, f"{split}/{kept.stem}"], name):
-            with pytest.raises(InputError, match=split):
-                TrajectoryDataset(several, split, without=without)
+        with pytest.raises(InputError, match=split):
+            TrajectoryDataset(several, split, without=[name, f"{split}/{kept.stem}"])
         found = TrajectoryDataset([several, other], split, without=[f"other set/{name}"])
         left = {header.path for header in found.headers}
         assert len(left) == 3

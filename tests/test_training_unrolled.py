@@ -12,7 +12,6 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
@@ -291,10 +290,9 @@ def test_a_silent_corrector_has_the_omega_of_its_base_model(folder, base):
     settings = samples.config(samples.one_step(), base=base)
     recordings = load_recordings(folder, "validation", base)
     scores = Validation(recordings, base)(samples.fitted(folder, settings, silent=True))
-    _, motions = read_arrays(folder / "validation" / "mesh-0001.h5", (), ("plain", "best"))
-    expected = [
-        error_corrected(m.rollouts[base], m.rollouts["plain"], m.positions) for m in motions
-    ]
+    simulations = read_shard(folder / "validation" / "mesh-0001.h5").simulations
+    names = (base, "plain", "reference")
+    expected = [error_corrected(*(s.runs[name].positions for name in names)) for s in simulations]
     assert scores.failed == 0
     np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
     assert scores.mean == pytest.approx(np.mean(scores.omegas))

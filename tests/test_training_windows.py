@@ -11,7 +11,7 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN, BodyGraph  # noqa: E402
 from pdcorrect.corrector.features import FeatureView  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.training.batch_losses import OneStepBatches, one_step_loss  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
@@ -33,14 +33,12 @@ def test_a_window_asks_for_what_the_base_model_lacks(folder):
     settings = samples.config(samples.one_step())
     windows, recordings = samples.windows(folder, settings)
     batch = windows.batch([3, 20 + 5])  # frame 3 of the first mesh, 5 of the second's first
-    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", ("plain",))
+    runs = read_shard(folder / "training" / "mesh-0003.h5").simulations[0].runs
     nodes = recordings[0].reference.shape[1]
-    motion = motions[0]
-    wanted = motion.positions[6].astype(float) - motion.predictions["plain"][5]
+    predictions = runs["plain"].predictions
+    wanted = runs["reference"].positions[6].astype(float) - predictions[5]
     np.testing.assert_allclose(batch.target[nodes:].numpy(), wanted, atol=1e-8)
-    np.testing.assert_array_equal(
-        batch.snapshot.proposed[nodes:].numpy(), motion.predictions["plain"][5]
-    )
+    np.testing.assert_array_equal(batch.snapshot.proposed[nodes:].numpy(), predictions[5])
     assert batch.scale.tolist() == [r.one_step for r in recordings[:2]]
     assert batch.snapshot.correction is None
 

@@ -143,7 +143,7 @@ def export(
         typer.Option(help="vtu: run beside the reference; repeatable; plain, if there is one."),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Delete the files of an earlier export first.")
+        bool, typer.Option("--overwrite", help="Replace files of the same names.")
     ] = False,
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""

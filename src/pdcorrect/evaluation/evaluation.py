@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, accepted_gaps
+from pdcorrect.data.folder import Damage, check_whole, missing_files
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.measures import (
@@ -181,10 +181,15 @@ def evaluate(
     if batch < 1 or workers < 1:
         raise InputError(f"batch = {batch}, workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
-    gaps = accepted_gaps(folder, split, incomplete=incomplete)  # files may be added while reading
+    missing: tuple[Path, ...] = ()
+    if incomplete:
+        with contextlib.suppress(InputError):  # of a configuration that cannot be used
+            missing = tuple(missing_files(folder, split))
+    else:
+        check_whole(folder, [split])
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
     read = {*found.shards, *(path.name for path in found.damaged)}
-    missing = tuple(path for path in gaps if path.name not in read)
+    missing = tuple(path for path in missing if path.name not in read)
     known = {candidate.name: candidate for candidate in candidates}
     stored = dict.fromkeys(name for case in found.cases for name in _stored(case))
     if len(known) < len(candidates) or known.keys() & {*stored, REFERENCE}:

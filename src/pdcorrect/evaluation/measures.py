@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, shard_paths, whole_files
+from pdcorrect.data.folder import Damage, read_files, shard_paths
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.rollouts import Outcome
@@ -115,16 +115,17 @@ def read_cases(
         If a file is damaged; with ``skip_damaged`` if all are.
     """
     damaged: Damage = {}
-    paths = whole_files(shard_paths(folder, split), damaged if skip_damaged else None)
     wanted = [PLAIN, *bases]
     shards: dict[str, str] = {}
     cases: list[EvaluationCase] = []
-    attributes: list[Mapping[str, str | int | float]] = []
-    for path in paths:
+
+    def read(path: Path) -> Mapping[str, str | int | float]:
         shard = read_shard(path)
-        attributes.append(shard.attributes)
-        shards[path.name] = stored_hashes(path)[1]
-        cases += _cases(shard, path, wanted)
+        shards[path.name] = shard.content_hash
+        cases.extend(_cases(shard, path, wanted))
+        return shard.attributes
+
+    attributes = read_files(shard_paths(folder, split), read, damaged if skip_damaged else None)
     if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
         raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
     return SplitCases(attributes[0], tuple(cases), shards, damaged)

@@ -1,23 +1,23 @@
 """First bytes of an HDF5 file, and reading a file whose end or closing is missing.
 
 HDF5 refuses a file that is shorter than its superblock says, or that its writer
-never closed.  `RepairedFile` shows such a file to HDF5 as if it were closed, with
-zeros in place of what is missing; every index and chunk of a trajectory carries
-a checksum, so those zeros are noticed and never taken for data.
+never closed; its reading mode for files in writing waits for ever where something is
+damaged.  `repaired` gives HDF5 such a file as if it were closed, with zeros in place
+of what is missing; every index and chunk of a trajectory carries a checksum, so those
+zeros are noticed and never taken for data.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pdcorrect.errors import FileFormatError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_DATASET = b"pdcorrect-dataset "  # see pdcorrect.data.checksum
 _SIZE = 48  # bytes of a version 3 superblock with 8-byte offsets
 _END, _CHECKSUM = 28, 44  # byte positions of the end-of-file address and the checksum
 _WORD = 0xFFFFFFFF
@@ -56,18 +56,11 @@ def read_superblock(path: Path) -> Superblock:
         If the file cannot be read, is not HDF5, or its superblock is damaged.
     """
     try:
-        size = path.stat().st_size
         with path.open("rb") as file:
-            head = file.read(_SIZE)
+            head, size = file.read(_SIZE), os.fstat(file.fileno()).st_size
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from None
-    if not size:
-        raise FileFormatError(f"{path}: the file is empty: expected an HDF5 trajectory.")
-    if head.startswith(_DATASET):
-        raise FileFormatError(
-            f"{path}: a file of a data set already: expected a trajectory of pdcorrect."
-        )
-    if head[:8] != _SIGNATURE[: len(head)]:
+    if not head or head[:8] != _SIGNATURE[: len(head)]:
         raise FileFormatError(f"{path}: not an HDF5 file: expected a trajectory of pdcorrect.")
     if len(head) < _SIZE:
         raise FileFormatError(
@@ -81,52 +74,14 @@ def read_superblock(path: Path) -> Superblock:
     return Superblock(struct.unpack_from("<Q", head, _END)[0], head[11] != 0, size)
 
 
-class RepairedFile(io.RawIOBase):
-    """A readable view of a trajectory file, marked as closed and padded with zeros."""
-
-    def __init__(self, path: Path, block: Superblock) -> None:
-        super().__init__()
-        self._file = path.open("rb")
-        head = bytearray(self._file.read(_SIZE))
-        self._size = max(block.size, block.end)
-        head[11] = 0
-        head[_END : _END + 8] = struct.pack("<Q", self._size)
-        head[_CHECKSUM:] = struct.pack("<I", _lookup3(bytes(head[:_CHECKSUM])))
-        self._head = bytes(head)
-        self._at = 0
-
-    def readable(self) -> bool:
-        """True."""
-        return True
-
-    def seekable(self) -> bool:
-        """True."""
-        return True
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        """Move to a byte position of the padded file."""
-        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
-        return self._at
-
-    def tell(self) -> int:
-        """Byte position."""
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        """Fill ``buffer`` from the file; zeros beyond its end."""
-        count = len(buffer)
-        self._file.seek(self._at)
-        data = self._file.read(count).ljust(count, b"\0")
-        if self._at < _SIZE:
-            data = (self._head[self._at :] + data[_SIZE - self._at :])[:count]
-        buffer[:] = data
-        self._at += count
-        return count
-
-    def close(self) -> None:
-        """Close the file behind the view."""
-        self._file.close()
-        super().close()
+def repaired(path: Path, block: Superblock) -> io.BytesIO:
+    """A file's bytes, marked as closed and padded with zeros."""
+    data = bytearray(path.read_bytes())
+    data += bytes(max(0, block.end - len(data)))
+    data[11] = 0
+    struct.pack_into("<Q", data, _END, len(data))
+    struct.pack_into("<I", data, _CHECKSUM, _lookup3(bytes(data[:_CHECKSUM])))
+    return io.BytesIO(data)
 
 
 def _rotate(x: int, k: int) -> int:

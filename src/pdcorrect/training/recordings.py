@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.folder import Folders, folders_of, shard_paths
 from pdcorrect.data.schema import PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
-from pdcorrect.data.shard_arrays import ShardHeader, read_header
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import InputError
@@ -32,7 +31,7 @@ class Recording:
     ----------
     path : Path
         The file, which has one mesh.
-    dataset, config_hash, setting, split : str
+    dataset, config_hash, content_hash, setting, split : str
     mesh, number : int
         Of the mesh in its split, and on the mesh.
     time_step : float
@@ -48,6 +47,7 @@ class Recording:
     path: Path
     dataset: str
     config_hash: str
+    content_hash: str
     setting: str
     split: str
     mesh: int
@@ -96,8 +96,9 @@ def load_recordings(
     """
     found = []
     for path in _paths(folder, split, without):
-        _check_complete(read_header(path), base, scenes)
-        shard = read_shard(path, verify=False, runs=_runs(base))
+        runs = dict.fromkeys(_runs(base), ("positions", "predictions"))
+        shard = read_shard(path, verify=False, runs=runs)
+        _check_complete(path, shard, base, scenes)
         for number, simulation in enumerate(shard.simulations):
             found.append(_recording(path, shard, simulation, number, split, base))
     return found
@@ -123,12 +124,11 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     return [known[recording.path][recording.number] for recording in recordings]
 
 
-def data_hash(folder: Folders, splits: Sequence[str], without: Collection[str] = ()) -> str:
-    """SHA-256 of the content hashes of the files of some splits, those left out left out."""
-    digest, folders = hashlib.sha256(), folders_of(folder)
-    for split in splits:
-        for path in _paths(folders, split, without):
-            digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
+def data_hash(recordings: Sequence[Recording]) -> str:
+    """SHA-256 of the content hashes of the files of some simulations, in their order."""
+    digest = hashlib.sha256()
+    for path, one in {recording.path: recording for recording in recordings}.items():
+        digest.update(f"{one.split}/{path.name} {one.content_hash}\n".encode())
     return digest.hexdigest()
 
 
@@ -137,15 +137,21 @@ def _paths(folder: Folders, split: str, without: Collection[str]) -> list[Path]:
     return [path for each in folders_of(folder) for path in shard_paths(each, split, without)]
 
 
-def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
+def _check_complete(path: Path, shard: Shard, base: Base, scenes: bool) -> None:
     """Refuse a file of which a simulation lacks what a training of ``base`` needs."""
-    for number, (positions, predictions) in enumerate(header.runs):
-        lacks = ["scene"] if scenes and not header.scenes[number] else []
-        lacks += [f"rollout of run {n!r}" for n in _runs(base) if n not in positions]
-        lacks += [f"single steps of run {base!r}"] if base not in predictions else []
+    for number, simulation in enumerate(shard.simulations):
+        runs = simulation.runs
+        single = runs[base].predictions if base in runs else None
+        lacks = ["scene"] if scenes and not simulation.scene_toml else []
+        lacks += [
+            f"rollout of run {name!r}"
+            for name in _runs(base)
+            if name not in runs or runs[name].positions is None
+        ]
+        lacks += [f"single steps of run {base!r}"] if single is None else []
         if lacks:
             raise InputError(
-                f"{header.path}: simulation {number} has no {', no '.join(lacks)}: expected what a "
+                f"{path}: simulation {number} has no {', no '.join(lacks)}: expected what a "
                 f"training with base = {base!r} needs."
             )
 
@@ -166,6 +172,7 @@ def _recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
+        content_hash=shard.content_hash,
         setting=str(shard.attributes["setting"]),
         split=split,
         mesh=int(shard.attributes["number"]),

@@ -105,7 +105,14 @@ class Training:
                 check_whole(folder, (TRAINING, VALIDATION))
         splits, without = _common_splits(data), config.without
         _check_left_out(without, data)
-        digest = data_hash(data, splits, without)
+        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
+        self._recordings = load_recordings(
+            data, TRAINING, config.base, scenes=unrolled, without=without
+        )
+        validated: list[Recording] = []
+        if VALIDATION in splits:
+            validated = load_recordings(data, VALIDATION, config.base, without=without)
+        digest = data_hash([*self._recordings, *validated])
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
@@ -116,10 +123,6 @@ class Training:
         if self._teachers:
             self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
-        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
-        self._recordings = load_recordings(
-            data, TRAINING, config.base, scenes=unrolled, without=without
-        )
         _check_alike(self._recordings)
         self._lineage = Lineage.of(config, start, self._recordings)
         self._windows = StepWindows(
@@ -134,10 +137,9 @@ class Training:
         self._averaged = copy.deepcopy(self.corrector)
         self._best: dict[str, Tensor] = {}
         self._validation: Validation | None = None
-        if VALIDATION in splits:
+        if validated:
             self._validation = Validation(
-                load_recordings(data, VALIDATION, config.base, without=without), config.base,
-                device=self.device, world=self.world,
+                validated, config.base, device=self.device, world=self.world,
             )  # fmt: skip
         self.progress = Progress()
         self._waiting: tuple[dict[str, Any], dict[str, Tensor]] | None = None
