@@ -430,7 +430,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
     scenes = [Scene.from_toml(s.scene_toml, f"{path}, a scene") for s in shard.simulations]
     plain = discretise_stored(scenes[0], shard.points, shard.cells)
     wrong = unlike_arrays(plain, shard)
-    for k, scene in enumerate(scenes):
+    for k, scene in enumerate([] if wrong else scenes):
         step = unlike_loads(plain.with_loads(scene.loads), shard.simulations[k])
         wrong += [] if step is None else [f"the loads of simulation {k} in step {step + 1}"]
     if wrong:
