@@ -16,10 +16,10 @@ import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
 from pdcorrect.batch import decomposition, gpu, minimise
 from pdcorrect.batch.cells import Sizes
-from pdcorrect.batch.gpu import tall_product
 from pdcorrect.batch.points import Points
 from pdcorrect.batch.shared_matrices import DistinctBodies
 from pdcorrect.batch.states import expected_bytes
+from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes

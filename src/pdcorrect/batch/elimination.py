@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor, cat
 
 from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.batch.gpu import small_products, tall_product
+from pdcorrect.batch.gpu import small_products
 from pdcorrect.batch.shared_matrices import Sharing, with_rows
+from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
 

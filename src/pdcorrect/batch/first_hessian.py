@@ -30,7 +30,7 @@ from pdcorrect.batch.elimination import (
     scalar_blocks,
     summed_blocks,
 )
-from pdcorrect.batch.gpu import as_kernel
+from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
 from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.errors import ConvergenceError, InputError
@@ -71,23 +71,15 @@ class Turning:
         return list(out.reshape(9, n.scenes, n.unknowns))
 
 
-def rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
-    """R x at each node where it is free, for nine (B, U), (B, U, 3) and 0 or 1 (B, U, 3)."""
-    out: Tensor = as_kernel(_rotated, x.is_cuda)(R, x, free)
-    return out
-
-
-def rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
-    """R^T of what is free of x at each node."""
-    out: Tensor = as_kernel(_rotated_back, x.is_cuda)(R, x, free)
-    return out
-
-
-def _rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+@one_kernel
+def _rotated(x: Tensor, R: list[Tensor], free: Tensor) -> Tensor:
+    """R x at each node where it is free, for (B, U, 3), nine (B, U) and 0 or 1 (B, U, 3)."""
     return _products(R, x) * free
 
 
-def _rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+@one_kernel
+def _rotated_back(x: Tensor, R: list[Tensor], free: Tensor) -> Tensor:
+    """R^T of what is free of x at each node."""
     return _products(transposed(R), x * free)
 
 
@@ -242,8 +234,8 @@ class FirstHessian:
     def __call__(self, r: Tensor) -> Tensor:
         if not self._turned:
             return self._solved(r * self._free) * self._free
-        x = self._solved(rotated_back(self._rotations, r, self._free))
-        return rotated(self._rotations, x, self._free)
+        x = self._solved(_rotated_back(r, self._rotations, self._free))
+        return _rotated(x, self._rotations, self._free)
 
     def _solved(self, r: Tensor) -> Tensor:
         return self._modes.recovered(self._solver(self._modes.reduced(r)), r)

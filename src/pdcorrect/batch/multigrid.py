@@ -19,7 +19,7 @@ from torch import Tensor
 
 from pdcorrect.batch.cells import padded
 from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
-from pdcorrect.batch.gpu import as_kernel, rows_of, sums
+from pdcorrect.batch.gpu import one_kernel, rows_of, sums
 from pdcorrect.batch.mesh_levels import Level, Numbers, hierarchy, places, table
 from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.fem.problem import Problem
@@ -134,33 +134,26 @@ class Grid:
         """B - A x; of no meaning where clamped."""
         local = rows_of(x.reshape(-1, 3), self._cells)
         images = self._images(local.reshape(len(x), -1, 24)).reshape(-1, 3)
-        kernel = as_kernel(_residual, x.is_cuda)
-        out: Tensor = kernel(b, x, self._nodal, images, self._slots)
-        return out
+        return _residual(b, x, self._nodal, images, self._slots)
 
     def smoothed(self, b: Tensor) -> Tensor:
         """A Chebyshev polynomial in D^-1 A, times D^-1 b: symmetric, zero where clamped."""
-        kernel = as_kernel(_advanced, b.is_cuda)
         x, step = torch.zeros_like(b), torch.zeros_like(b)
         r = b
         for k, factors in enumerate(self._factors):
             if k:
                 r = self.residual(b, x)
-            step, x = kernel(self._inverse, r, step, x, factors)
+            step, x = _advanced(self._inverse, r, step, x, factors)
         return x
 
     def restricted(self, r: Tensor) -> Tensor:
         """P^T r, on the next coarser level, for a field that counts where free."""
-        kernel = as_kernel(_weighted, r.is_cuda)
         flat = (r * self._free).reshape(-1, 3)
-        out: Tensor = kernel(flat, *self._down)
-        return out.reshape(len(r), -1, 3)
+        return _weighted(flat, *self._down).reshape(len(r), -1, 3)
 
     def prolonged(self, x: Tensor) -> Tensor:
         """P x, zero where clamped."""
-        kernel = as_kernel(_weighted, x.is_cuda)
-        out: Tensor = kernel(x.reshape(-1, 3), *self._up)
-        return out.reshape(self._free.shape) * self._free
+        return _weighted(x.reshape(-1, 3), *self._up).reshape(self._free.shape) * self._free
 
     def _images(self, local: Tensor) -> Tensor:
         """The cells' matrices times their values (B, C, 24)."""
@@ -171,13 +164,12 @@ class Grid:
         return self._sharing.scattered(moved.permute(0, 3, 1, 2))
 
 
-# --- what is one kernel on a GPU -----------------------------------------------------------------
-
-
+@one_kernel
 def _residual(b: Tensor, x: Tensor, nodal: Tensor, images: Tensor, slots: Tensor) -> Tensor:
     return b - nodal * x - sums(images, slots).reshape(b.shape)
 
 
+@one_kernel
 def _advanced(
     inverse: Tensor, r: Tensor, step: Tensor, x: Tensor, factors: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -187,6 +179,7 @@ def _advanced(
     return step, x + step
 
 
+@one_kernel
 def _weighted(values: Tensor, numbers: Tensor, weights: Tensor) -> Tensor:
     total = weights[:, 0, None] * values[numbers[:, 0]]
     for i in range(1, numbers.shape[1]):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pdcorrect.batch import viscosity
 from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.batch.gpu import as_kernel, small_products
+from pdcorrect.batch.gpu import one_kernel, small_products
 from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.batch.viscosity import ViscousTangent
@@ -165,7 +165,7 @@ class BatchObjective:
         energy, elastic = self.cells.energy_and_forces(y)
         offset = y - self.target
         momentum = self.mass(offset, self.inertia)
-        gradient, by_node = as_kernel(_terms, y.is_cuda)(
+        gradient, by_node = _terms(
             elastic, offset, momentum, self.forces, y - self.cells.rest, self.free
         )
         kinetic, work = by_node.sum(dim=-1)
@@ -243,14 +243,12 @@ class BatchObjective:
 
 def largest_displacement(x: Tensor) -> Tensor:
     """Largest node norm of each scene, (B,), for (B, U, 3)."""
-    squares: Tensor = as_kernel(node_dot, x.is_cuda)(x, x)
-    return torch.sqrt(squares.amax(dim=1))
+    return torch.sqrt(_by_node(x, x).amax(dim=1))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products (B,) of (B, U, 3)."""
-    by_node: Tensor = as_kernel(node_dot, a.is_cuda)(a, b)
-    return by_node.sum(dim=1)
+    return _by_node(a, b).sum(dim=1)
 
 
 def by_scene(values: Tensor) -> Tensor:
@@ -258,9 +256,7 @@ def by_scene(values: Tensor) -> Tensor:
     return values[:, None, None]
 
 
-# --- what is one kernel on a GPU -----------------------------------------------------------------
-
-
+@one_kernel
 def _terms(
     elastic: Tensor,
     offset: Tensor,
@@ -278,3 +274,6 @@ def node_dot(a: Tensor, b: Tensor) -> Tensor:
     """What each node has in the inner product of (B, U, 3), (B, U); part of larger kernels."""
     x, y, z = (a * b).unbind(dim=-1)
     return x + y + z
+
+
+_by_node = one_kernel(node_dot)
