@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.adjoint_terms import DampingTerms, Written
-from pdcorrect.batch.checks import check_kind, check_nodal, check_step
+from pdcorrect.batch.checks import check_nodal, check_step
 from pdcorrect.batch.follower import Mixing
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import largest_displacement
@@ -71,9 +71,7 @@ class BatchGradients:
         forces: Tensor | None = None,
         tolerance: float = 1e-6,
     ) -> None:
-        check_kind("stepper", stepper, BatchStepper, "a BatchStepper")
         check_step(stepper.cells, before, result, stepper.time_step)
-        check_kind("grad_memory", {} if grad_memory is None else grad_memory, Mapping, "a dict")
         tolerance = positive("tolerance", tolerance)
         self._stepper, self._before, self._y = stepper, before, result.y
         self._nodes = stepper.cells.sizes.nodes

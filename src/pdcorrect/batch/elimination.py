@@ -152,11 +152,6 @@ class DenseInverse:
     storage : torch.dtype
         Of the inverses.
     device : torch.device
-
-    Attributes
-    ----------
-    bytes : int
-        Of all inverses.
     """
 
     def __init__(
@@ -174,7 +169,6 @@ class DenseInverse:
         size = width * max(map(len, free))
         shape = (len(free), self._axes, size, size)
         self._inverse = torch.zeros(shape, dtype=storage, device=device)
-        self.bytes = self._inverse.numel() * self._inverse.element_size()
 
     def fill(self, i: int, matrix: Tensor) -> bool:
         """Invert one problem's matrix (w N, w N) into the store, if it is positive definite."""

@@ -142,10 +142,8 @@ class FirstHessian:
 
     Attributes
     ----------
-    bytes : int
-        Of what is stored for the nodes' matrices.
     count : int
-        Distinct ones.
+        Distinct matrices.
     regular : (B,) bool
         Whether there is an inverse; where not, the products mean nothing.
 
@@ -189,7 +187,6 @@ class FirstHessian:
                 f"scene {problems[0].scene.name!r}: the matrix of the step is not positive "
                 "definite: expected clamps, or inertia that matters beside the stiffness."
             )
-        self.bytes = self._solver.bytes
         self.regular = torch.tensor(regular, device=cells.device)[owners]
         self._rotations: list[Tensor] = []
         if self._turned:

@@ -8,6 +8,7 @@ them on the way.
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, wraps
@@ -115,6 +116,35 @@ def _sum(terms: list[Tensor]) -> Tensor:
     for term in terms[1:]:
         total = total + term
     return total
+
+
+_one_thread = threading.Lock()
+_inside, _threads = 0, 1
+
+
+@contextmanager
+def one_thread(device: torch.device) -> Iterator[None]:
+    """Torch on one CPU thread, if that is the device, as long as any Python thread asks for it.
+
+    Batches on the CPU are small; their products gain nothing from threads that wait for
+    each other, and lose much where other processes want the cores.  Numba's kernels, which
+    share torch's OpenMP library, change the number for both.
+    """
+    global _inside, _threads
+    if device.type != "cpu":
+        yield
+        return
+    with _one_thread:
+        if not _inside:
+            _threads = torch.get_num_threads()
+        _inside += 1
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _one_thread:
+            _inside -= 1
+            torch.set_num_threads(_threads)
 
 
 class Recorder:

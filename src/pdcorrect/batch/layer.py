@@ -22,7 +22,6 @@ from pdcorrect.batch.adjoint import BatchGradients
 from pdcorrect.batch.checks import (
     by_cell,
     check_finite,
-    check_kind,
     check_material,
     check_nodal,
     check_tensor,
@@ -168,7 +167,6 @@ class PDLayer(nn.Module):
             raise InputError(f"mode = {mode!r}: expected unrolled, checkpointed or detached.")
         if on_failure not in ("raise", "zero"):
             raise InputError(f"on_failure = {on_failure!r}: expected raise or zero.")
-        check_kind("stepper", stepper, BatchStepper, "a BatchStepper(problems)")
         self.stepper, self.steps, self.mode = stepper, whole("steps", steps, 1), mode
         self.on_failure, self.tolerance = on_failure, positive("tolerance", tolerance)
         self.statuses: list[list[Status]] = []

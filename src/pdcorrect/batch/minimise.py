@@ -273,8 +273,9 @@ class BatchMinimiser:
         """Where the last run began, (B, U, 3); the next one overwrites it."""
         return self._start
 
-    def forget(self) -> None:
-        """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
+    def forget(self, y: Tensor) -> None:
+        """Precondition by the first Hessian at y alone, without the last step's pairs."""
+        self._inverse.turn(y)
         self._history.clear(torch.ones_like(self._alive))
 
     # --- one iteration ------------------------------------------------------------------

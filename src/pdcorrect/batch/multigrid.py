@@ -97,15 +97,6 @@ class Grid:
             for tables, most, rows, columns in _both_ways(levels, nodes, coarse)
         )
 
-    @property
-    def bytes(self) -> int:
-        """Memory of its tensors."""
-        tensors = (
-            self._cells, self._slots, self._blocks, self._nodal, self._free, self._inverse,
-            *self._up, *self._down,
-        )  # fmt: skip
-        return sum(t.numel() * t.element_size() for t in tensors)
-
     def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Grid:
         """Of some scenes, with the matrices that they have."""
         scenes, nodes, _ = self._free.shape
@@ -276,8 +267,6 @@ class BatchMultigrid:
 
     Attributes
     ----------
-    bytes : int
-        Of all levels.
     regular : list of bool
         Whether each distinct problem's coarsest matrix is positive definite, and the nodes'
         blocks on the other levels.
@@ -308,7 +297,6 @@ class BatchMultigrid:
             and all(grid.regular[i] for grid in self._grids)
             for i, level in enumerate(coarsest)
         ]
-        self.bytes = self._coarsest.bytes + sum(grid.bytes for grid in self._grids)
 
     def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> BatchMultigrid:
         """Of some scenes, with the matrices that they have."""

@@ -95,15 +95,7 @@ def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> lis
         alive = torch.tensor([f is None for f in failed], device=fine.device) & fine
         frames.append(_where(alive, result.state.positions, frames[-1]))
         reasons.append(torch.where(alive, result.reasons, 0))
-        state = BatchState(
-            _where(alive, result.state.positions, rest.positions),
-            _where(alive, result.state.velocities, rest.velocities),
-            result.state.times,
-            {
-                name: _where(alive, x, torch.zeros_like(x))
-                for name, x in result.state.memory.items()
-            },
-        )
+        state = result.state.where(alive, rest)
         previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()
     told = torch.stack(reasons).cpu().numpy()

@@ -8,14 +8,13 @@ rollout does not hide what the others say.  What a model is worth is told by
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.placements import Velocity
@@ -131,7 +130,7 @@ class Validation:
             square = group.sums(error.square().sum(dim=2))
             total += torch.where(running & ok, square, 0.0)
             good &= ok & (total <= worst)
-            state = _where(good & (steps > frame), state, rest)
+            state = state.where(good & (steps > frame), rest)
         return torch.where(good, 100.0 * (1.0 - total / plain), LEAST), ~ok
 
 
@@ -140,14 +139,3 @@ def _squares(recording: Recording) -> float:
     distance = recording.plain[1:].astype(np.float64) - recording.reference[1:]
     least = recording.steps * len(recording.points) * rounding(recording.reference)
     return max(float((distance**2).sum()), least)
-
-
-def _where(ok: Tensor, state: BatchState, rest: BatchState) -> BatchState:
-    """The state, but rest where it is not ok."""
-    at = ok[:, None, None]
-    return replace(
-        state,
-        positions=torch.where(at, state.positions, rest.positions),
-        velocities=torch.where(at, state.velocities, rest.velocities),
-        memory={name: torch.where(at, x, 0.0) for name, x in state.memory.items()},
-    )
