@@ -160,8 +160,8 @@ def test_products_with_few_columns_are_matrix_products(device):
 
 
 @on_every_device
-def test_thirty_two_unlike_scenes_step_as_each_alone(device):
-    problems = [pc.discretise(unlike(seed)) for seed in range(32)]
+def test_a_dozen_unlike_scenes_step_as_each_alone(device):
+    problems = [pc.discretise(unlike(seed)) for seed in range(12)]
     states = moving_states(problems)
     stepper = pc.BatchStepper(problems, 1e-9, device=device, recover=False)
     found, result = stepped(stepper, states, 2)
@@ -172,8 +172,11 @@ def test_thirty_two_unlike_scenes_step_as_each_alone(device):
 
 
 @on_every_device
-@pytest.mark.parametrize("first_hessian", ["rest", "G", "G-scaled"])
-@pytest.mark.parametrize("element", VARIANTS[1:])
+@pytest.mark.parametrize(
+    ("element", "first_hessian"),
+    [(element, "rest") for element in VARIANTS[1:]]
+    + [("hex8-bubble-mean", "G"), ("hex8-enhanced", "G-scaled")],
+)
 def test_so_they_do_with_every_element_and_first_hessian(element, first_hessian, device):
     problems = [pc.discretise(unlike(seed, element)) for seed in range(4)]
     states = moving_states(problems)
@@ -274,9 +277,9 @@ def test_scenes_with_the_same_matrix_share_one_inverse():
 
 @on_every_device
 def test_a_scene_of_nan_and_one_that_cannot_converge_fail_alone(device):
-    problems = [pc.discretise(unlike(seed)) for seed in range(32)]
+    problems = [pc.discretise(unlike(seed)) for seed in range(9)]
     absurd = [{"kind": "gravity", "acceleration": [0.0, 0.0, -1e12]}]
-    problems[20] = pc.discretise(unlike(20, loads=absurd))
+    problems[4] = pc.discretise(unlike(4, loads=absurd))
     states = moving_states(problems)
     positions = states[7].positions.copy()
     positions[3, 1] = np.nan
@@ -284,9 +287,9 @@ def test_a_scene_of_nan_and_one_that_cannot_converge_fail_alone(device):
     stepper = pc.BatchStepper(problems, 1e-9, device=device, recover=False, max_iterations=60)
     found, result = stepped(stepper, states, 1)
     assert result.statuses[7] is pc.Status.NOT_FINITE
-    assert not result.statuses[20].ok
+    assert not result.statuses[4].ok
     for i, (problem, state) in enumerate(zip(problems, states, strict=True)):
-        if i not in (7, 20):
+        if i not in (4, 7):
             assert result.statuses[i] is pc.Status.CONVERGED
             assert furthest(alone(problem, state, 1), found[i]) < 1e-9
 
@@ -579,7 +582,7 @@ def test_volume_ratios_do_not_see_the_padding(element):
     problems = [pc.discretise(beam((n, 1, 1), **settings)) for n in (1, 3)]
     cells = pc.BatchStepper(problems).cells
     states = [2.0 * p.positions + 0.7 for p in problems]
-    ratios = cells.smallest_volume_ratios(cells.nodal(states)[:, : cells.sizes.nodes])
+    ratios = cells.volume_ratios(cells.nodal(states)).amin(dim=1)
     np.testing.assert_allclose(ratios, 8.0, rtol=1e-12)
 
 
@@ -691,7 +694,6 @@ WRONG = {
     "density in float32": (
         lambda s, r, o: s.set_material(density=torch.ones(1, 1)), r"density: torch\.float32",
     ),
-    "another time": (lambda s, r, o: pc.BatchGradients(s, o.state, o), "expected a step of 0.01 s"),
     "others": (
         lambda s, r, o: pc.BatchGradients(pc.BatchStepper(s.problems[:1]), r, o), "positions: ",
     ),

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from operator import attrgetter
 
 import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.material import BatchMaterial, in_range
-from pdcorrect.batch.states import BatchResult, BatchState, Solved
+from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import InputError
 from pdcorrect.fem.materials import RANGES
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
-
-_TIMES_DIFFER = 1e-6
-"""Of a step's length."""
 
 
 def scene_name(problems: Sequence[Problem], i: int) -> str:
@@ -39,31 +36,21 @@ def check_problems(
     problems = tuple(problems)
     if not problems:
         raise InputError("no problems: expected one or more scenes.")
-    first = problems[0]
+    first = problems[0].scene
+    names = ["solver.element", "material.energy", "material.volume_weight"]
+    names += ["damping.viscosity", "damping.mass", "damping.stiffness"]
+    if time_step is None:
+        names += ["time.step", "time.substeps"]
+    if integrator is None:
+        names.append("time.integrator")
+    if (integrator or first.time.integrator) == "generalised-alpha":
+        names.append("time.spectral_radius")
     for i, problem in enumerate(problems):
-        scene, other = problem.scene, first.scene
-        pairs: list[tuple[str, Any, Any]] = [
-            ("element", problem.element, first.element),
-            ("material.energy", scene.material.energy, other.material.energy),
-            ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
-        ]
-        for name in ("viscosity", "mass", "stiffness"):
-            values = (getattr(damping, name) for damping in (scene.damping, other.damping))
-            pairs.append((f"damping.{name}", *values))
-        if time_step is None:
-            for name in ("step", "substeps"):
-                mine, theirs = (getattr(s.time, name) for s in (scene, other))
-                pairs.append((f"time.{name}", mine, theirs))
-        if integrator is None:
-            pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
-        name = other.time.integrator if integrator is None else integrator
-        if name == "generalised-alpha":
-            radii = scene.time.spectral_radius, other.time.spectral_radius
-            pairs.append(("time.spectral_radius", *radii))
-        for key, mine, theirs in pairs:
+        for name in names:
+            mine, theirs = (attrgetter(name)(scene) for scene in (problem.scene, first))
             if mine != theirs:
                 raise InputError(
-                    f"scene {scene_name(problems, i)}: {key} = {mine!r}, the first one's is "
+                    f"scene {scene_name(problems, i)}: {name} = {mine!r}, the first one's is "
                     f"{theirs!r}: expected the same. Make a batch of each kind."
                 )
     return problems
@@ -205,20 +192,3 @@ def finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
     if len(found) != scenes or not all(map(math.isfinite, found)):
         raise InputError(f"times = {times!r}: expected {scenes} finite numbers, one a scene.")
     return found
-
-
-def check_step(cells: CellBatch, before: BatchState, result: Solved, time_step: float) -> None:
-    """Refuse what is no step of the batch."""
-    check_state(cells, before)
-    if result.y.shape != cells.rest.shape:
-        raise InputError(
-            f"result has configurations {tuple(result.y.shape)}: expected "
-            f"{tuple(cells.rest.shape)}, from a step of this stepper."
-        )
-    if isinstance(result, BatchResult):
-        for i, (start, end) in enumerate(zip(before.times, result.state.times, strict=True)):
-            if abs(end - start - time_step) > _TIMES_DIFFER * (time_step + abs(end)):
-                raise InputError(
-                    f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
-                    f"a step of {time_step:g} s from before."
-                )

@@ -186,8 +186,8 @@ class DenseInverse:
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
         return True
 
-    def narrowed(self, sharing: Sharing, kept: Tensor) -> DenseInverse:
-        """With some of the matrices."""
+    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> DenseInverse:
+        """Of some scenes, with the matrices that they have."""
         return with_rows(
             self, kept, "_inverse", _sharing=sharing, _free=[self._free[k] for k in kept.tolist()]
         )

@@ -12,8 +12,7 @@ size).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import torch
@@ -159,16 +158,13 @@ class Phase(IntEnum):
     LIMIT = 5
 
 
-@dataclass
-class LbfgsInverse:
+def _improved(inverse: FirstHessian, history: BatchHistory) -> Callable[[Tensor], Tensor]:
     """The first Hessian's inverse, improved by the pairs of the steps since the start."""
 
-    inverse: FirstHessian
-    history: BatchHistory
+    def product(r: Tensor) -> Tensor:
+        return history.improved(r.flatten(1), inverse(r).flatten(1)).reshape(r.shape)
 
-    def __call__(self, r: Tensor) -> Tensor:
-        x = self.inverse(r)
-        return self.history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
+    return product
 
 
 class BatchMinimiser:
@@ -218,7 +214,7 @@ class BatchMinimiser:
         self._narrows = rest.device.type == "cpu" and scenes >= _FEW
         self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        improved = LbfgsInverse(inverse, self._history)
+        improved = _improved(inverse, self._history)
         self.linear_solver = BatchConjugateGradients(objective, improved, recorder)
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._next)

@@ -111,15 +111,11 @@ def in_one(statuses: Sequence[Status]) -> list[bool]:
 def together(cells: CellBatch, states: Sequence[State]) -> BatchState:
     """States of the scenes of a batch together."""
     names = set(states[0].memory)
-
-    def nodal(arrays: Sequence[Array]) -> Tensor:
-        return cells.nodal(arrays)[:, : cells.sizes.nodes]
-
     return BatchState(
-        nodal([s.positions for s in states]),
-        nodal([s.velocities for s in states]),
+        cells.nodal([s.positions for s in states]),
+        cells.nodal([s.velocities for s in states]),
         tuple(s.time for s in states),
-        {name: nodal([s.memory[name] for s in states]) for name in names},
+        {name: cells.nodal([s.memory[name] for s in states]) for name in names},
     )
 
 

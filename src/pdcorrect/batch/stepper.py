@@ -351,7 +351,9 @@ class BatchStepper:
             found = settle(m, alive, lambda y: self._push(stage, forces, y[:, :nodes]))
         y, phase, iterations, evaluations, estimate = found
         after = self.staging.finish(stage, y, state, self._internal(stage, y))
-        ratios = self.cells.smallest_volume_ratios(after.positions).to("cpu", torch.float64).numpy()
+        ratios = (
+            self.cells.volume_ratios(after.positions).amin(dim=1).to("cpu", torch.float64).numpy()
+        )
         statuses = [_STATUSES[Phase(p)] for p in phase.tolist()]
         return BatchResult(
             y,
