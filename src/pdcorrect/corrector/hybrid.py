@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.batch.checks import one_thread
+from pdcorrect.batch.gpu import one_thread
 from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable

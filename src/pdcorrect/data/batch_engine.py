@@ -136,13 +136,7 @@ class _BatchLog:
         if not any(self.failures):
             return state
         failed = torch.tensor([bool(f) for f in self.failures], device=state.positions.device)
-        failed = failed[:, None, None]
-        return BatchState(
-            torch.where(failed, rest.positions, state.positions),
-            torch.where(failed, rest.velocities, state.velocities),
-            state.times,
-            {name: torch.where(failed, 0.0, x) for name, x in state.memory.items()},
-        )
+        return state.where(~failed, rest)
 
     def frame(self, state: BatchState) -> None:
         """The end of a frame."""

@@ -27,7 +27,7 @@ from pdcorrect.errors import InputError, require_extra
 LARGEST_BATCHED = 150_000
 """Nodes of the largest mesh that is stepped in batches.
 
-A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.states`), so a batch of 32
+A step takes about 11 kB a node of hex8-bubble-mean (docs/differentiable.md), so a batch of 32
 such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
 """
 

@@ -90,15 +90,7 @@ def roll_out(
         going = going & (last > number)
         if worth is not None:
             going = worth(number, frames[-1]) & going
-        state = BatchState(  # at rest scenes cost little
-            _where(going, result.state.positions, rest.positions),
-            _where(going, result.state.velocities, rest.velocities),
-            result.state.times,
-            {
-                name: _where(going, x, torch.zeros_like(x))
-                for name, x in result.state.memory.items()
-            },
-        )
+        state = result.state.where(going, rest)  # at rest scenes cost little
         previous = torch.where(_by_node(stepper, going), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()
     told = torch.stack(reasons).cpu().numpy()
