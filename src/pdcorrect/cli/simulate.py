@@ -85,7 +85,7 @@ def simulate(
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
-        _corrections(log.arrays(), getattr(stepper, "trained_step", ""))
+        _corrections(log.arrays())
         say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
@@ -245,14 +245,14 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
 
 def _described(stepper: Stepper) -> dict[str, str]:
     """What a stepper says of itself, but for the model, which is told before the run."""
-    elsewhere = {*getattr(stepper, "origin", {}), "trained_step", "time_step_excess"}
+    elsewhere = {*getattr(stepper, "origin", {}), "trained_step"}
     told = {name: text for name, text in stepper.describe().items() if name not in elsewhere}
     if told.get("gate", "none") != "none":
         told["gate"] = "default"  # the program has no other
     return told
 
 
-def _corrections(stats: dict[str, Any], trained_step: str) -> None:
+def _corrections(stats: dict[str, Any]) -> None:
     """How large the corrections of a hybrid were, and which were refused and why."""
     from pdcorrect.evaluation.report import refused_corrections
 
@@ -260,7 +260,7 @@ def _corrections(stats: dict[str, Any], trained_step: str) -> None:
         return
     if not stats["refused"].all():
         say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
-    say(refused_corrections(stats["gate"], trained_step))
+    say(refused_corrections(stats["gate"]))
 
 
 def _other_work(stats: dict[str, Any]) -> str:

@@ -98,10 +98,6 @@ class EvaluatedRun:
         missing = {name: every - len(self.values(name)[0]) for name in names}
         return {name: count for name, count in missing.items() if 0 < count < every}
 
-    def refused_by(self) -> list[int]:
-        """Of each trajectory, the `MeasuredRollout.refused_by`."""
-        return [t.refused_by for t in self.trajectories]
-
     @property
     def all_refused(self) -> bool:
         """Whether a gate refused all corrections of all trajectories."""

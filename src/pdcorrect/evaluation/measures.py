@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import Damage, shard_paths, whole_files
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
@@ -317,16 +316,6 @@ class MeasuredRollout:
     measures: TrajectoryMeasures
     errors: Array = field(default_factory=lambda: np.zeros(0))
     reasons: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    @property
-    def refused_by(self) -> int:
-        """Number of the `Reason` by which a gate refused the whole of it; 0 if it did not.
-
-        That is the body at rest or the time step.  What is refused by one of these is so in all
-        steps, so the first one tells.
-        """
-        first = int(self.reasons[0]) if len(self.reasons) else 0
-        return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
 
 
 def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:

@@ -146,7 +146,7 @@ def _of_the_models(comparison: Comparison) -> str:
         text = f"trained on {about['dataset']}{step}, elsewhere it may be of no use."
         if label in comparison.runs:
             run = comparison.runs[label]
-            refused = refused_corrections(run.stats["gate"], run.attributes["trained_step"])
+            refused = refused_corrections(run.stats["gate"])
             text = f"{text} {refused}".strip()
         told.append((label, text))
     return " ".join(grouped(told))
@@ -160,19 +160,17 @@ def grouped(told: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{', '.join(every)}: {text}" for text, every in names.items()]
 
 
-def refused_corrections(reasons: Iterable[float], trained_step: str = "", runs: int = 1) -> str:
+def refused_corrections(reasons: Iterable[float], runs: int = 1) -> str:
     """One sentence: how many corrections were refused, and why; empty if none was.
 
     Parameters
     ----------
     reasons : iterable of numbers of `pdcorrect.corrector.gate.Reason`
         Of each step, 0 where it was corrected.
-    trained_step : str
-        See `HybridStepper.trained_step`; told where it is the reason.
     runs : int
         Of which the steps are.
     """
-    from pdcorrect.corrector.gate import Reason, refusals
+    from pdcorrect.corrector.gate import refusals
 
     every = list(reasons)
     found = refusals(every)
@@ -180,8 +178,6 @@ def refused_corrections(reasons: Iterable[float], trained_step: str = "", runs: 
         return ""
     total = sum(one.steps for one in found)
     counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
-    if trained_step and any(one.reason is Reason.TIME_STEP for one in found):
-        counts += f", {trained_step} for cells of this size"
     alone = "the run is" if runs == 1 else "all runs are"
     rest = f": {alone} of the coarse model alone" if total == len(every) else ""
     return f"{total} of {len(every)} corrections were refused ({counts}){rest}."
