@@ -281,6 +281,6 @@ def test_checkpoints_come_back_and_every_damaged_one_is_refused_by_name(tmp_path
     path.write_bytes(whole[:-3])
     with pytest.raises(FileFormatError, match=path.name):
         read_checkpoint(path)
-    path.write_bytes(whole.replace(b'"version":"4"', b'"version":"9"'))
+    path.write_bytes(whole.replace(b'"version":"5"', b'"version":"9"'))
     with pytest.raises(FileVersionError, match="version 9"):
         read_checkpoint(path)

@@ -1,11 +1,11 @@
 """Models on disk: a folder with ``weights.safetensors`` and ``model.json``.
 
 ``weights.safetensors`` holds the network's weights (float32) and the buffers of normaliser and
-envelope (float64), under the normaliser's name.  ``model.json`` says what they belong to: architecture, normalisation, data set,
-code, training and metrics, the SHA-256 of the weights' file, and under ``checksum`` that of
-all its own other content.  It is replaced last.  If a program is ended between the two
-replacements, an old ``model.json`` lies beside new weights; that, like any other damage, is
-refused.  Nothing is ever unpickled.
+envelope (float64), all under the normaliser's name.  ``model.json`` says what they belong to:
+architecture, normalisation, data set, code, training and metrics, the SHA-256 of the weights'
+file, and under ``checksum`` that of all its own other content.  It is replaced last.  If a
+program is ended between the two replacements, an old ``model.json`` lies beside new weights;
+that, like any other damage, is refused.  Nothing is ever unpickled.
 """
 
 from __future__ import annotations

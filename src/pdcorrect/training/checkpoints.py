@@ -27,7 +27,7 @@ from safetensors import SafetensorError, safe_open  # noqa: E402
 from safetensors import torch as safetensors  # noqa: E402
 
 FORMAT = "pdcorrect-checkpoint"
-VERSION = 4
+VERSION = 5
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
