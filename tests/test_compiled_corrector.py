@@ -138,7 +138,7 @@ def test_how_far_outside_the_training_data_a_body_is_agrees_with_torch():
         found = compiled.score(view)
         assert found[0] > 0.0
         torch.testing.assert_close(found, made.score(view), rtol=1e-12, atol=0.0)
-        made.envelope.shape_high -= 30.0  # of the body, too, as it is then
+        made.envelope.shape_high -= 3e4  # of the body, too, as it is then
         assert compiled.score(view) > 10.0 + found
         assert torch.equal(compiled.rest_score(view.bodies), made.rest_score(view.bodies))
 
