@@ -89,7 +89,7 @@ def main() -> None:
     def refused(problems: list[Problem]) -> int:
         """Scenes that the gate refuses as a whole, whose steps are the coarse ones."""
         corrector = model.corrector
-        device = corrector.normaliser.shape_low.device
+        device = corrector.normaliser.output_scale.device
         bodies = BodyGraph.of(problems, dtype=torch.float64, device=device)
         return int((Gate().foreign(corrector, bodies) > 0).sum())
 

@@ -222,11 +222,11 @@ def test_a_row_whose_corrections_are_all_refused_is_the_base_and_says_so(stiff, 
 
 
 def test_refused_corrections_are_told_with_their_numbers_and_meanings():
-    body, pause = Reason.BODY, Reason.PAUSE
+    outside, energy = Reason.OUTSIDE, Reason.ENERGY
     assert refused_corrections([]) == refused_corrections([0.0, 0.0]) == ""
-    told = refused_corrections([0.0, body, pause, body])
+    told = refused_corrections([0.0, outside, energy, outside])
     assert "3 of 4" in told
-    assert told.index(f"2 because {body.meaning}") < told.index(f"1 because {pause.meaning}")
+    assert told.index(f"2 because {outside.meaning}") < told.index(f"1 because {energy.meaning}")
 
 
 def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):

@@ -471,11 +471,9 @@ def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="corrector is a str"):
         HybridStepper(coarse, "weights.pt")
     with pytest.raises(InputError, match="gate is a dict"):
-        HybridStepper(coarse, corrector, gate={"margin": 1.0})
+        HybridStepper(coarse, corrector, gate={"energy": 1.0})
     with pytest.raises(InputError, match="velocity = 'mixed'"):
         BatchHybrid(stepper, corrector, velocity="mixed")
-    with pytest.raises(InputError, match="limit with placement 'force'"):
-        HybridStepper(coarse, fitted([problem], placement="force"), gate=Gate(limit=True))
     for hybrid in (HybridStepper, BatchHybrid):
         part = (pc.ProjectiveDynamics if hybrid is HybridStepper else pc.BatchStepper)(
             problem if hybrid is HybridStepper else [problem], integrator="bdf2"

@@ -97,7 +97,7 @@ def test_ranges_of_a_model_that_does_not_record_it_count_as_fitted_to_all_that_i
 
 def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlier, tmp_path):
     model = load_model(earlier)
-    low, high = model.corrector.normaliser.time_step_low, model.corrector.normaliser.time_step_high
+    low, high = model.corrector.envelope.time_step_low, model.corrector.envelope.time_step_high
     step = float(low.exp())
     for shift in (np.log(2.0), -np.log(2.0)):
         for bound in (low, high):
@@ -108,12 +108,12 @@ def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlie
         with pytest.raises(InputError, match=told):
             Training(settings(start, {"widen": False}), data, tmp_path / "out")
         found = Training(settings(start, {}), data, tmp_path / "out").corrector
-        assert found.normaliser.time_steps == pytest.approx(sorted((step, there)))
+        assert found.envelope.time_steps == pytest.approx(sorted((step, there)))
     for bound in (low, high):
         bound.fill_(np.log(step) + 0.05)  # which a gate lets pass
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = Training(settings(start, {"widen": False}), data, tmp_path / "out").corrector
-    assert found.normaliser.time_steps == model.corrector.normaliser.time_steps
+    assert found.envelope.time_steps == model.corrector.envelope.time_steps
 
 
 # --- weights and ranges of the start ----------------------------------------------------------
@@ -125,10 +125,9 @@ def test_a_training_starts_from_a_models_weights_and_its_ranges_grow(earlier, tm
     before = load_model(earlier).corrector
     training = Training(config, new, tmp_path / "out")
     assert torch.equal(weights(training.corrector), weights(before))
-    mine, theirs = training.corrector.normaliser, before.normaliser
-    assert mine.output_scale == theirs.output_scale
-    for name, known in theirs.named_buffers():
-        found = mine.get_buffer(name)
+    assert training.corrector.normaliser.output_scale == before.normaliser.output_scale
+    for name, known in before.named_buffers():
+        found = training.corrector.get_buffer(name)
         if name.endswith("__low"):
             assert (found <= known).all()
         elif name.endswith("__high"):
@@ -143,9 +142,9 @@ def test_a_training_starts_from_a_models_weights_and_its_ranges_grow(earlier, tm
 
     config = samples.config(samples.one_step(), start_from=str(earlier))
     training = Training(config, data, tmp_path / "same")
-    known = training.corrector.normaliser
+    known = training.corrector.envelope
     fitted = known.get_buffer("deformation__high").clone()
-    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
+    assert fitted == load_model(earlier).corrector.envelope.get_buffer("deformation__high")
     further = {name: RunningMoments() for name in known.names}
     for name, moments in further.items():
         width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
@@ -172,17 +171,17 @@ def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, t
 
 def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(data, earlier, tmp_path):
     model = load_model(earlier)
-    model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
-    model.corrector.normaliser.time_step_high += 1.0  # and of longer time steps, too
+    model.corrector.envelope.shape_high -= 1.0  # as of other bodies
+    model.corrector.envelope.time_step_high += 1.0  # and of longer time steps, too
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = {}
     for widen in (True, False):
         config = samples.config(samples.one_step(), start_from=str(start), fitting={"widen": widen})
         Training(config, data, tmp_path / str(widen)).run()
         found[widen] = load_model(tmp_path / str(widen) / "model").corrector
-    for name, known in model.corrector.normaliser.named_buffers():
-        assert torch.equal(found[False].normaliser.get_buffer(name), known), name
-    assert (found[True].normaliser.shape_high > model.corrector.normaliser.shape_high).all()
+    for name, known in model.corrector.named_buffers():
+        assert torch.equal(found[False].get_buffer(name), known), name
+    assert (found[True].envelope.shape_high > model.corrector.envelope.shape_high).all()
     assert torch.equal(weights(found[True]), weights(found[False]))
     assert not torch.equal(weights(found[True]), weights(model.corrector))
 

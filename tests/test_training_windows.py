@@ -10,7 +10,12 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.bodies import KNOWN, BodyGraph  # noqa: E402
-from pdcorrect.corrector.features import FeatureView  # noqa: E402
+from pdcorrect.corrector.features import (  # noqa: E402
+    EDGE_FEATURES,
+    NODE_FEATURES,
+    FeatureView,
+    values,
+)
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.training.batch_losses import OneStepBatches, one_step_loss  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
@@ -192,34 +197,35 @@ def test_bodies_of_the_training_split_are_like_it_whatever_part_is_fitted_to(fol
     every = windows.batch(range(len(windows.dataset)))
     view = FeatureView(every.bodies, every.snapshot)
     averages = every.bodies.body_means(corrector.inputs(view)[0])
-    normaliser = corrector.normaliser
+    envelope = corrector.envelope
     np.testing.assert_allclose(
-        normaliser.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
+        envelope.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
     )
     np.testing.assert_allclose(
-        normaliser.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
+        envelope.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
     )
     np.testing.assert_allclose(
-        normaliser.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
+        envelope.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
     )
-    assert 1.0 < float(corrector.unlike(view).max()) <= 3.5 + 1e-9
+    assert 1.0 < float(envelope.strangeness(averages).max()) <= 3.5 + 1e-9
+    assert not (corrector.score(view) > 1.0).any()
 
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
     corrector = samples.fitted(folder, settings)
-    corrector.normaliser.shape_low.fill_(torch.nan)
+    corrector.envelope.shape_low.fill_(torch.nan)
     fit_normaliser(corrector, windows, 1)
     bodies = windows.batch(range(len(windows.dataset))).bodies
     assert len(torch.unique(bodies.shapes, dim=0)) > 1
-    assert not corrector.shape_excess(bodies).any()
-    normaliser = corrector.normaliser
-    assert torch.equal(normaliser.shape_low, bodies.shapes.double().amin(dim=0))
-    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
-    normaliser.shape_low += 1.0  # as of larger bodies
-    assert (corrector.shape_excess(bodies) > 0.5).any()
+    envelope = corrector.envelope
+    assert not envelope.shape_excess(bodies.shapes).any()
+    assert torch.equal(envelope.shape_low, bodies.shapes.double().amin(dim=0))
+    assert torch.equal(envelope.shape_high, bodies.shapes.double().amax(dim=0))
+    envelope.shape_low += 1.0  # as of larger bodies
+    assert (envelope.shape_excess(bodies.shapes) > 0.5).any()
     widen_ranges(corrector, windows, 1)
-    assert not corrector.shape_excess(bodies).any()
-    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
+    assert not envelope.shape_excess(bodies.shapes).any()
+    assert torch.equal(envelope.shape_high, bodies.shapes.double().amax(dim=0))
 
 
 def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
@@ -227,22 +233,24 @@ def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
     windows, _ = samples.windows(folder, settings)
     corrector, size = samples.fitted(folder, settings), 0.05
     step = windows.dataset.headers[0].time_step / size
-    normaliser = corrector.normaliser
-    normaliser.time_step_low.fill_(torch.nan)
+    envelope = corrector.envelope
+    envelope.time_step_low.fill_(torch.nan)
     fit_normaliser(corrector, windows, 1)
-    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+    assert envelope.time_steps == pytest.approx((step, step), rel=1e-6)
     bodies = windows.batch([0]).bodies
     assert bodies.time_steps.tolist() == pytest.approx([np.log(step)], abs=1e-6)
-    assert corrector.time_step_excess(bodies).tolist() == [0.0]
+    assert envelope.time_step_excess(bodies.time_steps).tolist() == [0.0]
     for shift in (np.log(2.0), -np.log(2.0)):  # as of data with another step
-        normaliser.time_step_low += shift
-        normaliser.time_step_high += shift
-        assert corrector.time_step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
+        envelope.time_step_low += shift
+        envelope.time_step_high += shift
+        assert envelope.time_step_excess(bodies.time_steps).tolist() == pytest.approx(
+            [np.log(2.0)], abs=1e-6
+        )
         both = sorted((step, step * np.exp(shift)))
         widen_ranges(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx(both, rel=1e-6)
+        assert envelope.time_steps == pytest.approx(both, rel=1e-6)
         fit_normaliser(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+        assert envelope.time_steps == pytest.approx((step, step), rel=1e-6)
 
 
 def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
@@ -270,7 +278,10 @@ def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers)
 
     def outside(numbers):
         batch = windows.batch(numbers.tolist())
-        return corrector.outside(FeatureView(batch.bodies, batch.snapshot), 0.0)
+        view = FeatureView(batch.bodies, batch.snapshot)
+        config = corrector.config
+        names = ((NODE_FEATURES, config.node_features), (EDGE_FEATURES, config.edge_features))
+        return torch.cat([corrector.excess(values(*row, view)) for row in names])
 
     assert not outside(first).any()
     assert outside(others).any()  # so few windows do not hold all of the rest

@@ -210,7 +210,10 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     if problem.scene.time.integrator != "quasi-static":
         say(gained_energy(stats))
     if "gate" in stats:
-        say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
+        if not stats["refused"].all():
+            say(
+                f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame"
+            )
         say(refused_corrections(stats["gate"]))
 
 

@@ -9,8 +9,8 @@ import torch
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.envelope import TIME_STEP
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
-from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.errors import InputError
 from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
@@ -37,11 +37,10 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
         limit holds for first steps.
     """
     chosen = _chosen(np.arange(len(windows.dataset)), most, seed)
-    corrector.normaliser.fit(*_moments(corrector, windows, chosen))
-    corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
-    shapes, steps = _at_rest(windows)
-    corrector.normaliser.fit_shapes(shapes)
-    corrector.normaliser.fit_time_steps(steps)
+    found, target = _moments(corrector, windows, chosen)
+    corrector.normaliser.fit(found, target)
+    averages = _averages(corrector, windows, chosen)
+    corrector.envelope.fit({**found, "average": averages, **_at_rest(windows)})
     _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
 
@@ -52,9 +51,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
-    shapes, steps = _at_rest(windows)
-    corrector.normaliser.widen_shapes(shapes)
-    corrector.normaliser.widen_time_steps(steps)
+    corrector.envelope.widen(_at_rest(windows))
     _widen(corrector, windows, _chosen(np.arange(len(windows.dataset)), most, seed))
     _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
@@ -67,13 +64,13 @@ def check_time_steps(corrector: Corrector, windows: StepWindows) -> None:
     InputError
         If some have such a time step: the gate would refuse every step of these bodies.
     """
-    _, found = _at_rest(windows)
-    steps, bound = torch.cat([found.low, found.high]), Gate().time_step
-    if bound is None or not (corrector.normaliser.time_step_excess(steps) > bound).any():
+    found = _at_rest(windows)["time_step"]
+    steps = torch.cat([found.low, found.high])
+    if not (corrector.envelope.time_step_excess(steps) > TIME_STEP).any():
         return
     here, there = (
         " to ".join(dict.fromkeys(f"{x:.4g}" for x in each))
-        for each in (steps.exp().tolist(), corrector.normaliser.time_steps)
+        for each in (steps.exp().tolist(), corrector.envelope.time_steps)
     )
     raise InputError(
         f"fitting.widen = false: the data's time step over the cell size is {here} s/m, that of "
@@ -83,8 +80,9 @@ def check_time_steps(corrector: Corrector, windows: StepWindows) -> None:
 
 
 def _widen(corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True) -> None:
-    corrector.normaliser.widen(_moments(corrector, windows, chosen, last)[0])
-    corrector.normaliser.widen_averages(_averages(corrector, windows, chosen, last))
+    found, _ = _moments(corrector, windows, chosen, last)
+    averages = _averages(corrector, windows, chosen, last)
+    corrector.envelope.widen({**found, "average": averages})
 
 
 def _chosen(numbers: Numbers, most: int, seed: int) -> Numbers:
@@ -123,13 +121,13 @@ def _averages(
     return averages
 
 
-def _at_rest(windows: StepWindows) -> tuple[RunningMoments, RunningMoments]:
+def _at_rest(windows: StepWindows) -> dict[str, RunningMoments]:
     """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
     shapes, steps = RunningMoments(), RunningMoments()
     for batch in _batches(windows, windows.of_each_file(), last=False):
         shapes.add(batch.bodies.shapes)
         steps.add(batch.bodies.time_steps[:, None])
-    return shapes, steps
+    return {"shape": shapes, "time_step": steps}
 
 
 def _batches(windows: StepWindows, chosen: Numbers, last: bool) -> Iterator[StepBatch]:
