@@ -494,15 +494,6 @@ def test_a_correction_before_of_other_bodies_is_refused(placement):
         layer(state.positions, state.velocities, previous=other)
 
 
-def test_a_state_or_forces_that_are_none_are_refused():
-    problem = pc.discretise(soft_beam())
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]))
-    with pytest.raises(InputError, match="state is a"):
-        stepper(problem.positions)
-    with pytest.raises(InputError, match="forces has shape"):
-        stepper(problem.rest_state(), np.zeros((2, 3)))
-
-
 def test_the_mass_times_a_correction_is_differentiated_as_it_is_computed():
     cells = (2, 1, 1), (3, 2, 1)
     scenes = [pc.discretise(soft_beam(c, solver={"mass": "averaged"})) for c in cells]

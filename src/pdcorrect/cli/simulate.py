@@ -211,9 +211,8 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         say(gained_energy(stats))
     if "gate" in stats:
         if not stats["refused"].all():
-            say(
-                f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame"
-            )
+            largest = 1e3 * stats["correction"].max()
+            say(f"corrections: at most {largest:.3g} mm of a node in a frame")
         say(refused_corrections(stats["gate"]))
 
 
