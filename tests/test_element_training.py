@@ -282,7 +282,7 @@ def test_time_that_is_up_and_other_recipes(few, tmp_path):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="of a GPU's graphs")
 def test_recorded_steps_learn_what_others_do(found, monkeypatch):
     samples, ends = [sample(answer) for _, answer in found], []
-    for replaced in (training.Recorded, lambda work: work):
+    for replaced in (training.Recorded, lambda work, pool: work):
         monkeypatch.setattr(training, "Recorded", replaced)
         trainer = training.Trainer(RECIPE, samples, samples, "cuda")
         for _ in range(4):
