@@ -10,17 +10,17 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load, save
+from safetensors.torch import load
 
 from pdcorrect._environment import environment
-from pdcorrect._files import make_folder, write_bytes, write_text
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
 from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.element_network import MODEL, read_network
+from pdcorrect.fem.element_network import MODEL, read_network, write_network
 from pdcorrect.fem.learned import effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
 from pdcorrect.fem.problem import Problem
@@ -102,7 +102,7 @@ def tune(
     tuned = Tuned(means(base), means(started), means(_found(network, batches)))
     if not np.isfinite(tuned.after["displacements"]):
         raise ConvergenceError("the weights have become infinite or NaN.")
-    write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
+    write_network(path, {k: v.numpy() for k, v in network.state_dict().items()})
     card = {
         "format": 1,
         "scene": problem.scene.name,

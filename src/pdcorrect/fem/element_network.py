@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect._files import write_bytes
 from pdcorrect.errors import FileFormatError, FileVersionError
 from pdcorrect.fem.cube_symmetry import on_scalars, on_strains
 from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, CellGraph, permutations
@@ -20,6 +22,8 @@ Array = NDArray[np.float64]
 
 STRAINS, SCALARS = 18, 7
 """Rows of the matrices of stiffness and of mass."""
+KIND = {"element": "hex8-learned", "version": "1"}
+"""In every file of weights: what cells' numbers and the network's answers mean."""
 MODEL = Path(__file__).parent / "hex8_learned.safetensors"
 EPSILON = 1e-6
 """Of the mean square that features are divided by."""
@@ -255,7 +259,7 @@ def read_network(path: Path) -> Network:
     FileFormatError
         If the file is missing or damaged.
     FileVersionError
-        If the network sees other numbers, or answers otherwise.
+        If they are of another version of the element, or the network has other sizes.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -269,6 +273,8 @@ def read_network(path: Path) -> Network:
     expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
     try:
         arrays = load(content)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        kind = header.get("__metadata__")
         finite = all(np.isfinite(x).all() for x in arrays.values())
         network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
         if finite and network.shape == expected:  # one cell alone, for the sizes in between
@@ -280,9 +286,22 @@ def read_network(path: Path) -> Network:
         ) from None
     if not finite:
         raise FileFormatError(f"{path}: weights that are not finite.")
-    if network.shape != expected:
+    if kind != KIND or network.shape != expected:
         raise FileVersionError(
-            f"{path}: from {network.shape[0]} to {network.shape[1]} numbers: expected "
-            f"{expected[0]} and {expected[1]}, those of this version's learned element."
+            f"{path}: weights of {kind}, from {network.shape[0]} to {network.shape[1]} numbers: "
+            f"expected {KIND}, from {expected[0]} to {expected[1]}."
         )
     return network
+
+
+def write_network(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write weights by name, as `pdcorrect.elements.network` has them.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    from safetensors.numpy import save
+
+    write_bytes(path, save(dict(arrays), metadata=KIND))

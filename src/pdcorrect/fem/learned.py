@@ -48,8 +48,10 @@ STIFFEST, VOLUME = 3.0, 0.3
 lets it change by this share of its own."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
-_CONTRAST, _DENSITIES, _POISSONS = 12.0, 5.0, 0.1
-"""Ratios of the moduli and of the densities, and the difference of Poisson's ratios, in reach."""
+_CONTRAST, _DENSITIES, _POISSONS = 10.0, 2.0, 0.1
+"""Ratios of the moduli and of the densities in reach, those of the training, and the difference of
+Poisson's ratios, whose training has one a body."""
+_ROUNDING = 1.0 + 1e-6
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
 
@@ -132,7 +134,9 @@ class ElementWriter:
         self._placed: dict[str, NDArray[np.bool_]] = {
             "that are not cubes of the grid": self._grid.regular,
             "beside nodes held in some components": ~partly,
-            f"in reach of densities over {_DENSITIES:g} times apart": most <= _DENSITIES * least,
+            f"in reach of densities over {_DENSITIES:g} times apart": (
+                most <= _ROUNDING * _DENSITIES * least
+            ),
         }
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
@@ -232,8 +236,10 @@ class ElementWriter:
             f"of nu outside 0 to {LARGEST_POISSON:.3g}": (
                 (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
             ),
-            f"in reach of moduli over {_CONTRAST:g} times apart": stiff <= _CONTRAST * soft,
-            f"in reach of nu over {_POISSONS:g} apart": most <= least + _POISSONS,
+            f"in reach of moduli over {_CONTRAST:g} times apart": (
+                stiff <= _ROUNDING * _CONTRAST * soft
+            ),
+            f"in reach of nu over {_POISSONS:g} apart": most <= least + _ROUNDING * _POISSONS,
         }
 
     def _seen(self, young: Array, poisson: Array) -> tuple[CellGraph, NDArray[np.bool_]]:
