@@ -189,9 +189,12 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
+    element, correction = problem.element, problem.correction
+    if correction is not None and not correction.learned.all():
+        element += f", {int(correction.learned.sum())} of them learned"
     say(
         f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
-        f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
+        f"and {len(problem.cells)} cells ({element}, {problem.mass_rule} mass) in "
         f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
     )
     say(
