@@ -72,8 +72,8 @@ def tune(
         If the weights do not stay finite.
     InputError
         If cells are off the grid or the body is in several pieces, nodes are held in some
-        components, or some nodes but no face of a cell, Poisson's ratios are several or too large, or the
-        file's name does not end with safetensors.
+        components, or some nodes but no face of a cell, Poisson's ratios are several or too large,
+        or the file's name does not end with safetensors.
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
