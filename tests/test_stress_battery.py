@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import pdcorrect as pc
 from conftest import rotation
-from pdcorrect.corrector.gate import Reason
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import make_plan
 from pdcorrect.scene import trained_coarse
@@ -230,10 +231,8 @@ def test_the_model_knows_the_cross_at_rest_and_not_with_its_far_end_held():
     found = pc.load_model("torsion-exact")
     for name, known in (("cross ordinary", True), ("cross plane", True), ("cross turned", False)):
         problem = pc.discretise(trained_coarse(SCENES[name].scene))
-        coarse = pc.ProjectiveDynamics(problem)
-        stepper = pc.HybridStepper(coarse, found.corrector, gate=pc.Gate())
-        refused = stepper(problem.rest_state()).stats["gate"] == Reason.OUTSIDE
-        assert refused != known
+        bodies = BodyGraph.of([problem], dtype=torch.float64)
+        assert (found.corrector.envelope.rest_score(bodies) <= pc.Gate().outside) == known
 
 
 def test_the_crosses_load_turns_round_at_every_step():
