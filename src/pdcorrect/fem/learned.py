@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
+from pdcorrect.fem.clamps import Clamps
 from pdcorrect.fem.cube_symmetry import MANDEL, SCALAR_PATTERNS
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.element_network import STRAINS, Network
@@ -116,16 +117,15 @@ class ElementWriter:
     network : Network
     body : ElasticBody
         Of an element with 8 nodes.
-    free : (N, 3)
-        Components that may move.
+    clamps : Clamps
     """
 
-    def __init__(self, network: Network, body: ElasticBody, free: NDArray[np.bool_]) -> None:
+    def __init__(self, network: Network, body: ElasticBody, clamps: Clamps) -> None:
         self._network, self._body = network, body
         self.digest = network.digest
         self._grid = on_grid(body.positions, body.cells)
         cells = self._grid.cells
-        self._images = mirrored(self._grid, free)
+        self._images = mirrored(self._grid, clamps.free, clamps.still)
         self._inside: NDArray[np.bool_] = ~self._images.held[: len(cells)].max(axis=1)
         least, most = self._extremes(body.materials.density)
         self._placed: dict[str, NDArray[np.bool_]] = {

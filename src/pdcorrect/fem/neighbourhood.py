@@ -129,16 +129,17 @@ class Images(NamedTuple):
     partly: NDArray[np.bool_]
 
 
-def mirrored(grid: Grid, free: NDArray[np.bool_]) -> Images:
+def mirrored(grid: Grid, free: NDArray[np.bool_], still: NDArray[np.bool_]) -> Images:
     """The body that cells on a grid are a half, quarter or eighth of, by how nodes are held.
 
     The outermost face of cells along an axis is a plane of symmetry where all its nodes are held
-    along the axis, as by rollers, and not all of them in all components; one for each axis.
+    along the axis, as by rollers that do not move, and not all of them in all components; one for
+    each axis.
 
     Parameters
     ----------
-    free : (N, 3)
-        Components that may move.
+    free, still : (N, 3)
+        Components that may move, and those that are held where they are.
     """
     cells, place, count = grid.cells, grid.place, len(free)
     planes = np.zeros((count, 3), dtype=bool)
@@ -146,7 +147,7 @@ def mirrored(grid: Grid, free: NDArray[np.bool_]) -> Images:
     for axis, side in np.ndindex(3, 2):
         outermost = (place[:, axis].max if side else place[:, axis].min)()
         face = cells[place[:, axis] == outermost][:, VTK_CORNERS[:, axis] == side]
-        if free[face, axis].any() or not free[face].any() or planes[:, axis].any():
+        if not (still[face, axis].all() and free[face].any()) or planes[:, axis].any():
             continue
         planes[face, axis] = True
         mirrors.append((axis, 2 * outermost + 2 * side - 1))
