@@ -727,6 +727,12 @@ def test_a_result_keeps_its_numbers():
     assert torch.equal(result.y, y)
 
 
+def test_a_result_of_another_step_is_refused():
+    stepper, _, result = two()
+    with pytest.raises(InputError, match=r"a step of 0\.01 s"):
+        pc.BatchGradients(stepper, result.state, result)
+
+
 def test_padding_is_told():
     stepper, rest, result = two()
     assert stepper.node_counts == (12, 16)

@@ -328,6 +328,19 @@ def test_missing_unexpected_and_left_over_files_are_found(dataset):
     assert finding.path == dataset / "training/mesh-0001.h5"
 
 
+@pytest.mark.parametrize(
+    ("what", "values"), [("code", ("a" * 64, "b" * 64)), ("device", ("cpu", "NVIDIA H100"))]
+)
+def test_files_of_different_code_or_devices_are_pointed_out(dataset, what, values):
+    paths = all_shards(dataset)
+    for path, value in zip(paths, np.repeat(values, 2).tolist(), strict=True):
+        changed(path, lambda s, value=value: dataclasses.replace(s, provenance={what: value}))
+    ((path, message),) = findings(dataset, "warning")
+    assert path == paths[2].relative_to(dataset).as_posix()
+    assert str(paths[0].relative_to(dataset)) in message
+    assert values[1][:12] in message
+
+
 def test_a_content_other_than_the_manifest_has_is_found(dataset):
     names = [plan.name for plan in make_plan(sample_config())]
     hashes = {name: read_header(dataset / f"{name}.h5").content_hash for name in names}

@@ -196,6 +196,12 @@ def test_files_of_the_same_names_are_replaced_only_when_asked(folder, tmp_path):
     assert (target / "meta.json").read_text() != "mine"
 
 
+def test_files_of_another_export_are_not_mixed_with_new_ones(folder, tmp_path):
+    export_meshgraphnet(folder, tmp_path / "target")
+    with pytest.raises(OutputError, match="another export"):
+        export_meshgraphnet(folder, tmp_path / "target", split="longer", overwrite=True)
+
+
 def test_an_export_that_fails_leaves_the_earlier_one(folder, tmp_path):
     target = tmp_path / "target"
     written = export_meshgraphnet(folder, target, split="longer")

@@ -135,6 +135,19 @@ def test_a_body_with_out_of_distribution_means_is_refused_though_each_node_is_wi
         assert one(problem.rest_state()).stats["gate"] == reason, scene
 
 
+def test_a_correction_may_improve_what_the_coarse_step_inverted():
+    problem = pc.discretise(soft_beam(loads=[], time={"step": 1e-6, "frames": 1}))
+    bad = pc.State(problem.positions + folded(problem), np.zeros_like(problem.positions))
+    coarse = pc.ProjectiveDynamics(problem)
+    answer = coarse(bad).state.positions
+    assert problem.volume_ratios(answer).min() < 0.0
+    corrector = prescribed(problem, 0.1 * (problem.positions - answer))
+    gate = Gate(outside=None, energy=None, crushing=0.5)
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["refused"] == 0.0
+    corrector.answer = -corrector.answer
+    assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["gate"] == Reason.INVERSION
+
+
 @pytest.mark.parametrize("placement", PLACEMENTS)
 def test_a_failed_coarse_step_is_not_corrected(placement):
     problem = pc.discretise(soft_beam(loads=[TORSION]))

@@ -13,7 +13,7 @@ from pdcorrect.batch.checks import check_nodal, check_state
 from pdcorrect.batch.follower import Mixing
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import largest_displacement
-from pdcorrect.batch.states import BatchState, Solved, in_one
+from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Material
@@ -21,6 +21,9 @@ from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.follower import MOST
 from pdcorrect.solvers.implicit import positive
 from pdcorrect.solvers.schemes import Linear
+
+_TIMES_DIFFER = 1e-6
+"""Of the step, or of the time, that times may be apart."""
 
 
 class BatchGradients:
@@ -77,6 +80,14 @@ class BatchGradients:
                 f"result has configurations {tuple(result.y.shape)}: expected "
                 f"{tuple(stepper.cells.rest.shape)}, from a step of this stepper."
             )
+        if isinstance(result, BatchResult):
+            step = stepper.time_step
+            for i, (start, end) in enumerate(zip(before.times, result.state.times, strict=True)):
+                if abs(end - start - step) > _TIMES_DIFFER * (step + abs(end)):
+                    raise InputError(
+                        f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
+                        f"a step of {step:g} s from before."
+                    )
         tolerance = positive("tolerance", tolerance)
         self._stepper, self._before, self._y = stepper, before, result.y
         self._nodes = stepper.cells.sizes.nodes

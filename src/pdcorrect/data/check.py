@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -152,6 +153,8 @@ class _Check:
         First file with a mesh, and with a mesh and its material, by their digests.
     forces : dict of str to str
         Where forces on a mesh came first.
+    origins : dict of str to dict of str to Path
+        First file made by each state of the code, and on each device.
     """
 
     folder: Path
@@ -163,6 +166,7 @@ class _Check:
     meshes: dict[str, Path] = field(default_factory=dict)
     bodies: dict[str, Path] = field(default_factory=dict)
     forces: dict[str, str] = field(default_factory=dict)
+    origins: dict[str, dict[str, Path]] = field(default_factory=dict)
 
     def error(self, path: Path, message: str) -> None:
         """Note an error."""
@@ -176,7 +180,7 @@ class _Check:
         """Read the configuration and derive the files that it asks for; imports have none."""
         path = self.folder / CONFIG
         try:
-            if not path.exists() and paths and not read_header(paths[0]).config_hash:
+            if not path.exists() and self._imported(paths):
                 return
             self.config = DatasetConfig.load(path)
             plans = make_plan(self.config)
@@ -184,6 +188,14 @@ class _Check:
             self.error(path, _reason(path, error))
             return
         self.plans = {self.folder / f"{plan.name}{SUFFIX}": plan for plan in plans}
+
+    @staticmethod
+    def _imported(paths: Sequence[Path]) -> bool:
+        """Whether the first file that can be read was imported."""
+        for path in paths:
+            with suppress(InputError):
+                return not read_header(path).config_hash
+        return False
 
     def load_manifest(self) -> None:
         """Read the hashes that the manifest lists; unfinished data sets have none."""
@@ -233,6 +245,7 @@ class _Check:
             return
         for message in (*file_faults(shard), *self._config_faults(path, shard)):
             self.error(path, message)
+        self._origin(path, shard)
         self._repetitions(path, shard)
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
@@ -252,6 +265,18 @@ class _Check:
             if not found and self.repeat:
                 limit = float(shard.attributes["tolerance"]) * cell_size(shard)
                 yield from step_faults(path, shard, self.repeat, limit)
+
+    def _origin(self, path: Path, shard: Shard) -> None:
+        """Changes of the code and of the device between files, where they tell."""
+        for what, told in (("code", "made by other code than {} (SHA-256 {:.12})"),
+                           ("device", "computed on another device than {}: {}")):  # fmt: skip
+            own = shard.provenance.get(what)
+            if own is None:
+                continue
+            known = self.origins.setdefault(what, {})
+            if known and own not in known:
+                self.warn(path, told.format(self._short(next(iter(known.values()))), own))
+            known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""

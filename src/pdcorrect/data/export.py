@@ -31,7 +31,13 @@ SIMULATOR = "pdcorrect"
 def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
     """A new folder in ``target`` to write to, whose files are moved there in the end.
 
-    If anything fails, ``target`` is as it was before.
+    If writing fails, ``target`` is as it was before.
+
+    Raises
+    ------
+    OutputError
+        If files are there already, or, whatever ``overwrite``, others that would be taken for
+        parts of the same export, or if some cannot be moved.
     """
     existed = target.is_dir()
     staging = target / "export.part"
@@ -46,8 +52,14 @@ def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
                 f"{target / there[0]}: exists already; choose another folder, or replace it with "
                 "--overwrite (overwrite=True)."
             )
-        for name in names:
-            (staging / name).replace(target / name)
+        others = [path for path in sorted(target.glob("*.h5")) if path.name not in names]
+        if "meta.json" in names and others:
+            raise OutputError(f"{others[0]}: is of another export: expected an empty folder.")
+        try:
+            for name in names:
+                (staging / name).replace(target / name)
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written ({error.strerror}).") from None
     finally:
         shutil.rmtree(staging, ignore_errors=True)
         if not existed:

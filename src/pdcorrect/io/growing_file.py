@@ -14,6 +14,7 @@ import io
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -63,6 +64,20 @@ class Reserve:
         if self._end and self._path.stat().st_size > used:
             os.truncate(self._path, used)
         self._end = 0
+
+
+def abandon(file: Any, path: Path) -> None:
+    """Close an h5py file that can no longer be written, without changing it on the disk.
+
+    HDF5, which would write its metadata, is given a scratch copy to finish on.  If there is no
+    room for one either, the file stays open.
+    """
+    with contextlib.suppress(Exception), tempfile.TemporaryFile() as scratch:
+        with path.open("rb") as original:
+            shutil.copyfileobj(original, scratch)
+        scratch.flush()
+        os.dup2(scratch.fileno(), file.id.get_vfd_handle())
+        file.close()
 
 
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
@@ -287,8 +302,7 @@ class GrowingFile:
         except (OSError, RuntimeError, ValueError) as error:
             self._broken = True
             if self._file:
-                with contextlib.suppress(OSError, RuntimeError, ValueError):
-                    self._file.close()
+                abandon(self._file, self.path)
             raise OutputError(
                 f"{self.path}: cannot be written ({_reason(error)}); its first {self.records} "
                 "frames are intact. Free some space or choose another place."

@@ -2,7 +2,7 @@
 
 HDF5 refuses a file that is shorter than its superblock says, or that its writer
 never closed; its reading mode for files in writing waits for ever where something is
-damaged.  `repaired` gives HDF5 such a file as if it were closed, with zeros in place
+damaged.  `RepairedFile` gives HDF5 such a file as if it were closed, with zeros in place
 of what is missing; every index and chunk of a trajectory carries a checksum, so those
 zeros are noticed and never taken for data.
 """
@@ -14,6 +14,7 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pdcorrect.errors import FileFormatError
 
@@ -74,14 +75,52 @@ def read_superblock(path: Path) -> Superblock:
     return Superblock(struct.unpack_from("<Q", head, _END)[0], head[11] != 0, size)
 
 
-def repaired(path: Path, block: Superblock) -> io.BytesIO:
-    """A file's bytes, marked as closed and padded with zeros."""
-    data = bytearray(path.read_bytes())
-    data += bytes(max(0, block.end - len(data)))
-    data[11] = 0
-    struct.pack_into("<Q", data, _END, len(data))
-    struct.pack_into("<I", data, _CHECKSUM, _lookup3(bytes(data[:_CHECKSUM])))
-    return io.BytesIO(data)
+class RepairedFile(io.RawIOBase):
+    """A readable view of a trajectory file, marked as closed and padded with zeros."""
+
+    def __init__(self, path: Path, block: Superblock) -> None:
+        super().__init__()
+        self._file = path.open("rb")
+        head = bytearray(self._file.read(_SIZE))
+        self._size = max(block.size, block.end)
+        head[11] = 0
+        head[_END : _END + 8] = struct.pack("<Q", self._size)
+        head[_CHECKSUM:] = struct.pack("<I", _lookup3(bytes(head[:_CHECKSUM])))
+        self._head = bytes(head)
+        self._at = 0
+
+    def readable(self) -> bool:
+        """True."""
+        return True
+
+    def seekable(self) -> bool:
+        """True."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to a byte position of the padded file."""
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        """Byte position."""
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill ``buffer`` from the file; zeros beyond its end."""
+        count = len(buffer)
+        self._file.seek(self._at)
+        data = self._file.read(count).ljust(count, b"\0")
+        if self._at < _SIZE:
+            data = (self._head[self._at :] + data[_SIZE - self._at :])[:count]
+        buffer[:] = data
+        self._at += count
+        return count
+
+    def close(self) -> None:
+        """Close the file behind the view."""
+        self._file.close()
+        super().close()
 
 
 def _rotate(x: int, k: int) -> int:

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.io.superblock import Superblock, read_superblock, repaired
+from pdcorrect.io.superblock import RepairedFile, Superblock, read_superblock
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
@@ -69,7 +69,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Superblock]]:
     block = read_superblock(path)
     try:
         whole = not (block.truncated or block.in_writing)
-        with h5py.File(path if whole else repaired(path, block), "r", locking=False) as file:
+        with h5py.File(path if whole else RepairedFile(path, block), "r", locking=False) as file:
             yield file, block
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}.") from None
@@ -143,9 +143,12 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     _check_format(file)
     remembered = list(file["memory"]) if "memory" in file else []
     names = ("positions", "velocities", "times", *(f"memory/{name}" for name in remembered))
+    for name in (*names, "mesh/points", "mesh/cells"):
+        if name not in file:
+            raise FileFormatError(f"{name!r} is missing")
     datasets = {name: file[name] for name in names}
-    stats = dict(file["stats"].items()) if "stats" in file else {}
     frames = datasets["times"].shape[0]
+    stats = dict(file["stats"].items()) if "stats" in file else {}
     if salvage or block.truncated or block.in_writing:
         intact = _intact_frames([*datasets.values()], [*stats.values()], frames, block.size)
         if not salvage and block.truncated and (intact < frames or not block.in_writing):
