@@ -84,15 +84,15 @@ def fitted(name: str, view: FeatureView) -> Corrector:
         for feature, values in features.values(table, names, view).items():
             found[feature] = RunningMoments()
             found[feature].add(values)
-    target, averages, shapes, steps = (RunningMoments() for _ in range(4))
+    target = RunningMoments()
     target.add(torch.ones(1, 1))
     corrector.normaliser.fit(found, target)
-    averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
-    corrector.normaliser.fit_averages(averages)
-    shapes.add(view.bodies.shapes)
-    corrector.normaliser.fit_shapes(shapes)
-    steps.add(view.bodies.time_steps[:, None])
-    corrector.normaliser.fit_time_steps(steps)
+    rest = {"shape": view.bodies.shapes, "time_step": view.bodies.time_steps[:, None]}
+    averages = view.bodies.body_means(corrector.inputs(view)[0])
+    for name, values in {"average": averages, **rest}.items():
+        found[name] = RunningMoments()
+        found[name].add(values)
+    corrector.envelope.fit(found)
     return corrector.eval()
 
 
@@ -147,7 +147,7 @@ def steps(
     state = pc.State(step.positions.numpy(), step.velocities.numpy())
     forces, times = step.forces.numpy(), {}
     # other velocities than those that the normaliser has seen
-    gate = pc.Gate(margin=1e3, average=1e3)
+    gate = pc.Gate(outside=1e3)
     for kind, model in (("", scene), ("best_", trained_coarse(scene))):
         coarse = pc.ProjectiveDynamics(pc.discretise(model))
         hybrid = pc.HybridStepper(coarse, corrector, gate=gate).prepare()

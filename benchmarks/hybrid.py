@@ -88,10 +88,11 @@ def main() -> None:
 
     def refused(problems: list[Problem]) -> int:
         """Scenes that the gate refuses as a whole, whose steps are the coarse ones."""
-        corrector = model.corrector
-        device = corrector.normaliser.shape_low.device
+        corrector, gate = model.corrector, Gate()
+        device = corrector.normaliser.output_scale.device
         bodies = BodyGraph.of(problems, dtype=torch.float64, device=device)
-        return int((Gate().foreign(corrector, bodies) > 0).sum())
+        assert gate.outside is not None
+        return int((corrector.envelope.rest_score(bodies) > gate.outside).sum())
 
     data = Path(chosen.data)
     source = drawn(data, chosen.split, base) if data.is_file() else stored(data, chosen.split, base)

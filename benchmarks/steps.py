@@ -22,7 +22,7 @@ def main() -> None:
     scene = pc.Scene.load(SCENE)
     rows = []
     for solver, refine in (("pd", 1), ("pd", 2), ("pd", 4), ("newton", 1), ("newton", 2)):
-        stepper = make_stepper(scene, solver, refine)
+        stepper = make_stepper(pc.discretise(scene, refine=refine), solver)
         run = pc.rollout(stepper, frames=10)
         rows.append(
             {

@@ -27,7 +27,8 @@ def main() -> None:
         del os.environ["GOMP_SPINCOUNT"]
     if blas == "all":
         implicit.quiet_blas = nullcontext
-    run = pc.rollout(make_stepper(pc.Scene.load(SCENE), "pd", refine), frames=6)
+    problem = pc.discretise(pc.Scene.load(SCENE), refine=refine)
+    run = pc.rollout(make_stepper(problem, "pd"), frames=6)
     print(json.dumps(1e3 * float(np.median(run.stats["seconds"]))))
 
 

@@ -135,7 +135,7 @@ def _split_cells(name: str, split: SplitInfo) -> tuple[object, ...]:
     return (
         name, split.meshes, split.simulations, f"{split.nodes[0]:.0f} to {split.nodes[1]:.0f}",
         f"{100 * split.rejection_rate:.2g}", "" if error is None else f"{1e3 * error:.3g}",
-        "" if best is None or best.omega is None else f"{best.omega.mean:.3g}",
+        "" if best is None or best.omega is None else f"{best.omega:.3g}",
     )  # fmt: skip
 
 
@@ -146,7 +146,7 @@ def _use(
     machine = made_with.get("processor", "?") if where == "cpu" else where
     yield (
         f"**Made** by `pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}, in "
-        f"{info.whole.seconds['total']:.0f} worker seconds, {made_with.get('date', '?')}, "
+        f"{info.whole.seconds:.0f} worker seconds, {made_with.get('date', '?')}, "
         f"pdcorrect {made_with.get('pdcorrect', '?')}, {machine}; "
         f"{info.whole.bytes / 1e6:.0f} MB. SHA-256 `{content}`; other devices differ within the "
         "solver's tolerance."

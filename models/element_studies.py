@@ -82,9 +82,9 @@ FULL = ElementRecipe()
 STUDIES: dict[str, tuple[ElementRecipe, type[ElementNetwork]]] = {
     **{f"{n} bodies": (replace(FULL, bodies=n), ElementNetwork) for n in (50, 200, 1000)},
     f"{FULL.bodies} bodies": (FULL, ElementNetwork),
-    "sees 3 cells across": (replace(FULL, rounds=1), ElementNetwork),
-    "sees 5 cells across": (replace(FULL, rounds=2), ElementNetwork),
-    "MLP on 27 cells": (replace(FULL, width=256), NeighbourhoodMLP),
+    "sees 5 cells across": (replace(FULL, rounds=1), ElementNetwork),
+    "sees 7 cells across": (replace(FULL, rounds=2), ElementNetwork),
+    "MLP that sees 5 cells across": (replace(FULL, width=256), NeighbourhoodMLP),
     "without mass": (FULL, WithoutMass),
     "one orientation": (FULL, OneOrientation),
 }

@@ -12,6 +12,7 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.corrector.model_io import ModelRecord, save_model
 from pdcorrect.corrector.normaliser import RunningMoments
+from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.evaluation.evaluation import Candidate
 from pdcorrect.state import State, Status
 
@@ -22,7 +23,7 @@ STEP = 0.01  # s
 class Fake:
     """A hybrid whose next positions of a scene are `answer(case, frame, positions)`."""
 
-    def __init__(self, stepper, cases, answer, refused=(), reason=Reason.FEATURES):
+    def __init__(self, stepper, cases, answer, refused=(), reason=Reason.OUTSIDE):
         self.stepper, self.answer = stepper, answer
         self.reasons = dict.fromkeys(refused, int(reason))
         known = {case.problems["plain"].scene.name: case for case in cases}
@@ -72,18 +73,24 @@ def as_stored(name):
     return answer
 
 
+def seen(values):
+    """Moments of values (m, k)."""
+    moments = RunningMoments()
+    moments.add(values)
+    return moments
+
+
 def untrained(folder, base="plain", seed=0, dataset="tiny", step=STEP):
     """A saved model whose correction is zero."""
     corrector = Corrector(preset("compact", layers=1, width=8))
     corrector.normaliser.output_scale.fill_(1e-3)
-    averages = RunningMoments()
-    averages.add(torch.zeros(1, len(corrector.normaliser.average_low)))
-    corrector.normaliser.fit_averages(averages)
-    shapes, steps = RunningMoments(), RunningMoments()
-    shapes.add(torch.zeros(1, len(corrector.normaliser.shape_low)))
-    corrector.normaliser.fit_shapes(shapes)
-    steps.add(torch.tensor([[step / 0.05]], dtype=torch.float64).log())  # of cells of 5 cm
-    corrector.normaliser.fit_time_steps(steps)
+    of_5_cm = torch.tensor([[step / 0.05]], dtype=torch.float64).log()
+    nothing = (
+        torch.zeros(1, k) for k in (len(corrector.envelope.average_low), len(SHAPE_MEASURES))
+    )
+    corrector.envelope.fit(
+        dict(zip(("average", "shape", "time_step"), map(seen, (*nothing, of_5_cm)), strict=True))
+    )
     with torch.no_grad():
         corrector.network.decoder[-1].weight.zero_()
         corrector.network.decoder[-1].bias.zero_()

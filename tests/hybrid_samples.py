@@ -28,6 +28,14 @@ TINY = {
 PRESSURE = {"kind": "pressure", "region": {"plane": "z", "at": "max"}, "pressure": 300.0}
 
 
+def seen(*parts):
+    """Moments of values (m, k) that come in parts."""
+    moments = RunningMoments()
+    for part in parts:
+        moments.add(part)
+    return moments
+
+
 class Prescribed(Corrector):
     """Gives ``answer`` (n, 3), m, whatever it is asked; a NumPy array."""
 
@@ -78,16 +86,12 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
         ):
             for name in names:
                 moments[name].add(table[name][1](views[-1]))
-    target, averages, shapes, lengths = (RunningMoments() for _ in range(4))
-    target.add(torch.full((4, 1), size))
-    corrector.normaliser.fit(moments, target)
-    for view in views:
-        averages.add(nodes.graph.body_means(corrector.inputs(view)[0]))
-        shapes.add(nodes.graph.shapes)
-    corrector.normaliser.fit_averages(averages)
-    corrector.normaliser.fit_shapes(shapes)
-    lengths.add(nodes.graph.time_steps[:, None])
-    corrector.normaliser.fit_time_steps(lengths)
+    corrector.normaliser.fit(moments, seen(torch.full((4, 1), size)))
+    averages = [nodes.graph.body_means(corrector.inputs(view)[0]) for view in views]
+    corrector.envelope.fit({
+        **moments, "average": seen(*averages), "shape": seen(nodes.graph.shapes),
+        "time_step": seen(nodes.graph.time_steps[:, None]),
+    })  # fmt: skip
     return corrector
 
 

@@ -122,15 +122,15 @@ def fit(corrector, view):
         for name, values in features.values(table, names, view).items():
             found[name] = RunningMoments()
             found[name].add(values)
-    target, averages, shapes, steps = (RunningMoments() for _ in range(4))
+    target = RunningMoments()
     target.add(torch.tensor([[0.1], [-0.3]]))
     corrector.normaliser.fit(found, target)
-    averages.add(view.bodies.body_means(corrector.inputs(view)[0]))
-    corrector.normaliser.fit_averages(averages)
-    shapes.add(view.bodies.shapes)
-    corrector.normaliser.fit_shapes(shapes)
-    steps.add(view.bodies.time_steps[:, None])
-    corrector.normaliser.fit_time_steps(steps)
+    rest = {"shape": view.bodies.shapes, "time_step": view.bodies.time_steps[:, None]}
+    averages = view.bodies.body_means(corrector.inputs(view)[0])
+    for name, values in {"average": averages, **rest}.items():
+        found[name] = RunningMoments()
+        found[name].add(values)
+    corrector.envelope.fit(found)
     return corrector
 
 

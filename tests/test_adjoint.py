@@ -616,7 +616,7 @@ def test_wrong_input_is_refused_by_name():
     g = np.ones_like(state.positions)
     with pytest.raises(InputError, match="grad_positions has shape"):
         pc.adjoint(stepper, state, result, g[1:])
-    with pytest.raises(InputError, match="grad_velocities contains NaN"):
+    with pytest.raises(InputError, match="grad_velocities of node 0"):
         pc.adjoint(stepper, state, result, g, g * np.nan)
     with pytest.raises(InputError, match="solver = 'magic'"):
         pc.adjoint(stepper, state, result, g, solver="magic")
@@ -691,28 +691,6 @@ def test_without_a_loss_there_is_nothing_to_solve():
     assert not found.positions.any()
     assert not found.young.any()
     assert found.time_step == 0.0
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"stepper": "problem"}, "stepper is a Problem: expected ProjectiveDynamics or Newton"),
-        ({"state": "run"}, "state is a Trajectory: expected the step's State"),
-        ({"result": "run"}, "result is a Trajectory: expected the StepResult"),
-        ({"result": "state"}, "result is a State: expected the StepResult"),
-    ],
-)
-def test_arguments_of_the_wrong_kind_are_named(change, message):
-    problem = pc.discretise(beam(time={"frames": 1}))
-    stepper = pc.ProjectiveDynamics(problem)
-    state = problem.rest_state()
-    known = {
-        "problem": problem, "state": state, "run": pc.rollout(stepper, 1), "stepper": stepper,
-        "result": stepper(state),
-    }  # fmt: skip
-    chosen = {name: known[change.get(name, name)] for name in ("stepper", "state", "result")}
-    with pytest.raises(InputError, match=message):
-        pc.adjoint(*chosen.values(), state.positions)
 
 
 def test_a_tolerance_that_is_not_positive_is_refused():

@@ -44,7 +44,7 @@ def test_scenes_of_a_batch_are_corrected_as_single_ones_are(placement, element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
     names = (*preset("compact").node_features, "previous-correction")
     corrector = fitted(scenes, placement=placement, node_features=names)
-    gate = Gate(margin=None, average=None)
+    gate = Gate(outside=None)
     stepper = pc.BatchStepper(scenes, 1e-12)
     many = BatchHybrid(stepper, corrector, gate=gate)
     alone = [HybridStepper(pc.ProjectiveDynamics(p, 1e-12), corrector, gate=gate) for p in scenes]

@@ -11,7 +11,6 @@ from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, s
 from pdcorrect.batch.first_hessian import LARGEST_REST, FirstHessian, chosen
 from pdcorrect.batch.mesh_levels import hierarchy
 from pdcorrect.batch.multigrid import largest_eigenvalue, with_mass
-from pdcorrect.batch.states import expected_bytes
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import interpolation, refine
 
@@ -309,18 +308,3 @@ def test_a_body_adrift_fails_by_name_and_alone():
         lonely(lonely.rest_state())
     stepper = pc.BatchStepper([held, adrift], **options)
     assert [s.ok for s in stepper(stepper.rest_state()).statuses] == [True, False]
-
-
-def test_it_takes_the_memory_that_is_told():
-    """Far less than dense inverses."""
-    one = pc.discretise(beam((6, 2, 2), poisson=0.3), 4)
-    problems = [one, *[one.with_material(young=2e6, poisson=0.3)] * 2]
-    stepper = pc.BatchStepper(problems, first_hessian="multigrid")
-    n = stepper.cells.sizes
-    found = FirstHessian(stepper.cells, problems, (MASS, 1.0), "multigrid")
-    coarse = len(problems[0].mesh.coarse_nodes)
-    assert found.count == 2
-    assert found.bytes < 0.1 * 2 * 4 * n.nodes**2
-    assert stepper.expected_bytes == expected_bytes(n, 2, 3, coarse)
-    bare = expected_bytes(n._replace(nodes=0), 2, 3, coarse)
-    assert found.bytes < stepper.expected_bytes - bare + 2 * 4 * (3 * coarse) ** 2

@@ -471,11 +471,9 @@ def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(InputError, match="corrector is a str"):
         HybridStepper(coarse, "weights.pt")
     with pytest.raises(InputError, match="gate is a dict"):
-        HybridStepper(coarse, corrector, gate={"margin": 1.0})
+        HybridStepper(coarse, corrector, gate={"energy": 1.0})
     with pytest.raises(InputError, match="velocity = 'mixed'"):
         BatchHybrid(stepper, corrector, velocity="mixed")
-    with pytest.raises(InputError, match="limit with placement 'force'"):
-        HybridStepper(coarse, fitted([problem], placement="force"), gate=Gate(limit=True))
     for hybrid in (HybridStepper, BatchHybrid):
         part = (pc.ProjectiveDynamics if hybrid is HybridStepper else pc.BatchStepper)(
             problem if hybrid is HybridStepper else [problem], integrator="bdf2"
@@ -494,15 +492,6 @@ def test_a_correction_before_of_other_bodies_is_refused(placement):
     layer = HybridLayer(stepper, corrector, through_solver=True)
     with pytest.raises(InputError, match="previous"):
         layer(state.positions, state.velocities, previous=other)
-
-
-def test_a_state_or_forces_that_are_none_are_refused():
-    problem = pc.discretise(soft_beam())
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem]))
-    with pytest.raises(InputError, match="state is a"):
-        stepper(problem.positions)
-    with pytest.raises(InputError, match="forces has shape"):
-        stepper(problem.rest_state(), np.zeros((2, 3)))
 
 
 def test_the_mass_times_a_correction_is_differentiated_as_it_is_computed():

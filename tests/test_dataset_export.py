@@ -178,44 +178,28 @@ def test_vtu_series_hold_motion_error_and_forces(folder, tmp_path):
 # --- the folder of an export -------------------------------------------------------------
 
 
-def names(folder):
-    return {path.name for path in folder.iterdir()}
-
-
-def test_exports_do_not_mix_and_files_of_another_origin_are_not_replaced(
-    folder, exported, tmp_path
-):
+def test_files_of_the_same_names_are_replaced_only_when_asked(folder, tmp_path):
     target = tmp_path / "target"
-    export_meshgraphnet(folder, target)
-    (target / "notes.json").write_text('{"mine": 1}')
-    (target / "mine.vtu").write_text("mine")
-    shutil.copy(folder / "training/mesh-0000.h5", target / "mine.h5")
-    mine = {"notes.json", "mine.vtu", "mine.h5"}
+    export_vtu(folder, target, "evaluation", 2, 1)
+    export_vtu(folder, target, "evaluation", 1, 1)  # beside it
+    (target / "meta.json").write_text("mine")
+    before = {path.name: path.read_bytes() for path in target.iterdir()}
     for again in (
         lambda **options: export_meshgraphnet(folder, target, split="longer", **options),
         lambda **options: export_vtu(folder, target, "evaluation", 2, 1, **options),
-        lambda **options: export_vtu(folder, target, "evaluation", 1, 1, **options),
     ):
-        before = names(target)
         with pytest.raises(OutputError, match="--overwrite"):
             again()
-        assert names(target) == before
-        written = again(overwrite=True)
-        assert names(target) - mine - {path.name for path in written} == {
-            f"{path.stem}_{frame:04d}.vtu"
-            for path in written
-            if path.suffix == ".pvd"
-            for frame in range(5)
-        }
-        assert mine < names(target)
+        assert {path.name: path.read_bytes() for path in target.iterdir()} == before
+    written = export_meshgraphnet(folder, target, split="longer", overwrite=True)
+    assert {path.name for path in target.iterdir()} == {*before, *(path.name for path in written)}
+    assert (target / "meta.json").read_text() != "mine"
 
-    tmp_path = tmp_path / "mine"
-    tmp_path.mkdir()
-    (tmp_path / "train.h5").write_text("mine")
-    with pytest.raises(OutputError, match=r"train\.h5"):
-        export_meshgraphnet(folder, tmp_path, overwrite=True)
-    assert names(tmp_path) == {"train.h5"}
-    assert (tmp_path / "train.h5").read_text() == "mine"
+
+def test_files_of_another_export_are_not_mixed_with_new_ones(folder, tmp_path):
+    export_meshgraphnet(folder, tmp_path / "target")
+    with pytest.raises(OutputError, match="another export"):
+        export_meshgraphnet(folder, tmp_path / "target", split="longer", overwrite=True)
 
 
 def test_an_export_that_fails_leaves_the_earlier_one(folder, tmp_path):

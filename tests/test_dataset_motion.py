@@ -55,27 +55,10 @@ def inverted(shard):
     return with_run(shard, 0, "plain", statistics=told)
 
 
-def without(statistic):
-    def change(shard):
-        told = dict(shard.simulations[0].runs["reference"].statistics)
-        del told[statistic]
-        return with_run(shard, 0, "reference", statistics=told)
-
-    return change
-
-
 def pulled_harder(shard):
     forces = shard.simulations[0].forces.copy()
     forces[-1] *= 1.001
     return with_simulation(shard, 0, forces=forces)
-
-
-def attribute(run, key, value):
-    def change(shard):
-        told = dict(shard.simulations[0].runs[run].attributes)
-        return with_run(shard, 0, run, attributes={**told, key: value})
-
-    return change
 
 
 @pytest.mark.parametrize(
@@ -84,12 +67,7 @@ def attribute(run, key, value):
         (reflected("reference", "positions", 5), ("reference", "positions", "row 5")),
         (reflected("best", "predictions", 7), ("best", "predictions", "row 7")),
         (inverted, ("plain", "-1", "step 1")),
-        (without("smallest_volume_ratios"), ("reference", "smallest_volume_ratios")),
-        (without("error_estimates"), ("reference", "error_estimates")),
         (pulled_harder, ("forces", "step 20")),
-        (attribute("reference", "refine", 1), ("reference", "refine is 1", "4")),
-        (attribute("plain", "solver", "x"), ("plain", "solver is 'x'", "'pd'")),
-        (attribute("best", "time_step", 0.02), ("best", "time_step is 0.02", "0.01")),
     ],
 )
 def test_what_no_solver_would_have_written_is_found_and_named(spoilt, change, named):
@@ -134,7 +112,6 @@ def test_a_manifest_of_something_else_is_found(tmp_path, key):
     manifest.write_text(json.dumps({**json.loads(before), key: "other"}))
     (finding,) = check_dataset(folder, repeat=0)
     assert finding.path == manifest
-    assert key in finding.message
     if key == "content_hash":
         with pytest.raises(ValueError, match="repeat = -1"):
             check_dataset(folder, repeat=-1)

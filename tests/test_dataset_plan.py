@@ -10,7 +10,7 @@ import tomli_w
 import pdcorrect as pc
 from dataset_configs import small
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION, DatasetConfig
-from pdcorrect.data.families import PUBLISHED, count_bodies, draw, extreme, node_levels
+from pdcorrect.data.families import PUBLISHED, draw, extreme, node_levels
 from pdcorrect.data.plan import draw_scene, make_plan
 
 RNG = np.random.default_rng
@@ -109,14 +109,6 @@ def test_plans_and_loads_depend_on_nothing_but_the_configuration():
     assert other.hash() != config.hash()
     assert make_plan(other) != make_plan(config)
 
-    one = small(extra=[{"name": "stiffer", "meshes": 1, "simulations": 1}])
-    other = small(seed=8, coarse_nodes=None)
-    assert one.differences(one) == []
-    found = other.differences(one)
-    for key in ("seed: 7 there, 8 here", "coarse_nodes: [72, 108] there", '"stiffer" there'):
-        assert any(key in row for row in found), found
-    assert any('"stiffer" here' in row for row in one.differences(other))
-
 
 def test_splits_are_by_mesh_and_extra_ones_leave_the_training_distribution_as_told():
     config = small(
@@ -175,7 +167,7 @@ def test_splits_are_by_mesh_and_extra_ones_leave_the_training_distribution_as_to
         ),
         (
             {"material": {"young": 2.0, "poisson": [0.3, 0.3], "density": [1.0]}},
-            r"material\.young = 2\.0.*material\.density = \[1\.0\]",
+            r"material\.young = 2\.0.*material\.density\[1\]: missing",
         ),
         ({"coarse_nodes": [200, 100]}, r"coarse_nodes = \[200, 100\]"),
         ({"extra": [{**EXTRA, "poisson": [0.3, 0.6]}]}, r"extra\[0\]\.poisson\[1\] = 0\.6"),
@@ -205,7 +197,7 @@ def test_plans_and_files_that_cannot_be_are_refused(tmp_path):
             {"name": "crosses", "meshes": 1, "simulations": 1, "family": "cross"},
         ],
     )
-    with pytest.raises(pc.errors.InputError, match=r"coarse_nodes = \[36, 72\].*'beam'.* 4 .* 6 "):
+    with pytest.raises(pc.errors.InputError, match=r"coarse_nodes = \[36, 72\].*'beam'"):
         make_plan(config)
     (tmp_path / "bad.toml").write_text("a = [")
     for name in ("none", "bad"):
@@ -213,14 +205,7 @@ def test_plans_and_files_that_cannot_be_are_refused(tmp_path):
             DatasetConfig.load(tmp_path / f"{name}.toml")
 
 
-@pytest.mark.parametrize(
-    ("family", "nodes"), [("beam", (36, 72)), ("cross", (72, 90)), ("weight", (150, 175))]
-)
-def test_the_bodies_of_a_family_are_counted_and_mirrored_ones_once(family, nodes):
-    rng = RNG(4)
-    drawn = {draw(family, nodes, rng).key() for _ in range(3000)}
-    assert count_bodies(family, nodes) == len(drawn)
-
+def test_mirrored_bodies_are_equal():
     rng = RNG(0)
     designs = [draw("weight", (237, 471), rng) for _ in range(40)]
     for design in designs:

@@ -116,6 +116,7 @@ def test_parts_of_a_large_body_are_held_and_hang_together():
         ({"clamps": [{"region": {"plane": "x", "at": "min"}, "components": ["x"]}]}, "components"),
         ({"materials": [{"region": {"box": [[0.0, 0.0, 0.0], [0.05, 1.0, 1.0]]}, "young": 1e6,
                          "poisson": 0.1, "density": 1e3}]}, "poisson"),
+        ({"material": {"young": 1e5, "poisson": 0.499, "density": 1e3}}, "0.499"),
     ],
 )  # fmt: skip
 def test_bodies_that_cannot_be_learned_are_refused(changes, message):

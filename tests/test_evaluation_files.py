@@ -168,8 +168,8 @@ def test_files_that_do_not_fit_their_scenes_are_refused(stored):
         "mass": replace(shard, mass=2 * shard.mass),
         "young": replace(shard, young=1.01 * shard.young),
         "time_step": replace(shard, attributes={**shard.attributes, "time_step": 0.02}),
-        "simulation 0: loads": replace(shard, simulations=(mixed, shard.simulations[1])),
-        "simulation 0": replace(
+        "the loads of simulation 0": replace(shard, simulations=(mixed, shard.simulations[1])),
+        "a simulation has no scene": replace(
             shard, simulations=(replace(mixed, scene_toml=""), shard.simulations[1])
         ),
     }.items():

@@ -22,13 +22,16 @@ from pdcorrect.errors import ConvergenceError, InputError  # noqa: E402
 from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
 from pdcorrect.evaluation.evaluation import EvaluatedRun, evaluate  # noqa: E402
 from pdcorrect.evaluation.measures import (  # noqa: E402
-    MeasuredRollout,
-    Outcome,
-    TrajectoryMeasures,
     measure,
     read_cases,
 )
-from pdcorrect.evaluation.rollouts import roll_out, roll_out_alone, single_steps, single_steps_alone  # noqa: E402  # noqa: E402
+from pdcorrect.evaluation.rollouts import (  # noqa: E402  # noqa: E402
+    Outcome,
+    roll_out,
+    roll_out_alone,
+    single_steps,
+    single_steps_alone,
+)
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.state import Status  # noqa: E402
 from training_samples import shortened  # noqa: E402
@@ -101,30 +104,14 @@ def test_stored_runs_are_measured_as_the_models_are(evaluation):
     assert evaluation.runs["intermediate"].values("step_omega") == ([], [])
 
 
-def test_of_rollouts_that_a_gate_refuses_as_a_whole_the_reason_is_kept(cases):
-    options = {"refused": range(1, 21)}
-    candidates = [
-        fake(cases, perfect, reason.name, reason=reason, **options)
-        for reason in (Reason.BODY, Reason.TIME_STEP, Reason.FEATURES)
-    ]
-    found = evaluate([*candidates, fake(cases, perfect, "open")], TINY, batch=3).runs
-    for name, reason in (("BODY", 6), ("TIME_STEP", 9), ("FEATURES", 0), ("open", 0)):
-        assert found[name].refused_by() == [reason] * 4
-        assert found[name].all_refused == (name != "open")
-        assert found[name].values("gate_rate")[0] == [0.0 if name == "open" else 100.0] * 4
-    assert found["plain"].refused_by() == [0] * 4
-    assert not found["plain"].all_refused
-
-
 def test_steps_after_a_failure_do_not_count_as_corrected(cases):
     case = cases[0]
     reasons = np.zeros(case.steps, dtype=np.int64)
-    reasons[:2] = Reason.FEATURES
+    reasons[:2] = Reason.OUTSIDE
     outcomes = [Outcome(case.reference, None, "plain", reasons, failed) for failed in (3, 4, None)]
     runs = [EvaluatedRun("run", None, None, (measure(case, one),)) for one in outcomes]
-    assert [run.all_refused for run in runs] == [True, False, False]
+    assert [all(run.reasons) for run in runs] == [True, False, False]
     assert [len(run.trajectories[0].reasons) for run in runs] == [2, 3, case.steps]
-    assert not EvaluatedRun("run", None, None, ()).all_refused
 
 
 def test_names_bases_splits_and_counts_that_cannot_be_are_refused(cases):
@@ -157,7 +144,7 @@ def test_a_scene_that_fails_is_held_and_the_others_reach_the_frames_asked_for(pa
     runs = roll_out(Fake(stepper, chosen, perfect), stepper, [3, 7])
     for run, case, count in zip(runs, chosen, (3, 7), strict=True):
         np.testing.assert_allclose(run.positions[1:], case.reference[1 : count + 1], atol=1e-15)
-        assert run.refused.shape == (count,)
+        assert run.reasons.shape == (count,)
         assert run.failed is None
 
     chosen, stepper = pair
@@ -170,7 +157,7 @@ def test_a_scene_that_fails_is_held_and_the_others_reach_the_frames_asked_for(pa
     np.testing.assert_array_equal(other.positions[5:], np.stack([other.positions[4]] * 4))
     np.testing.assert_allclose(other.positions[4], chosen[1].reference[4], atol=1e-15)
     np.testing.assert_allclose(one.positions[8], chosen[0].reference[8], atol=1e-15)
-    assert other.refused.tolist() == [True] * 4 + [False] * 4
+    assert (other.reasons > 0).tolist() == [True] * 4 + [False] * 4
     found = measure(chosen[1], Outcome(_cut(other, chosen[1]), failed=other.failed)).measures
     assert found.failed == 5
     assert found.omega < 100.0
@@ -195,15 +182,11 @@ def test_a_scene_that_flies_away_has_failed(pair, away):
     np.testing.assert_array_equal(one.positions[3:], np.stack([one.positions[2]] * 3))
 
 
-def test_a_run_that_cannot_be_measured_is_not_left_out_and_gaps_are_counted(cases):
+def test_a_run_that_cannot_be_measured_is_not_left_out(cases):
     gone = cases[0].reference.copy()
     gone[5:] *= 1e160
     with np.errstate(over="ignore"), pytest.raises(ConvergenceError, match="omega"):
         measure(cases[0], Outcome(gone))
-    measured = [MeasuredRollout(TrajectoryMeasures(0, k, omega=1.0)) for k in range(3)]
-    measured.append(MeasuredRollout(TrajectoryMeasures(0, 3, omega=2.0, stress_error=0.1)))
-    run = EvaluatedRun("run", None, None, tuple(measured))
-    assert run.gaps() == {"stress_error": 3}
 
 
 def test_a_step_that_does_not_converge_is_a_failure(pair):
@@ -246,17 +229,10 @@ def test_the_gate_refuses_what_the_network_has_not_seen_unless_it_is_off(tmp_pat
     """A fitted range of nothing: every body, and every input, lies outside."""
     _, stepper = pair
     path = untrained(tmp_path / "model")
-    rates = {}
-    gates = {
-        "all": Gate(), "bodies": Gate(margin=None, average=None), "inputs": Gate(body=None),
-        "none": None,
-    }  # fmt: skip
-    for name, gate in gates.items():
+    for gate, rate in ((Gate(), 1.0), (None, 0.0)):
         (saved,) = saved_candidates([path], gate=gate)
         runs = roll_out(saved.candidate.hybrid(stepper), stepper, [2, 2])
-        rates[name] = [run.refused.mean() for run in runs]
-    assert rates.pop("none") == [0.0, 0.0]
-    assert set(map(tuple, rates.values())) == {(1.0, 1.0)}
+        assert [(run.reasons > 0).mean() for run in runs] == [rate, rate]
 
 
 @pytest.fixture(scope="module")
@@ -284,14 +260,14 @@ def test_scenes_alone_are_evaluated_as_in_a_batch(shorter, gate):
         assert one.measures.step_omega == pytest.approx(other.measures.step_omega, abs=0.05)
 
 
-def test_a_gate_refuses_and_pauses_alone_as_in_a_batch(cases):
+def test_a_gate_refuses_alone_as_in_a_batch(cases):
     """Of the first scene; in others two gates may part where energy is at its bound."""
     (saved,) = saved_candidates(["tiny"], gate=Gate(energy=0.01))
     problem = cases[0].problems[saved.candidate.base]
     stepper = pc.BatchStepper([problem])
     (expected,) = roll_out(saved.candidate.hybrid(stepper), stepper, [20])
     found = roll_out_alone(saved.candidate.alone(problem), 20)
-    assert {0, Reason.ENERGY, Reason.PAUSE} == set(found.reasons.tolist())
+    assert {0, Reason.ENERGY} == set(found.reasons.tolist())
     np.testing.assert_array_equal(found.reasons, expected.reasons)
 
 

@@ -27,7 +27,7 @@ from conftest import beam  # noqa: E402
 from dataset_configs import small  # noqa: E402
 from pdcorrect.cli.program import TERMINATED  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard, stored_hashes  # noqa: E402
+from pdcorrect.data.shard_reader import read_header, read_shard  # noqa: E402
 from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
 
 NAMESPACE = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
@@ -134,7 +134,7 @@ def dataset_input(folder):
 def shards(output):
     folder = output / "set"
     manifest = json.loads((folder / "manifest.json").read_text())["files"]
-    return {p.name: stored_hashes(p)[1] for p in all_shards(folder)}, manifest
+    return {p.name: read_header(p, verify=True).content_hash for p in all_shards(folder)}, manifest
 
 
 def whole_shards(output, killed):

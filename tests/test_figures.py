@@ -179,14 +179,6 @@ def test_several_frames_lie_beside_or_below_each_other(run, tmp_path):
     assert (first != last).mean() > 0.05
 
 
-def test_size_factor_and_window(run, tmp_path):
-    small = drawn(figures.render(run, tmp_path / "a.png", window=300))
-    large = drawn(figures.render(run, tmp_path / "b.png", window=300, scale=2.0))
-    assert small.shape[1] == 300
-    assert large.shape[1] == 600
-    assert large.shape[0] == pytest.approx(2 * small.shape[0], abs=8)
-
-
 def test_films_hold_every_common_frame(run, tmp_path):
     short = trajectory(frames=4)
     path = figures.render([run, short], tmp_path / "a.gif", window=2 * 150, fps=20)

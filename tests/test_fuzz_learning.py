@@ -11,8 +11,6 @@ import tomllib
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
 import tomli_w
 from hypothesis import strategies as st
@@ -34,12 +32,11 @@ from pdcorrect.corrector.model_io import DESCRIPTION, WEIGHTS, load_model  # noq
 from pdcorrect.data.check import check_dataset  # noqa: E402
 from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays, read_header  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from test_corrector_model import assert_same_corrector  # noqa: E402
-from test_dataset_files import assert_same, edited  # noqa: E402
+from test_dataset_files import assert_same  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 DATASET, MODEL = ROOT / "datasets" / "tiny", ROOT / "models" / "tiny"
@@ -96,107 +93,6 @@ def test_damaged_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
 
     heads = damaged(whole[:512]).map(lambda head: head + whole[512:])
     for_all(damaged(whole) | heads, check, count)
-
-
-def places(path):
-    """Places of all groups, datasets and attributes of an HDF5 file."""
-    members, attributes = [], []
-    with h5py.File(path) as file:
-        file.visit(members.append)
-        for place in ["/", *members]:
-            attributes += [(place, name) for name in file[place].attrs]
-    return members, attributes
-
-
-@st.composite
-def edits(draw, path):
-    """One to three changes of a file's content, each a function of the open file."""
-    members, attributes = places(path)
-    changes = []
-    for _ in range(draw(st.integers(1, 3))):
-        kind = draw(st.sampled_from(list(KINDS)))
-        place, other = draw(st.sampled_from(members)), draw(st.sampled_from(members))
-        attribute = draw(st.sampled_from(attributes))
-        new = draw(
-            st.sampled_from([0, -1, 7, 1.5, np.nan, "text", "", np.zeros(3), b"\xff", 2**60])
-        )
-        changes.append((kind, place, other, attribute, new))
-    return changes
-
-
-def exchange(file, place, change):
-    if isinstance(file[place], h5py.Dataset):
-        values = file[place][()]
-        del file[place]
-        file[place] = change(values)
-
-
-def poked(values, new):
-    out = values.copy().ravel()
-    if out.size and np.isscalar(new) and not isinstance(new, (str, bytes)):
-        with np.errstate(all="ignore"):
-            out[out.size // 2] = np.asarray(new).astype(out.dtype)
-    return out.reshape(values.shape)
-
-
-NOWHERE, ELSEWHERE = h5py.SoftLink("/nowhere"), h5py.ExternalLink("nowhere.h5", "/mesh")
-
-KINDS = {
-    "delete": lambda file, place, other, attribute, new: file.__delitem__(place),
-    "rename": lambda file, place, other, attribute, new: file.move(place, place + "x"),
-    "move": lambda file, place, other, attribute, new: file.move(place, other + "/x"),
-    "link": lambda file, place, other, attribute, new: file.__setitem__(place + "x", file[other]),
-    "swap": lambda file, place, other, attribute, new: exchange(file, place, lambda v: file[other]),
-    "shape": lambda file, place, *_: exchange(file, place, lambda v: v[..., None]),
-    "shorter": lambda file, place, *_: exchange(file, place, lambda v: v[:-1]),
-    "type": lambda file, place, *_: exchange(file, place, lambda v: v.astype("f2")),
-    "order": lambda file, place, *_: exchange(
-        file, place, lambda v: v.astype(v.dtype.newbyteorder())
-    ),
-    "value": lambda f, place, other, a, new: exchange(f, place, lambda v: poked(v, new)),
-    "scalar": lambda file, place, other, attribute, new: exchange(file, place, lambda v: new),
-    "forget": lambda file, place, other, attribute, new: file[attribute[0]].attrs.pop(attribute[1]),
-    "nowhere": lambda f, place, *_: (f.__delitem__(place), f.__setitem__(place, NOWHERE)),
-    "elsewhere": lambda f, place, *_: (f.__delitem__(place), f.__setitem__(place, ELSEWHERE)),
-    "references": lambda f, place, *_: exchange(
-        f, place, lambda v: np.full(v.shape, f["mesh"].ref, h5py.ref_dtype)
-    ),
-    "reference": lambda f, p, o, attribute, new: f[attribute[0]].attrs.create(
-        attribute[1], f["mesh"].ref, dtype=h5py.ref_dtype
-    ),
-    "attribute": lambda f, p, o, attribute, new: f[attribute[0]].attrs.create(attribute[1], new),
-}
-
-
-@counts(50, 700)
-def test_edited_files_of_data_sets_are_refused_by_name(tmp_path, shard, count):
-    path = tmp_path / "shard.h5"
-
-    def edit(file, changes):
-        for kind, *arguments in changes:
-            try:
-                KINDS[kind](file, *arguments)
-            except (KeyError, ValueError, TypeError, OSError, RuntimeError, IndexError):
-                continue  # what another change took away, or HDF5 does not store
-
-    def check(changes):
-        path.unlink(missing_ok=True)
-        edited(SHARD, path, lambda file: edit(file, changes))
-        for read in (read_shard, loose, read_header, read_arrays):
-            try:
-                found = read(path)
-            except FileFormatError as error:
-                assert str(error).startswith(f"{path}: ")
-                assert len(str(error).splitlines()) == 1
-            else:
-                if read is read_shard:
-                    assert_same_content(found, shard)
-
-    for_all(edits(SHARD), check, count)
-
-
-def loose(path):
-    return read_shard(path, verify=False)
 
 
 # --- settings ----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""`Gate.time_step`: a gate that knows the time step over the cell size of the training."""
+"""Gates that know the time step over the cell size of the training."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pdcorrect as pc
-from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, soft_beam
+from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, seen, soft_beam
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
@@ -19,9 +19,7 @@ from pdcorrect.corrector.normaliser import RunningMoments
 
 H, C = 0.01, 0.02
 """Time step and cell size of the training, s and m."""
-ONLY_STEPS = Gate(
-    body=None, margin=None, average=None, volume=None, crushing=None, energy=None, pause=0
-)
+ONLY_OUTSIDE = Gate(crushing=None, energy=None)
 
 
 def logarithms(*steps):
@@ -34,7 +32,7 @@ def logarithms(*steps):
 def ranged(*steps):
     """A corrector that knows some time steps, s, otherwise without values."""
     corrector = Corrector(preset("compact", layers=1, width=8))
-    corrector.normaliser.fit_time_steps(logarithms(*steps))
+    corrector.envelope.fit({"time_step": logarithms(*steps)})
     return corrector
 
 
@@ -54,37 +52,42 @@ def stepped(factor, cells=(3, 1, 1)):
 
 def test_time_steps_lie_outside_their_range_by_the_logarithm_of_a_factor():
     corrector = ranged(0.02, 0.005, 0.01)
-    assert corrector.normaliser.trained_step(C) == "0.005 to 0.02 s"
-    found = corrector.time_step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03))
+    assert corrector.envelope.trained_step(C) == "0.005 to 0.02 s"
+    found = corrector.envelope.time_step_excess(graph(0.004, 0.005, 0.013, 0.02, 0.03).time_steps)
     expected = [np.log(5 / 4), 0.0, 0.0, 0.0, np.log(3 / 2)]
     assert found.tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_no_time_step_is_known_before_data_were_seen_nor_is_what_is_no_number():
     corrector = Corrector(preset("compact", layers=1, width=8))
-    assert corrector.time_step_excess(graph(H)).tolist() == [np.inf]
-    wide = Gate(body=None, time_step=1e6)
-    assert wide.foreign(corrector, graph(H)).tolist() == [Reason.TIME_STEP]
+    assert corrector.envelope.time_step_excess(graph(H).time_steps).tolist() == [np.inf]
+    assert corrector.rest_score(graph(H)).tolist() == [np.inf]
     known = ranged(H)
-    assert known.time_step_excess(graph(np.nan, np.inf, -H, 0.0)).tolist() == [np.inf] * 4
-    assert np.isnan(corrector.normaliser.time_steps).all()
+    assert (
+        known.envelope.time_step_excess(graph(np.nan, np.inf, -H, 0.0).time_steps).tolist()
+        == [np.inf] * 4
+    )
+    assert np.isnan(corrector.envelope.time_steps).all()
     strange = fitted(problems((3, 1, 1)))
-    strange.normaliser.time_step_low.fill_(np.nan)
-    hybrid = HybridStepper(pc.ProjectiveDynamics(stepped(1.0)), strange, gate=ONLY_STEPS)
-    assert (hybrid.trained_step, hybrid.time_step_excess()) == ("not known", np.inf)
+    strange.envelope.time_step_low.fill_(np.nan)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(stepped(1.0)), strange, gate=Gate(outside=1e6))
+    assert hybrid.trained_step == "not known"
+    assert hybrid(hybrid.problem.rest_state()).stats["gate"] == Reason.OUTSIDE
 
 
 def test_time_steps_of_further_data_are_as_known_as_those_of_the_first():
     corrector = ranged(0.1 * H, 10.0 * H)
-    corrector.normaliser.fit_time_steps(logarithms(H))  # takes the place of what was known
+    corrector.envelope.fit({"time_step": logarithms(H)})  # takes the place of what was known
     state = corrector.state_dict()
-    for name in ("normaliser.time_step_low", "normaliser.time_step_high"):
+    for name in ("envelope.time_step_low", "envelope.time_step_high"):
         assert state[name].tolist() == pytest.approx([np.log(H / C)])
-    corrector.normaliser.widen_time_steps(logarithms(0.5 * H))
-    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, H / C))
-    corrector.normaliser.widen_time_steps(logarithms(0.7 * H, 3.0 * H))
-    assert corrector.normaliser.time_steps == pytest.approx((0.5 * H / C, 3.0 * H / C))
-    found = corrector.time_step_excess(graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H))
+    corrector.envelope.widen({"time_step": logarithms(0.5 * H)})
+    assert corrector.envelope.time_steps == pytest.approx((0.5 * H / C, H / C))
+    corrector.envelope.widen({"time_step": logarithms(0.7 * H, 3.0 * H)})
+    assert corrector.envelope.time_steps == pytest.approx((0.5 * H / C, 3.0 * H / C))
+    found = corrector.envelope.time_step_excess(
+        graph(0.25 * H, 0.5 * H, 3.0 * H, 6.0 * H).time_steps
+    )
     assert found.tolist() == pytest.approx([np.log(2), 0.0, 0.0, np.log(2)], abs=1e-12)
 
 
@@ -92,33 +95,30 @@ def test_time_steps_of_further_data_are_as_known_as_those_of_the_first():
 
 
 def test_the_default_bound_is_a_factor_of_1_1_both_ways():
-    gate, corrector = Gate(body=None), ranged(H)
-    factors = np.array([0.5, 1 / 1.11, 1 / 1.1, 1.0, 1.1, 1.11, 2.0])
-    found = gate.foreign(corrector, graph(*(factors * H)))
-    t = int(Reason.TIME_STEP)
-    assert found.tolist() == [t, t, 0, 0, 0, t, t]
+    bodies = graph(*(np.array([0.5, 1 / 1.11, 1 / 1.1, 1.0, 1.1, 1.11, 2.0]) * H))
+    corrector = ranged(H)
+    corrector.envelope.fit({"shape": seen(bodies.shapes)})
+    found = corrector.rest_score(bodies) > Gate().outside
+    assert found.tolist() == [True, True, False, False, False, True, True]
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("step", [0.01, 0.003, 1 / 60, 0.007])
 def test_the_very_time_step_of_the_training_passes_the_narrowest_bound(step, dtype):
-    gate, corrector = Gate(body=None, time_step=0.0), ranged(step)
-    assert gate.foreign(corrector, graph(*[step] * 9, dtype=dtype)).tolist() == [0] * 9
-    assert gate.foreign(corrector, graph(1.0001 * step, dtype=dtype)).tolist() == [Reason.TIME_STEP]
+    corrector, bodies = ranged(step), graph(*[step] * 9, 1.0001 * step, dtype=dtype)
+    corrector.envelope.fit({"shape": seen(bodies.shapes)})
+    assert (corrector.rest_score(bodies) > 0.0).tolist() == [*[False] * 9, True]
 
 
-def test_a_body_counts_before_its_time_step():
+def test_the_larger_score_of_body_and_time_step_counts():
     known, strange = problems((3, 1, 1), (6, 2, 2))
     bodies = BodyGraph.of([known, known, strange, strange], H, dtype=torch.float64)
     bodies = replace(bodies, time_step=bodies.time_step * torch.tensor([1.0, 2.0, 1.0, 2.0]))
     corrector = fitted([known])
-    for body, step, expected in (
-        (0.3, 0.1, [0, Reason.TIME_STEP, Reason.BODY, Reason.BODY]),
-        (None, 0.1, [0, Reason.TIME_STEP, 0, Reason.TIME_STEP]),
-        (0.3, None, [0, 0, Reason.BODY, Reason.BODY]),
-        (None, None, [0, 0, 0, 0]),
-    ):
-        assert Gate(body=body, time_step=step).foreign(corrector, bodies).tolist() == expected
+    body = float(corrector.envelope.shape_excess(bodies.shapes).max() / 0.3)
+    step = np.log(2.0) / 0.1
+    expected = [0.0, step, body, max(body, step)]
+    assert corrector.rest_score(bodies).tolist() == pytest.approx(expected, abs=1e-9)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -131,14 +131,13 @@ def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(
     run, plain = pc.rollout(hybrid, 4), pc.rollout(coarse, 4)
     assert np.array_equal(run.positions, plain.positions)
     assert np.array_equal(run.velocities, plain.velocities)
-    assert run.stats["gate"].tolist() == [Reason.TIME_STEP] * 4
+    assert run.stats["gate"].tolist() == [Reason.OUTSIDE] * 4
     assert run.stats["refused"].tolist() == [1.0] * 4
     assert not run.stats["correction"].any()
     assert corrector.calls == 0
-    assert not hybrid(problem.rest_state()).state.memory  # nothing to pause for
-    assert hybrid.time_step_excess() == pytest.approx(np.log(2.0))
-    assert refusals(run.stats["gate"]) == (Refusal(Reason.TIME_STEP, 4),)
-    open_ = HybridStepper(coarse, corrector, gate=ONLY_STEPS.model_copy(update={"time_step": None}))
+    assert not hybrid(problem.rest_state()).state.memory
+    assert refusals(run.stats["gate"]) == (Refusal(Reason.OUTSIDE, 4),)
+    open_ = HybridStepper(coarse, corrector, gate=ONLY_OUTSIDE.model_copy(update={"outside": None}))
     found = open_(problem.rest_state())
     assert corrector.calls == 1
     assert found.stats["gate"] == 0.0 < found.stats["correction"]
@@ -147,12 +146,12 @@ def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(
 def test_it_is_the_stepper_s_time_step_that_counts_and_not_the_scene_s():
     problem = stepped(1.0)
     corrector = fitted(problems((3, 1, 1)))
-    for step, reason in ((H, 0), (2.0 * H, Reason.TIME_STEP)):
+    for step, reason in ((H, 0), (2.0 * H, Reason.OUTSIDE)):
         coarse = pc.ProjectiveDynamics(problem, time_step=step)
-        hybrid = HybridStepper(coarse, corrector, gate=ONLY_STEPS)
+        hybrid = HybridStepper(coarse, corrector, gate=ONLY_OUTSIDE)
         assert hybrid(problem.rest_state()).stats["gate"] == reason
         stepper = pc.BatchStepper([problem], time_step=step)
-        many = BatchHybrid(stepper, corrector, gate=ONLY_STEPS)
+        many = BatchHybrid(stepper, corrector, gate=ONLY_OUTSIDE)
         assert many(stepper.rest_state()).reasons.tolist() == [reason]
 
 
@@ -164,9 +163,9 @@ def test_a_stiffer_body_with_a_shorter_step_is_refused_though_the_network_sees_a
         loads=[{**TORSION, "strength": 4.0 * TORSION["strength"]}],
     )
     corrector, found = fitted(problems((3, 1, 1))), []
-    for scene, reason in ((known, 0), (half, Reason.TIME_STEP)):
+    for scene, reason in ((known, 0), (half, Reason.OUTSIDE)):
         problem = pc.discretise(scene)
-        for gate in (None, ONLY_STEPS):
+        for gate in (None, ONLY_OUTSIDE):
             hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
             result = hybrid(problem.rest_state())
             found += [result] if gate is None else []
@@ -179,15 +178,16 @@ def test_a_stiffer_body_with_a_shorter_step_is_refused_though_the_network_sees_a
 
 def test_of_a_refined_body_its_own_cells_count():
     corrector = fitted(problems((3, 1, 1)))
-    for refine, step, reason in ((2, H, Reason.TIME_STEP), (2, 0.5 * H, 0)):
+    for refine, step, reason in ((2, H, Reason.OUTSIDE), (2, 0.5 * H, 0)):
         scene = soft_beam(loads=[TORSION], time={"step": step, "frames": 4})
         problem = pc.discretise(scene, refine=refine)
-        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=ONLY_STEPS)
-        assert hybrid(problem.rest_state()).stats["gate"] == reason
+        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
+        excess = corrector.envelope.time_step_excess(hybrid.bodies.time_steps)
+        assert (excess > 0.1).tolist() == [reason > 0]
         assert hybrid.trained_step == f"{0.5 * H:g} s"
 
 
-SCALED = [(0.5, 1.0, Reason.TIME_STEP), (1.0, 2.0, Reason.TIME_STEP), (0.5, 0.5, 0), (3.0, 3.0, 0)]
+SCALED = [(0.5, 1.0, Reason.OUTSIDE), (1.0, 2.0, Reason.OUTSIDE), (0.5, 0.5, 0), (3.0, 3.0, 0)]
 """Factors on all lengths and on the time step, and what a gate says."""
 
 
@@ -201,15 +201,12 @@ def test_half_the_lengths_are_refused_as_twice_the_step_is_and_both_alike_pass(
     scene = soft_beam().with_changes(body=body, time={"step": times * H})
     problem = pc.discretise(scene)
     corrector = fitted(problems((3, 1, 1)))
-    gate = Gate(time_step=0.0)  # the narrowest; of bodies at rest, as by default
     bodies = BodyGraph.of([problem], dtype=dtype)
-    assert gate.foreign(corrector, bodies).tolist() == [reason]
-    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
-    assert hybrid.compiled
-    excess = np.log(2.0) if reason else 0.0
-    assert hybrid.time_step_excess() == pytest.approx(excess, rel=1e-6)
+    score = np.log(2.0) / 0.1 if reason else 0.0
+    assert corrector.rest_score(bodies).tolist() == pytest.approx([score], rel=1e-4, abs=1e-4)
+    hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=ONLY_OUTSIDE)
     assert hybrid.trained_step == f"{lengths * H:g} s"
-    assert (hybrid(problem.rest_state()).stats["gate"] == Reason.TIME_STEP) == (reason != 0)
+    assert reason == 0 or hybrid(problem.rest_state()).stats["gate"] == Reason.OUTSIDE
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -224,15 +221,11 @@ def test_a_batch_of_another_time_step_is_refused_as_a_whole_each_scene_by_its_re
     state = stepper.rest_state()
     hybrid = BatchHybrid(stepper, corrector, gate=Gate(), recorded=recorded)
     result, plain = hybrid(state), stepper(state)
-    assert result.reasons.tolist() == [Reason.TIME_STEP, Reason.BODY]
+    assert result.reasons.tolist() == [Reason.OUTSIDE, Reason.OUTSIDE]
     assert torch.equal(result.state.positions, plain.state.positions)
     assert not result.state.memory
     assert not result.correction.any()
     assert recorded or corrector.calls == 0
-    gate = ONLY_STEPS.model_copy(update={"body": 0.3, "time_step": None})
-    result = BatchHybrid(stepper, corrector, gate=gate, recorded=recorded)(state)
-    assert result.reasons.tolist() == [0, Reason.BODY]
-    assert result.correction[: len(known.positions)].any()
 
 
 def test_of_several_time_steps_only_the_out_of_distribution_one_is_refused():
@@ -240,11 +233,11 @@ def test_of_several_time_steps_only_the_out_of_distribution_one_is_refused():
     scenes = problems((3, 1, 1), (3, 1, 1))
     corrector = fitted(scenes, kind=Watched)
     stepper = pc.BatchStepper(scenes)
-    hybrid = BatchHybrid(stepper, corrector, gate=ONLY_STEPS)
+    hybrid = BatchHybrid(stepper, corrector, gate=ONLY_OUTSIDE)
     nodes = hybrid._hybrid.nodes
     nodes._graph = replace(nodes.graph, time_step=torch.tensor([2.0 * H, H], dtype=torch.float64))
     result, plain = hybrid(stepper.rest_state()), stepper(stepper.rest_state())
-    assert result.reasons.tolist() == [Reason.TIME_STEP, 0]
+    assert result.reasons.tolist() == [Reason.OUTSIDE, 0]
     assert corrector.calls == 1
     assert torch.equal(result.state.positions[0], plain.state.positions[0])
     assert not torch.equal(result.state.positions[1], plain.state.positions[1])
@@ -263,4 +256,4 @@ MEASURED = ("impulse-as-published", "stretch-as-published")
 def test_released_models_know_the_time_step_and_cell_size_of_their_data(name):
     model = pc.load_model(name)
     rel = 1e-6 if name in MEASURED else 1e-12
-    assert model.corrector.normaliser.time_steps == pytest.approx((0.2, 0.2), rel=rel)
+    assert model.corrector.envelope.time_steps == pytest.approx((0.2, 0.2), rel=rel)

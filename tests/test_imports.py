@@ -14,7 +14,7 @@ TINY = ROOT / "datasets" / "tiny"
 LAYERS = [
     "_version", "errors", "_config", "_files", "_environment", "state", "scene", "fem",
     "trajectory", "solvers", "metrics", "figures", "io", "batch", "corrector", "data", "elements",
-    "training", "evaluation", "cli", "__main__",
+    "evaluation", "training", "cli", "__main__",
 ]  # fmt: skip
 """From the ground up: a folder, or module beside the folders, imports from those before it."""
 

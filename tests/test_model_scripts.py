@@ -96,7 +96,7 @@ def test_released_models_know_the_bodies_that_they_were_trained_on(name):
     model = pc.load_model(name)
     sets = [dataset for dataset, _ in model.data_sets]
     shapes = torch.cat([training_shapes(x) for x in (sets[:1] if name in FIRST_ONLY else sets)])
-    known = model.corrector.normaliser
+    known = model.corrector.envelope
     assert float(known.shape_excess(shapes).max()) < 1e-6
     assert (shapes.amin(dim=0) - known.shape_low).abs().max() < 1e-6
     assert (shapes.amax(dim=0) - known.shape_high).abs().max() < 1e-6

@@ -15,6 +15,7 @@ from pdcorrect import discretise  # noqa: E402
 from pdcorrect.corrector import features  # noqa: E402
 from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
+from pdcorrect.corrector.envelope import Envelope  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
     NODE_FEATURES,
     FeatureView,
@@ -67,6 +68,20 @@ def fitted(**columns):
     return normaliser
 
 
+def excess(columns, values):
+    """How far values of features lie outside of those in columns."""
+    normaliser, envelope = (
+        fitted(**columns),
+        Envelope({n: x.shape[1] for n, x in columns.items()}, {}),
+    )
+    seen = {name: RunningMoments() for name in columns}
+    for name, moments in seen.items():
+        moments.add(columns[name])
+    envelope.fit(seen)
+    x = torch.cat(list(values.values()), dim=1)
+    return envelope.excess(tuple(values), x, *normaliser.rows(values))
+
+
 def test_normalised_features_have_zero_mean_and_unit_deviation():
     rng = np.random.default_rng(1)
     a, b = tensor(rng.normal(3.0, 2.0, (100, 2))), tensor(rng.normal(-1e5, 10.0, (100, 1)))
@@ -92,44 +107,44 @@ def test_components_that_never_change_become_zero_and_are_known_to_a_hundredth(c
     assert largest(other) == pytest.approx(1.0 if constant else 0.0)
     unit = 0.01 * (abs(constant) or 1.0)
     near = constant + unit * tensor([[0.0], [2.0], [-60.0]])
-    assert normaliser.excess({"a": near}).flatten().tolist() == pytest.approx([0.0, 2.0, 60.0])
+    assert excess({"a": x}, {"a": near}).flatten().tolist() == pytest.approx([0.0, 2.0, 60.0])
 
 
 def averaged(*rows):
-    """A normaliser of two components that has seen bodies with these mean inputs."""
-    normaliser, averages = Normaliser({"a": 2}, {"b": 3}), RunningMoments()
+    """An envelope of two components that has seen bodies with these mean inputs."""
+    envelope, averages = Envelope({"a": 2}, {"b": 3}), RunningMoments()
     averages.add(tensor(rows))
-    normaliser.fit_averages(averages)
-    return normaliser
+    envelope.fit({"average": averages})
+    return envelope
 
 
 def test_out_of_distribution_scores_of_bodies_are_deviations_of_their_mean_inputs():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(4000, 2)) * [1.0, 3.0] + [5.0, -2.0]
-    normaliser = averaged(*rows)
-    found = normaliser.strangeness(tensor([[5.0, -2.0], [7.0, -2.0], [5.0, 10.0], [9.0, -11.0]]))
+    envelope = averaged(*rows)
+    found = envelope.strangeness(tensor([[5.0, -2.0], [7.0, -2.0], [5.0, 10.0], [9.0, -11.0]]))
     expected = [[0.0, 0.0], [2.0, 0.0], [0.0, 4.0], [4.0, 3.0]]
     np.testing.assert_allclose(found.numpy(), expected, rtol=0.12, atol=0.1)
-    assert Normaliser({"a": 1}, {}).strangeness(tensor([[0.0]])).isposinf().all()
+    assert Envelope({"a": 1}, {}).strangeness(tensor([[0.0]])).isposinf().all()
     cancelled = averaged([0.0, 0.0], [1e-9, -1e-9])
     assert largest(cancelled.strangeness(tensor([[0.1, -0.3]])) - tensor([[1.0, 3.0]])) < 1e-6
     rows = np.zeros((1000, 2))  # with a rare extreme
     rows[0] = 30.0, -7.0
-    normaliser = averaged(*rows)
-    assert largest(normaliser.strangeness(tensor(rows[:1])) - 3.5) < 1e-9
-    beyond = normaliser.strangeness(tensor([[36.0, 0.0], [-6.0, 0.0]]))
+    envelope = averaged(*rows)
+    assert largest(envelope.strangeness(tensor(rows[:1])) - 3.5) < 1e-9
+    beyond = envelope.strangeness(tensor([[36.0, 0.0], [-6.0, 0.0]]))
     assert 4.1 < float(beyond[0, 0]) < 4.3  # by a fifth
     assert float(beyond[1, 0]) > 6.0  # on the other side, where none was
 
 
 def test_mean_inputs_of_further_data_widen_the_range():
-    normaliser = averaged([0.0, 0.0], [1.0, 1.0], [0.5, 0.2])
+    envelope = averaged([0.0, 0.0], [1.0, 1.0], [0.5, 0.2])
     further, averages = tensor([[9.0, 0.5]]), RunningMoments()
     averages.add(further)
-    assert float(normaliser.strangeness(further)[0, 0]) > 10.0
-    normaliser.widen_averages(averages)
-    assert float(normaliser.strangeness(further)[0, 0]) <= 3.5 + 1e-12
-    assert float(normaliser.strangeness(-further)[0, 0]) > 10.0
+    assert float(envelope.strangeness(further)[0, 0]) > 10.0
+    envelope.widen({"average": averages})
+    assert float(envelope.strangeness(further)[0, 0]) <= 3.5 + 1e-12
+    assert float(envelope.strangeness(-further)[0, 0]) > 10.0
 
 
 def test_inputs_bend_towards_the_clip():
@@ -144,19 +159,15 @@ def test_inputs_bend_towards_the_clip():
 
 def test_excess_counts_deviations_outside_the_range_seen_of_which_the_farthest_is_3_5_at_most():
     x = tensor([[0.0, -1.0], [4.0, 1.0]])  # deviations 2 and 1
-    found = fitted(a=x).excess({"a": tensor([[2.0, 0.0], [-3.0, 1.0], [5.0, -1.5], [4.0, 3.0]])})
+    found = excess({"a": x}, {"a": tensor([[2.0, 0.0], [-3.0, 1.0], [5.0, -1.5], [4.0, 3.0]])})
     assert torch.equal(found, tensor([[0.0, 0.0], [1.5, 0.0], [0.5, 0.5], [0.0, 2.0]]))
     kicks = torch.zeros(100, 1).double()
     kicks[0] = 7.0  # ten deviations from the mean
-    normaliser = fitted(a=kicks)
     unit = (7.0 - 0.07) / 3.5
     usual = float(kicks.std(correction=0))
     assert usual < 0.4 * unit
-    assert normaliser.excess({"a": tensor([[7.0 + unit], [-usual]])}).flatten().tolist() == (
-        pytest.approx([1.0, 1.0])
-    )
-    scale = normaliser.scale("a")
-    assert [float(scale.below), float(scale.above)] == pytest.approx([usual, unit])
+    found = excess({"a": kicks}, {"a": tensor([[7.0 + unit], [-usual]])})
+    assert found.flatten().tolist() == pytest.approx([1.0, 1.0])
 
 
 def test_a_normaliser_needs_values_to_be_fitted_to():

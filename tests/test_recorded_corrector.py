@@ -66,8 +66,8 @@ class Motion:
         return [view for _, _, view in self.steps]
 
 
-def assert_same(answers, corrector, view, margin=1.0):
-    """Corrections, shares outside and distances, at rounding of single precision at most."""
+def assert_same(answers, corrector, view):
+    """Corrections and scores, at rounding of single precision at most."""
     with torch.no_grad():
         anew = FeatureView(view.bodies, view.snapshot)
         expected = corrector.of_view(anew)
@@ -75,13 +75,12 @@ def assert_same(answers, corrector, view, margin=1.0):
         size = expected.abs().max()
         assert size > 1e-8
         assert (found - expected).abs().max() < 1e-5 * size
-        assert torch.equal(answers.outside(view, margin), corrector.outside(anew, margin))
-        torch.testing.assert_close(answers.unlike(view), corrector.unlike(anew))
+        torch.testing.assert_close(answers.score(view), corrector.score(anew))
 
 
 def test_answers_are_those_of_the_corrector_step_by_step_and_stay(device, made):
     motion = Motion(device, made)
-    answers = RecordedCorrector(made, 1.0)
+    answers = RecordedCorrector(made)
     for view in (*motion.views, *motion.views[::-1]):
         assert_same(answers, made, view)
     first, second, *_ = motion.views
@@ -92,16 +91,13 @@ def test_answers_are_those_of_the_corrector_step_by_step_and_stay(device, made):
     assert torch.equal(kept, before)
 
 
-@pytest.mark.parametrize("margin", [None, 0.0, 3.0])
-def test_other_margins_and_views_are_not_taken_for_those_recorded(device, made, margin):
+def test_other_views_are_not_taken_for_those_recorded(device, made):
     first, second, *_ = Motion(device, made).views
-    answers = RecordedCorrector(made, margin)
+    answers = RecordedCorrector(made)
     with torch.no_grad():
         answers.of_view(first)
         for view in (first, second):
-            for asked in (0.0, 0.1, 3.0):
-                assert torch.equal(answers.outside(view, asked), made.outside(view, asked))
-            torch.testing.assert_close(answers.unlike(view), made.unlike(view))
+            torch.testing.assert_close(answers.score(view), made.score(view))
 
 
 def written(corrector):
@@ -149,7 +145,7 @@ IN_PLACE, ANEW = [written, loaded, scaled], [replaced, moved, layered, grown, cl
 def test_changes_of_the_corrector_count_at_once(device, made, change):
     motion = Motion(device, made)
     view = motion.views[-1]
-    answers = Counted(made, 1.0)
+    answers = Counted(made)
     with torch.no_grad():
         answers.of_view(motion.views[-2])
         before = answers.of_view(view)
@@ -175,7 +171,7 @@ class Counted(RecordedCorrector):
 
 def test_a_recording_that_fails_leaves_nothing_behind(device, made, monkeypatch):
     motion = Motion(device, made)
-    answers = RecordedCorrector(made, 1.0)
+    answers = RecordedCorrector(made)
     assert_same(answers, made, motion.views[1])
     replaced(made)
 
@@ -193,10 +189,10 @@ def test_a_recording_that_fails_leaves_nothing_behind(device, made, monkeypatch)
 def test_what_is_recorded_stays_where_it_is(device, made):
     """A GPU replays work on addresses."""
     motion = Motion(device, made)
-    answers = Counted(made, 1.0)
+    answers = Counted(made)
 
     def places():
-        kept = [answers._answer, answers._outside, answers._unlike]
+        kept = [answers._answer, answers._score]
         kept += [getattr(answers._snapshot, name) for name in ("positions", "correction")]
         measures, stepper = motion.parts.measures, motion.stepper
         kept += [measures._positions, measures._velocities, measures._y]
@@ -221,20 +217,21 @@ def test_nothing_that_is_recorded_asks_for_a_value(made):
     view = motion.views[2]
     with torch.no_grad():
         made.of_view(view)  # what is known of the bodies at rest is there before
+        made.rest_score(view.bodies)
     with FakeTensorMode(allow_non_fake_inputs=True) as fake, torch.no_grad():
         snapshot = Snapshot(*(fake.from_tensor(x) for x in vars(view.snapshot).values()))
         found = FeatureView(view.bodies, snapshot)
         vars(found)["turns"] = fake.from_tensor(view.turns)  # compiled loops on the CPU
         corrections = made.of_view(found)
         assert corrections.shape == view.bodies.rest.shape
-        assert made.outside(found, 1.0).shape == made.unlike(found).shape == (2,)
+        assert made.score(found).shape == (2,)
         with pytest.raises(DataDependentOutputException):
             float(corrections.sum())
 
 
 def test_other_bodies_and_materials_are_recorded_anew(device, made):
     motion = Motion(device, made)
-    answers = RecordedCorrector(made, 1.0)
+    answers = RecordedCorrector(made)
     assert_same(answers, made, motion.views[1])
     motion.stepper.set_material(young=8e4)
     state = motion.stepper.rest_state()
@@ -285,7 +282,7 @@ def test_code_that_would_not_run_is_not_recorded(device, made, change):
     assert not pc.BatchHybrid(stepper, made)(stepper.rest_state()).refused.any()
     if change is not neutral:
         with pytest.raises(InputError, match="record"):
-            RecordedCorrector(made, 1.0).of_view(Motion(device, made).views[0])
+            RecordedCorrector(made).of_view(Motion(device, made).views[0])
     with pytest.raises(InputError, match="record"):
         pc.BatchHybrid(stepper, made, recorded=True)
 
@@ -293,7 +290,7 @@ def test_code_that_would_not_run_is_not_recorded(device, made, change):
 @pytest.mark.parametrize("placement", ["state", "force", "guess"])
 def test_rollouts_are_those_without_recording(device, placement):
     corrector = fitted(problems(*CELLS), size=0.01, placement=placement).to(device)
-    gate = pc.Gate(margin=0.05)
+    gate = pc.Gate(outside=0.8)
     stepper = pc.BatchStepper(problems(*CELLS), device=device)
     runs = []
     for replayed in (False, True):
@@ -321,7 +318,7 @@ def assert_equal(found, expected):
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
 def test_copies_of_a_hybrid_in_use_record_for_themselves(device, made, copied):
     stepper = pc.BatchStepper(problems(*CELLS), device=device)
-    gate = pc.Gate(margin=100.0, average=None)
+    gate = pc.Gate(outside=100.0)
     hybrid = pc.BatchHybrid(stepper, made, gate=gate, recorded=True)
     first = hybrid(stepper.rest_state())
     other = copied(hybrid)
@@ -345,11 +342,11 @@ def test_inference_mode_makes_no_difference(device, made):
 def test_of_a_recorded_batch_the_out_of_distribution_body_is_refused(device, made):
     several = [*problems(*CELLS), *problems((14, 1, 1))]
     stepper = pc.BatchStepper(several, device=device)
-    gate = pc.Gate(margin=None, average=None, volume=None, crushing=None, energy=None)
+    gate = pc.Gate(crushing=None, energy=None)
     hybrid, state = pc.BatchHybrid(stepper, made, gate=gate, recorded=True), stepper.rest_state()
     for _ in range(3):
         result = hybrid(state)
         state = result.state
-        assert result.reasons.tolist() == [*[0] * len(CELLS), Reason.BODY]
+        assert result.reasons.tolist() == [*[0] * len(CELLS), Reason.OUTSIDE]
     assert not result.correction[-len(several[-1].positions) :].any()
     assert result.correction.any()

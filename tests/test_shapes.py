@@ -19,7 +19,7 @@ from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.fem.mesh import voxel_mesh
 
-ONLY_BODIES = Gate(margin=None, average=None, volume=None, crushing=None, energy=None)
+ONLY_BODIES = Gate(crushing=None, energy=None)
 
 
 def measured(*several):
@@ -142,12 +142,13 @@ def ranged(*several):
     """A corrector that knows some bodies, otherwise without values."""
     corrector, shapes = Corrector(preset("compact", layers=1, width=8)), RunningMoments()
     shapes.add(BodyGraph.of(several, 0.01, dtype=torch.float64).shapes)
-    corrector.normaliser.fit_shapes(shapes)
+    corrector.envelope.fit({"shape": shapes})
     return corrector
 
 
 def excess(corrector, *several):
-    return corrector.shape_excess(BodyGraph.of(several, 0.01, dtype=torch.float64)).tolist()
+    shapes = BodyGraph.of(several, 0.01, dtype=torch.float64).shapes
+    return corrector.envelope.shape_excess(shapes).amax(dim=1).tolist()
 
 
 def test_what_lies_between_two_known_bodies_is_known_and_what_is_larger_by_how_much_it_is():
@@ -166,13 +167,11 @@ def test_nobody_is_known_before_bodies_were_fitted_and_further_data_widen_the_ra
     unknown = torch.full((1, len(SHAPE_MEASURES)), torch.nan, dtype=torch.float64)
     one, other = cantilever((4, 1, 1)), cantilever((3, 3, 3), clamps=[])
     corrector, shapes = ranged(one), RunningMoments()
-    assert corrector.normaliser.shape_excess(unknown).isposinf().all()
+    assert corrector.envelope.shape_excess(unknown).isposinf().all()
     assert excess(corrector, other)[0] > 1.0
     shapes.add(BodyGraph.of([other], dtype=torch.float64).shapes)
-    corrector.normaliser.widen_shapes(shapes)
+    corrector.envelope.widen({"shape": shapes})
     assert excess(corrector, one, other) == [0.0, 0.0]
-    state = corrector.state_dict()
-    assert torch.equal(state["normaliser.shape_low"], corrector.normaliser.shape_low)
 
 
 # --- the gate ----------------------------------------------------------------------------------
@@ -187,14 +186,14 @@ def test_an_out_of_distribution_body_keeps_its_coarse_steps_and_the_network_is_n
     hybrid = HybridStepper(coarse, corrector, gate=Gate()).prepare()
     run, plain = pc.rollout(hybrid, 5), pc.rollout(coarse, 5)
     assert np.array_equal(run.positions, plain.positions)
-    assert run.stats["gate"].tolist() == [Reason.BODY] * 5
+    assert run.stats["gate"].tolist() == [Reason.OUTSIDE] * 5
     assert run.stats["refused"].tolist() == [1.0] * 5
     assert not run.stats["correction"].any()
     assert corrector.calls == 0
     others = [pc.discretise(soft_beam(cells, loads=[TORSION])) for cells in ((6, 1, 1), (3, 3, 3))]
     stepper = pc.BatchStepper(others)
     result = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
-    assert result.reasons.tolist() == [Reason.BODY] * 2
+    assert result.reasons.tolist() == [Reason.OUTSIDE] * 2
     assert not result.correction.any()
     assert corrector.calls == 0
     known_body = HybridStepper(pc.ProjectiveDynamics(known[0]), corrector, gate=Gate())
@@ -209,7 +208,7 @@ def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it
     def beyond(problem):
         """Measures outside of their ranges, by name."""
         shapes = BodyGraph.of([problem], dtype=torch.float64).shapes
-        far = corrector.normaliser.shape_excess(shapes)[0].tolist()
+        far = corrector.envelope.shape_excess(shapes)[0].tolist()
         return {name: x for name, x in zip(SHAPE_MEASURES, far, strict=True) if x > 0.0}
 
     assert beyond(known[0]) == beyond(known[1]) == {}
@@ -221,7 +220,7 @@ def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it
     assert max(found.values()) == pytest.approx(excess(corrector, longer)[0])
     hybrid = HybridStepper(pc.ProjectiveDynamics(longer), corrector, gate=Gate()).prepare()
     assert hybrid.compiled
-    assert hybrid(longer.rest_state()).stats["gate"] == Reason.BODY
+    assert hybrid(longer.rest_state()).stats["gate"] == Reason.OUTSIDE
 
 
 @pytest.mark.parametrize("recorded", [False, True])
@@ -230,14 +229,14 @@ def test_a_batch_refuses_the_out_of_distribution_body_and_not_the_others(recorde
     corrector = fitted(known)
     stepper = pc.BatchStepper([known[0], strange])
     hybrid = BatchHybrid(stepper, corrector, gate=ONLY_BODIES, recorded=recorded)
-    state, plain = stepper.rest_state(), stepper.rest_state()
-    for _ in range(3):
-        result, coarse = hybrid(state), stepper(plain)
-        state, plain = result.state, coarse.state
-        assert result.reasons.tolist() == [0, Reason.BODY]
-        assert torch.equal(state.positions[1], plain.positions[1])
-        assert not torch.equal(state.positions[0], plain.positions[0])
-        assert not result.correction[len(known[0].positions) :].any()
+    result, plain = hybrid(stepper.rest_state()), stepper(stepper.rest_state()).state
+    assert result.reasons.tolist() == [0, Reason.OUTSIDE]
+    for found, expected in (
+        (result.state.positions, plain.positions), (result.state.velocities, plain.velocities)
+    ):  # fmt: skip
+        assert torch.equal(found[1], expected[1])
+        assert not torch.equal(found[0], expected[0])
+    assert not result.correction[len(known[0].positions) :].any()
     assert result.correction.any()
 
 
@@ -258,15 +257,18 @@ def test_a_known_shape_on_unknown_supports_is_refused(kind):
     corrector = ranged(*(pc.discretise(soft_beam((n, 1, 1))) for n in (6, 12)))
     assert max(excess(corrector, pc.discretise(soft_beam((8, 1, 1))))) < 1e-12
     body = BodyGraph.of([unlike_supports()[kind]], 0.01, dtype=torch.float64)
-    assert Gate().foreign(corrector, body).tolist() == [Reason.BODY]
+    assert corrector.envelope.shape_excess(body.shapes).max() > 0.3
 
 
 def test_the_bound_on_bodies_is_an_argument():
     corrector = fitted(problems((3, 1, 1)))
     problem = pc.discretise(soft_beam((4, 1, 1), loads=[TORSION]))
     (away,) = excess(corrector, problem)
-    for bound, reason in ((0.9 * away, Reason.BODY), (1.1 * away, 0), (None, 0)):
-        gate = ONLY_BODIES.model_copy(update={"body": bound})
+    assert float(corrector.rest_score(BodyGraph.of([problem], dtype=torch.float64))) == (
+        pytest.approx(away / 0.3)
+    )
+    for bound, reason in ((3.0 * away, Reason.OUTSIDE), (1e6, 0), (None, 0)):
+        gate = ONLY_BODIES.model_copy(update={"outside": bound})
         hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=gate)
         assert hybrid(problem.rest_state()).stats["gate"] == reason, bound
 
@@ -277,13 +279,12 @@ def test_a_correction_that_is_not_a_number_does_not_hide_an_out_of_distribution_
     corrector.of_view = lambda view: torch.full_like(view.bodies.rest, torch.nan)
     stepper = pc.BatchStepper([known[0], strange])
     result = BatchHybrid(stepper, corrector, gate=Gate())(stepper.rest_state())
-    assert result.reasons.tolist() == [Reason.NOT_FINITE, Reason.BODY]
+    assert result.reasons.tolist() == [Reason.NOT_FINITE, Reason.OUTSIDE]
 
 
 def test_measures_are_kept_where_only_the_material_changes():
     body = BodyGraph.of([cantilever()], dtype=torch.float64)
-    shapes, corners = body.shapes, body.rest_corners
+    shapes = body.shapes
     cells = torch.ones(len(body.cells))
     other = body.with_material(2.0 * body.mass, cells, 0.3 * cells, cells)
     assert other.shapes is shapes
-    assert other.rest_corners is corners

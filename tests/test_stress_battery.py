@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import pdcorrect as pc
 from conftest import rotation
-from pdcorrect.corrector.gate import Reason
+from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import make_plan
 from pdcorrect.scene import trained_coarse
@@ -53,6 +54,8 @@ def judged(scenario, solver):
     found = {"error above PD best's" if finer else "distance", "status"}
     if scenario.name == "cross ordinary" and solver in MODELS:
         found.add("accepted")
+    if solver == BATTERY.LEARNED:
+        found.add("beside PD enhanced")
     return {f"{scenario.name}, {solver}, {what}" for what in found}
 
 
@@ -162,7 +165,8 @@ def test_the_reversing_load_turns_round_at_every_step():
 
 def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
     """The battery as a whole, with a stepper that stops after one iteration."""
-    scenario = replace(SCENES["1 cell"], solvers=("PD", "Newton"))
+    solvers = ("PD", BATTERY.ENHANCED, BATTERY.LEARNED, "Newton")
+    scenario = replace(SCENES["1 cell"], solvers=solvers)
     make = {**BATTERY.run.__globals__["MAKE"]}
     make["PD"] = lambda problem: pc.ProjectiveDynamics(problem, max_iterations=0, recover=False)
     monkeypatch.setitem(BATTERY.run.__globals__, "MAKE", make)
@@ -171,6 +175,39 @@ def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
     assert row["PD"].startswith("fail")
     assert row["Newton"].startswith("pass")
     assert outcome.figures["1 cell, PD, status"] == "ITERATION_LIMIT"
+
+
+# --- the learned element beside the best coarse model -------------------------------------------
+
+
+def test_the_learned_element_and_the_best_coarse_model_are_those_of_scenes():
+    make, solvers = sys.modules["solvers"].problem_of, ("PD", BATTERY.ENHANCED, BATTERY.LEARNED)
+    found = [make(SCENES["1 cell"], solver).element for solver in solvers]
+    assert found == ["hex8", "hex8-enhanced", "hex8-learned"]
+
+
+@pytest.mark.parametrize(
+    ("mine", "its", "word"),
+    [(0.0, 0.0, "both"), (0.0, 1.0, "won"), (1.0, 0.0, "lost"), (1.0, 1.0, "neither")],
+)
+def test_a_scene_is_lost_if_only_the_best_coarse_model_reaches_what_it_has_to(mine, its, word):
+    scenario = SCENES["plane"]
+    learned, best = (
+        BATTERY.figures_of(scenario, s, run_of(scenario, at_rest, pushed([far, 0.0, 0.0])), None)
+        for s, far in ((BATTERY.LEARNED, mine), (BATTERY.ENHANCED, its))
+    )
+    assert BATTERY.beside(learned, best) == word
+    wanted = CASE.expected["plane, PD learned, beside PD enhanced"]
+    assert wanted.met_by(word) == (word != "lost")
+
+
+def test_the_share_of_cells_that_are_learned_is_told():
+    rows = {}
+    for name in ("1 cell", "slivers"):
+        truth = BATTERY.Truth(SCENES[name])
+        figures = {s: truth.figures(s) for s in (BATTERY.ENHANCED, BATTERY.LEARNED)}
+        rows[name] = BATTERY.learned(truth, figures, "both")[1][0]
+    assert [row[-2:] for row in rows.values()] == [("both", 100.0), ("both", 0.0)]
 
 
 # --- crosses that the torsion model knows ------------------------------------------------------
@@ -194,10 +231,8 @@ def test_the_model_knows_the_cross_at_rest_and_not_with_its_far_end_held():
     found = pc.load_model("torsion-exact")
     for name, known in (("cross ordinary", True), ("cross plane", True), ("cross turned", False)):
         problem = pc.discretise(trained_coarse(SCENES[name].scene))
-        coarse = pc.ProjectiveDynamics(problem)
-        stepper = pc.HybridStepper(coarse, found.corrector, gate=pc.Gate())
-        refused = stepper(problem.rest_state()).stats["gate"] == Reason.BODY
-        assert refused != known
+        bodies = BodyGraph.of([problem], dtype=torch.float64)
+        assert (found.corrector.envelope.rest_score(bodies) <= pc.Gate().outside) == known
 
 
 def test_the_crosses_load_turns_round_at_every_step():

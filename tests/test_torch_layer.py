@@ -22,8 +22,11 @@ NAMES = (
 
 
 @on_every_device
-@pytest.mark.parametrize("element", VARIANTS)
-@pytest.mark.parametrize("integrator", ["backward-euler", "bdf2", "midpoint", "generalised-alpha"])
+@pytest.mark.parametrize(
+    ("element", "integrator"),
+    [(element, "generalised-alpha") for element in VARIANTS]
+    + [("hex8-bubble-mean", name) for name in ("backward-euler", "bdf2", "midpoint")],
+)
 def test_gradients_of_a_batch_are_those_of_its_scenes(element, integrator, device):
     """The two homes of the adjoint, torch and NumPy."""
     changes = {"time": {"integrator": integrator}, "damping": {"mass": 0.7}}
@@ -302,28 +305,14 @@ def test_options_that_make_no_sense_are_refused(name, value):
         pc.PDLayer(small_batch(), **{name: value})
 
 
-@pytest.mark.parametrize("kind", ["problems", "problem", "single"])
-def test_a_layer_is_of_a_batch_stepper(kind):
-    problem = pc.discretise(beam((2, 1, 1)))
-    given = {"problems": [problem], "problem": problem, "single": pc.ProjectiveDynamics(problem)}
-    with pytest.raises(InputError, match="stepper is a .*: expected a BatchStepper"):
-        pc.PDLayer(given[kind])
-
-
 WRONG = {
-    "a state": (lambda r, p, v: ((r, None), {}), "positions is a BatchState"),
-    "no velocities": (lambda r, p, v: ((p, None), {}), "velocities is a NoneType"),
-    "arrays": (lambda r, p, v: ((p.numpy(), v.numpy()), {}), "positions is a ndarray"),
-    "a list of forces": (lambda r, p, v: ((p, v, [1.0]), {}), "forces is a list"),
     "flat forces": (lambda r, p, v: ((p, v, p[0, 0]), {}), r"forces: \(3,\); expected \(2, 12"),
-    "array forces": (lambda r, p, v: ((p, v, p.numpy()), {}), "forces is a ndarray"),
     "one scene": (lambda r, p, v: ((p[0], v[0]), {}), r"positions: \(12, 3\); expected \(2, 12, 3"),
     "one time": (lambda r, p, v: ((p, v), {"times": 0.5}), r"times = 0\.5: expected 2 finite"),
     "few times": (lambda r, p, v: ((p, v), {"times": [0.0]}), r"times = \[0\.0\]"),
     "words": (lambda r, p, v: ((p, v), {"times": "ab"}), "times = 'ab'"),
     "infinite times": (lambda r, p, v: ((p, v), {"times": [0.0, np.inf]}), "times = "),
     "integers": (lambda r, p, v: ((p, v), {"young": torch.tensor(1)}), r"young: torch\.int64"),
-    "truth": (lambda r, p, v: ((p, v), {"young": True}), "young is a bool"),
     "young of scenes": (
         lambda r, p, v: ((p, v), {"young": torch.full((3,), 1e5, dtype=p.dtype)}),
         r"young: \(3,\).*one value a scene is \(2, 1\)",
@@ -347,22 +336,21 @@ def spoilt(x):
 
 
 @pytest.fixture(scope="module")
-def expected_step():
-    """Positions after a step of a batch that nobody called wrongly."""
-    stepper = small_batch()
-    return pc.PDLayer(stepper)(*(x.detach() for x in inputs(stepper)[:2]))[0]
+def refusing():
+    """A layer for all calls that are refused, what it is given, and what it makes of that."""
+    layer = pc.PDLayer(small_batch())
+    p, v = (x.detach() for x in inputs(layer.stepper)[:2])
+    return layer, p, v, layer(p, v)[0]
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_calls_with_unusable_arguments_are_refused_by_name_and_change_nothing(what, expected_step):
+def test_calls_with_unusable_arguments_are_refused_by_name_and_change_nothing(what, refusing):
     make, message = WRONG[what]
-    stepper = small_batch()
-    p, v = (x.detach() for x in inputs(stepper)[:2])
-    layer = pc.PDLayer(stepper)
-    arguments, named = make(stepper.rest_state(), p, v)
+    layer, p, v, expected = refusing
+    arguments, named = make(layer.stepper.rest_state(), p, v)
     with pytest.raises(InputError, match=message):
         layer(*arguments, **named)
-    assert torch.equal(layer(p, v)[0], expected_step)
+    assert torch.equal(layer(p, v)[0], expected)
 
 
 def test_a_failure_tells_its_step_and_the_scenes_statuses():
@@ -612,14 +600,12 @@ def test_inputs_that_do_not_fit_are_refused_by_name():
             layer(p, v, torch.stack([f] * frames))
     with pytest.raises(InputError, match=r"young: \(4, 7\)"):
         layer(p, v, f, young=torch.ones(4, 7, dtype=torch.float64))
-    with pytest.raises(InputError, match="poisson is a str"):
-        layer(p, v, f, poisson="0.3")
     with pytest.raises(InputError, match="times = "):
         layer(p, v, f, times=[0.0])
 
 
 def test_a_layer_with_follower_loads_can_be_copied():
-    twist = [{"kind": "torsion", "strength": 1e4, "stretch": 0.2, "follower": True}]
+    twist = [{"kind": "torsion", "strength": 100.0, "stretch": 0.2, "follower": True}]
     stepper = pc.BatchStepper([pc.discretise(beam((2, 1, 1), loads=twist))], 1e-9)
     layer = pc.PDLayer(stepper)
     rest = stepper.rest_state()

@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.compare import cases_with
+from pdcorrect.evaluation.comparison_cases import cases_with
 from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]
@@ -94,8 +94,7 @@ def save_silent(published, folder):
     save_model(samples.fitted(published, settings(), silent=True), folder, record=record)
 
 
-@pytest.mark.parametrize("resident", [False, True])
-def test_single_steps_are_shown_the_masses_that_rollouts_have(published, resident):
+def test_single_steps_are_shown_the_masses_that_rollouts_have(published):
     """What the network sees of a stored step is what it sees when the scene is stepped."""
     import torch
 
@@ -103,7 +102,7 @@ def test_single_steps_are_shown_the_masses_that_rollouts_have(published, residen
     from pdcorrect.corrector.bodies import BodyGraph
     from pdcorrect.training.recordings import make_problems
 
-    windows, recordings = samples.windows(published, settings(), resident=resident)
+    windows, recordings = samples.windows(published, settings())
     problems = make_problems(recordings, "total-mass")
     for problem, recording in zip(problems, recordings, strict=True):
         assert problem.mass.sum() == pytest.approx(recording.total_mass, rel=1e-12)
@@ -118,7 +117,7 @@ def test_single_steps_are_shown_the_masses_that_rollouts_have(published, residen
 def test_a_silent_corrector_of_it_has_its_omega(published):
     pytest.importorskip("torch_geometric")
     import training_samples as samples
-    from pdcorrect.data.shard_arrays import read_arrays
+    from pdcorrect.data.shard_reader import read_shard
     from pdcorrect.training.recordings import load_recordings
     from pdcorrect.training.validation import Validation
 
@@ -127,10 +126,10 @@ def test_a_silent_corrector_of_it_has_its_omega(published):
         samples.fitted(published, settings(), silent=True)
     )
     (path,) = published.glob("validation/*.h5")
-    _, motions = read_arrays(path, (), ("plain", "total-mass"))
+    names = ("total-mass", "plain", "reference")
     expected = [
-        pc.metrics.error_corrected(m.rollouts["total-mass"], m.rollouts["plain"], m.positions)
-        for m in motions
+        pc.metrics.error_corrected(*(s.runs[name].positions for name in names))
+        for s in read_shard(path).simulations
     ]
     np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
     assert scores.mean > 30.0  # it is nearer than the plain mesh

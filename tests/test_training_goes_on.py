@@ -1,4 +1,4 @@
-"""Trainings that go on with a model: its weights, and ranges widened, left as they are or anew."""
+"""Trainings that go on with a model: its weights, and ranges widened or left as they are."""
 
 import shutil
 from dataclasses import replace
@@ -10,14 +10,11 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.corrector.corrector import Corrector  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import RunningMoments  # noqa: E402
 from pdcorrect.data.schema import write_shard  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
-from pdcorrect.training import training as training_module  # noqa: E402
-from pdcorrect.training.fitting import fit_normaliser  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from training_samples import weights  # noqa: E402
 
@@ -27,12 +24,6 @@ pytestmark = pytest.mark.usefixtures("few_threads")
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
     return samples.dataset(tmp_path_factory.mktemp("data"), frames=5)
-
-
-@pytest.fixture(scope="module")
-def other(tmp_path_factory):
-    """Another data set, of one mesh."""
-    return samples.dataset(tmp_path_factory.mktemp("other"), training=(2,), frames=4)
 
 
 @pytest.fixture(scope="module")
@@ -48,68 +39,17 @@ def settings(start, fitting, **changes):
     return samples.config(stage, start_from=str(start), fitting=fitting, **changes)
 
 
-# --- anew --------------------------------------------------------------------------------------
-
-
-def test_a_start_of_another_base_is_let_pass_if_the_normalisation_is_fitted_anew(
+def test_a_start_of_another_architecture_or_base_or_that_is_not_there_is_refused(
     data, earlier, tmp_path
 ):
-    for fitting, changes, words in (
-        ({}, {"base": "best"}, r"'plain'.*'best'.*fitting\.anew"),
-        ({"widen": False}, {"base": "best"}, r"fitting\.anew = true"),
-        ({}, {"velocity": "kept"}, "'recomputed'.*'kept'"),
-        ({"anew": True}, {"velocity": "kept"}, "'recomputed'.*'kept'"),
-    ):
-        with pytest.raises(InputError, match=f"start_from = .*{words}"):
-            Training(settings(earlier, fitting, **changes), data, tmp_path / "refused")
-    Training(settings(earlier, {"anew": True}, base="best"), data, tmp_path / "out").run()
-    found = load_model(tmp_path / "out" / "model")
-    assert found.base == "best"
-    assert found.record.training["config"]["fitting"]["anew"] is True
-    assert found.data_sets == load_model(earlier).data_sets
-
-
-def test_a_start_of_another_architecture_or_that_is_not_there_is_refused(data, earlier, tmp_path):
     other = {"preset": "compact", "changes": {"layers": 2, "width": 8}}
     for start, changes, words in (
         (earlier, {"corrector": other}, "layers = 1"),
+        (earlier, {"base": "best"}, '"plain".*"best"'),
         (tmp_path / "nothing", {}, "nothing"),
     ):
         with pytest.raises(InputError, match=words):
             Training(settings(start, {}, **changes), data, tmp_path / "out")
-
-
-@pytest.mark.parametrize("base", ["plain", "best"])
-def test_weights_are_those_of_the_start_and_the_normalisation_is_a_fresh_one(
-    other, earlier, tmp_path, base
-):
-    config = settings(earlier, {"anew": True, "windows": 3}, base=base, seed=5)
-    found, start = Training(config, other, tmp_path).corrector, load_model(earlier).corrector
-    fresh = Corrector(config.architecture())
-    fit_normaliser(fresh, samples.windows(other, config)[0], 3, seed=5)
-    for name, x in start.network.state_dict().items():
-        assert torch.equal(found.network.state_dict()[name], x), name
-    for name, x in fresh.normaliser.state_dict().items():
-        assert torch.equal(found.normaliser.state_dict()[name], x), name
-    assert not torch.equal(found.normaliser.output_scale, start.normaliser.output_scale)
-
-
-def test_such_a_training_goes_on_with_the_same_bits_and_does_not_fit_again(
-    other, earlier, tmp_path, monkeypatch
-):
-    config = settings(earlier, {"anew": True}, base="best", checkpoint_every={"iterations": 1})
-    Training(config, other, tmp_path / "whole").run()
-    assert not Training(config, other, tmp_path / "broken").run(seconds=0.0)
-    monkeypatch.setattr(training_module, "fit_normaliser", None)
-    resumed = Training(config, other, tmp_path / "broken", resume=True)
-    assert 0 < resumed.progress.total < 3
-    assert resumed.run()
-    one, two = (load_model(tmp_path / name / "model") for name in ("whole", "broken"))
-    for name, x in one.corrector.state_dict().items():
-        assert torch.equal(x, two.corrector.state_dict()[name]), name
-    changed = settings(earlier, {"widen": False}, checkpoint_every={"iterations": 1})
-    with pytest.raises(InputError, match=r"config\.base"):
-        Training(changed, other, tmp_path / "broken", resume=True)
 
 
 # --- the record --------------------------------------------------------------------------------
@@ -120,7 +60,6 @@ def test_such_a_training_goes_on_with_the_same_bits_and_does_not_fit_again(
     [
         ({}, ["first", "tiny"]),
         ({"widen": False}, ["first"]),
-        ({"anew": True}, ["tiny"]),
     ],
     ids=str,
 )
@@ -158,7 +97,7 @@ def test_ranges_of_a_model_that_does_not_record_it_count_as_fitted_to_all_that_i
 
 def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlier, tmp_path):
     model = load_model(earlier)
-    low, high = model.corrector.normaliser.time_step_low, model.corrector.normaliser.time_step_high
+    low, high = model.corrector.envelope.time_step_low, model.corrector.envelope.time_step_high
     step = float(low.exp())
     for shift in (np.log(2.0), -np.log(2.0)):
         for bound in (low, high):
@@ -168,14 +107,13 @@ def test_ranges_that_stay_and_data_of_another_time_step_are_refused(data, earlie
         told = rf"fitting\.widen = false.* {step:.4g} s/m.* {there:.4g} s/m"
         with pytest.raises(InputError, match=told):
             Training(settings(start, {"widen": False}), data, tmp_path / "out")
-        for fitting, expected in (({}, sorted((step, there))), ({"anew": True}, [step, step])):
-            found = Training(settings(start, fitting), data, tmp_path / "out").corrector
-            assert found.normaliser.time_steps == pytest.approx(expected)
+        found = Training(settings(start, {}), data, tmp_path / "out").corrector
+        assert found.envelope.time_steps == pytest.approx(sorted((step, there)))
     for bound in (low, high):
         bound.fill_(np.log(step) + 0.05)  # which a gate lets pass
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = Training(settings(start, {"widen": False}), data, tmp_path / "out").corrector
-    assert found.normaliser.time_steps == model.corrector.normaliser.time_steps
+    assert found.envelope.time_steps == model.corrector.envelope.time_steps
 
 
 # --- weights and ranges of the start ----------------------------------------------------------
@@ -187,10 +125,9 @@ def test_a_training_starts_from_a_models_weights_and_its_ranges_grow(earlier, tm
     before = load_model(earlier).corrector
     training = Training(config, new, tmp_path / "out")
     assert torch.equal(weights(training.corrector), weights(before))
-    mine, theirs = training.corrector.normaliser, before.normaliser
-    assert mine.output_scale == theirs.output_scale
-    for name, known in theirs.named_buffers():
-        found = mine.get_buffer(name)
+    assert training.corrector.normaliser.output_scale == before.normaliser.output_scale
+    for name, known in before.named_buffers():
+        found = training.corrector.get_buffer(name)
         if name.endswith("__low"):
             assert (found <= known).all()
         elif name.endswith("__high"):
@@ -205,9 +142,9 @@ def test_a_training_starts_from_a_models_weights_and_its_ranges_grow(earlier, tm
 
     config = samples.config(samples.one_step(), start_from=str(earlier))
     training = Training(config, data, tmp_path / "same")
-    known = training.corrector.normaliser
+    known = training.corrector.envelope
     fitted = known.get_buffer("deformation__high").clone()
-    assert fitted == load_model(earlier).corrector.normaliser.get_buffer("deformation__high")
+    assert fitted == load_model(earlier).corrector.envelope.get_buffer("deformation__high")
     further = {name: RunningMoments() for name in known.names}
     for name, moments in further.items():
         width = len(known.get_buffer(f"{name.replace('-', '_')}__low"))
@@ -234,18 +171,17 @@ def test_a_model_that_went_on_names_all_data_sets_that_it_has_learned(earlier, t
 
 def test_the_ranges_of_a_start_may_stay_and_the_weights_become_the_same(data, earlier, tmp_path):
     model = load_model(earlier)
-    model.corrector.normaliser.shape_high -= 1.0  # as of other bodies
-    model.corrector.normaliser.time_step_high += 1.0  # and of longer time steps, too
+    model.corrector.envelope.shape_high -= 1.0  # as of other bodies
+    model.corrector.envelope.time_step_high += 1.0  # and of longer time steps, too
     start = save_model(model.corrector, tmp_path / "start", record=model.record)
     found = {}
     for widen in (True, False):
         config = samples.config(samples.one_step(), start_from=str(start), fitting={"widen": widen})
         Training(config, data, tmp_path / str(widen)).run()
         found[widen] = load_model(tmp_path / str(widen) / "model").corrector
-        assert ("widen" in config.model_dump()["fitting"]) is not widen
-    for name, known in model.corrector.normaliser.named_buffers():
-        assert torch.equal(found[False].normaliser.get_buffer(name), known), name
-    assert (found[True].normaliser.shape_high > model.corrector.normaliser.shape_high).all()
+    for name, known in model.corrector.named_buffers():
+        assert torch.equal(found[False].get_buffer(name), known), name
+    assert (found[True].envelope.shape_high > model.corrector.envelope.shape_high).all()
     assert torch.equal(weights(found[True]), weights(found[False]))
     assert not torch.equal(weights(found[True]), weights(model.corrector))
 

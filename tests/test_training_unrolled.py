@@ -11,7 +11,8 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
+from pdcorrect.data.schema import write_shard  # noqa: E402
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402
@@ -136,10 +137,11 @@ def test_scenes_whose_step_fails_are_left_out(group, folder, monkeypatch):
     assert batches.failed == 1
 
 
-def test_a_pool_goes_on_where_it_was(folder):
+def test_a_pool_goes_on_where_it_was(folder, monkeypatch):
     recordings = load_recordings(folder, "training", "plain")
-    stage = samples.unrolled(start="pool", restart=0.0, lost=1e9, steps=2)
+    stage = samples.unrolled(start="pool", restart=0.0, steps=2)
     corrector = samples.fitted(folder, samples.config(stage), silent=True)
+    monkeypatch.setattr(SceneGroup, "lost", lambda self, *_: np.zeros(len(self), dtype=bool))
     batches = UnrolledBatches(SceneGroups(recordings, "plain"), stage)
     ages = []
     for iteration in range(3):
@@ -174,18 +176,17 @@ def test_rollouts_that_are_lost_by_their_squared_distance_go_back_to_the_referen
     frames = np.array([5, 6, 7])
     truth = group.truth(frames)
     rollout = torch.maximum(group.errors.rollout, group.errors.one_step)
-    away = torch.tensor([0.9, 1.1, 1.9]).double()
+    away = torch.tensor([0.9, 1.1, 0.3]).double()
     moved = truth.clone()
     moved[..., 0] += (away * rollout).sqrt()[:, None]
-    assert group.lost(moved, frames, 1.0).tolist() == [False, True, True]
-    assert group.lost(moved, frames, 2.0).tolist() == [False, False, False]
-    assert group.lost(moved * torch.nan, frames, 2.0).all()
+    assert group.lost(moved, frames).tolist() == [False, True, False]
+    assert group.lost(moved * torch.nan, frames).all()
     recordings = load_recordings(folder, "training", "plain")
     stage = samples.unrolled(start="pool", restart=0.0, steps=2)
     corrector = samples.fitted(folder, samples.config(stage), silent=True)
-    for lost, expected in ((1e9, [False] * 3), (1e-9, [True] * 3)):
-        chosen = stage.model_copy(update={"lost": lost})
-        batches = UnrolledBatches(SceneGroups(recordings, "plain"), chosen)
+    for rollout, expected in ((1e9, [False] * 3), (1e-30, [True] * 3)):
+        own = [replace(r, one_step=1e-30, rollout=rollout) for r in recordings]
+        batches = UnrolledBatches(SceneGroups(own, "plain"), stage)
         batches.loss(corrector, 0, 2)
         ages = batches.state_dict()[0]["pool"]["0"]["ages"]
         assert [age < 0 for age in ages] == expected
@@ -237,7 +238,7 @@ def test_a_teacher_is_asked_about_the_states_that_the_learner_meets(group, folde
     same = unroll(group, learner, started(group, frames), 2, stage, teacher=learner)
     assert same.losses.tolist() == [0.0, 0.0, 0.0]
     found = unroll(group, learner, started(group, frames), 1, stage, teacher=teacher)
-    layer = group.layer(learner, False, "recomputed")
+    layer = group.layer(learner, False)
     before = started(group, frames)
     assert layer.watch is None
     layer.watch = (views := []).append
@@ -273,8 +274,7 @@ def test_a_teacher_of_another_kind_is_refused(folder, tmp_path):
     stage = samples.unrolled(teacher=str(tmp_path / "best" / "model"))
     missing = samples.unrolled(teacher=str(tmp_path / "nowhere"))
     for settings, words in (
-        (samples.config(stage), "'best'.*'plain'"),
-        (samples.config(stage, base="best", velocity="kept"), "'recomputed'.*'kept'"),
+        (samples.config(stage), '"best".*"plain"'),
         (samples.config(missing), "nowhere"),
     ):
         with pytest.raises(InputError, match=words):
@@ -290,30 +290,41 @@ def test_a_silent_corrector_has_the_omega_of_its_base_model(folder, base):
     settings = samples.config(samples.one_step(), base=base)
     recordings = load_recordings(folder, "validation", base)
     scores = Validation(recordings, base)(samples.fitted(folder, settings, silent=True))
-    _, motions = read_arrays(folder / "validation" / "mesh-0001.h5", (), ("plain", "best"))
-    expected = [
-        error_corrected(m.rollouts[base], m.rollouts["plain"], m.positions) for m in motions
-    ]
+    simulations = read_shard(folder / "validation" / "mesh-0001.h5").simulations
+    names = (base, "plain", "reference")
+    expected = [error_corrected(*(s.runs[name].positions for name in names)) for s in simulations]
     assert scores.failed == 0
     np.testing.assert_allclose(scores.omegas, expected, atol=0.01)
     assert scores.mean == pytest.approx(np.mean(scores.omegas))
 
 
-def test_where_the_plain_model_has_no_error_there_is_only_error_to_add(folder):
+def test_where_the_plain_model_has_no_error_there_is_only_error_to_add(folder, tmp_path):
     recordings = load_recordings(folder, "validation", "plain")
     perfect = [replace(r, plain=r.reference) for r in recordings]
     corrector = samples.fitted(folder, samples.config(samples.one_step()), silent=True)
     assert Validation(perfect, "plain")(corrector).omegas.tolist() == [-100.0] * len(perfect)
-    same = [replace(r, reference=r.reference[:1].repeat(3, axis=0)) for r in recordings]
-    still = [replace(r, plain=r.reference, scene_toml=_unloaded(r)) for r in same]
-    assert (Validation(still, "plain")(corrector).omegas >= 0.0).all()
+    for path in {recording.path for recording in recordings}:
+        shard = read_shard(path)
+        still = tuple(
+            replace(s, forces=0.0 * s.forces, scene_toml=_unloaded(s)) for s in shard.simulations
+        )
+        (tmp_path / "validation").mkdir()
+        write_shard(
+            tmp_path / "validation" / path.name, replace(shard, simulations=still), "float32"
+        )
+    same = [
+        replace(r, reference=rest, plain=rest)
+        for r in load_recordings(tmp_path, "validation", "plain")
+        for rest in [r.reference[:1].repeat(3, axis=0)]
+    ]
+    assert (Validation(same, "plain")(corrector).omegas >= 0.0).all()
     ruined = samples.fitted(folder, samples.config(samples.one_step()))
     ruined.normaliser.output_scale.fill_(1e9)
     assert Validation(recordings, "plain")(ruined).omegas.tolist() == [-100.0, -100.0]
 
 
-def _unloaded(recording):
-    scene = Scene.from_toml(recording.scene_toml)
+def _unloaded(simulation):
+    scene = Scene.from_toml(simulation.scene_toml)
     return scene.model_copy(update={"loads": ()}).to_toml()
 
 

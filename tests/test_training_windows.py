@@ -9,10 +9,15 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.corrector.bodies import KNOWN  # noqa: E402
-from pdcorrect.corrector.features import FeatureView  # noqa: E402
-from pdcorrect.data.shard_arrays import read_arrays  # noqa: E402
-from pdcorrect.training.batch_losses import one_step_loss  # noqa: E402
+from pdcorrect.corrector.bodies import KNOWN, BodyGraph  # noqa: E402
+from pdcorrect.corrector.features import (  # noqa: E402
+    EDGE_FEATURES,
+    NODE_FEATURES,
+    FeatureView,
+    values,
+)
+from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.training.batch_losses import OneStepBatches, one_step_loss  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
@@ -33,14 +38,12 @@ def test_a_window_asks_for_what_the_base_model_lacks(folder):
     settings = samples.config(samples.one_step())
     windows, recordings = samples.windows(folder, settings)
     batch = windows.batch([3, 20 + 5])  # frame 3 of the first mesh, 5 of the second's first
-    _, motions = read_arrays(folder / "training" / "mesh-0003.h5", ("plain",))
-    nodes = len(recordings[0].points)
-    motion = motions[0]
-    wanted = motion.positions[6].astype(float) - motion.predictions["plain"][5]
+    runs = read_shard(folder / "training" / "mesh-0003.h5").simulations[0].runs
+    nodes = recordings[0].reference.shape[1]
+    predictions = runs["plain"].predictions
+    wanted = runs["reference"].positions[6].astype(float) - predictions[5]
     np.testing.assert_allclose(batch.target[nodes:].numpy(), wanted, atol=1e-8)
-    np.testing.assert_array_equal(
-        batch.snapshot.proposed[nodes:].numpy(), motion.predictions["plain"][5]
-    )
+    np.testing.assert_array_equal(batch.snapshot.proposed[nodes:].numpy(), predictions[5])
     assert batch.scale.tolist() == [r.one_step for r in recordings[:2]]
     assert batch.snapshot.correction is None
 
@@ -52,9 +55,8 @@ def remembering():
     return samples.config(samples.one_step(), corrector={"preset": "compact", "changes": changes})
 
 
-@pytest.mark.parametrize("resident", [False, True])
-def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder, resident):
-    windows, _ = samples.windows(folder, remembering(), resident=resident)
+def test_a_network_that_remembers_sees_the_correction_of_the_step_before(folder):
+    windows, _ = samples.windows(folder, remembering())
     plain, _ = samples.windows(folder, samples.config(samples.one_step()))
     first, begins = windows.batch([3], last=False), plain.batch([3])
     assert first.snapshot.correction is None
@@ -94,83 +96,75 @@ def test_what_is_proposed_before_the_step_holds_the_clamps_where_the_coarse_step
     architecture = {"preset": "compact", "changes": changes}
     stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
     windows, _ = samples.windows(folder, samples.config(stage, corrector=architecture))
-    found = windows.dataset.batch([7, 26])
-    batch = windows.step_batch(found)
+    batch = windows.batch([7, 26])
     held, state = ~batch.bodies.free, batch.snapshot
     assert held.any()
     ahead = state.positions + 0.01 * state.velocities  # as clamps that do not move always were
     assert torch.equal(state.proposed[held], ahead[held])
-    found.predictions[:, -1][held] += 0.003
-    moved = windows.step_batch(found)
-    predicted = found.predictions[:, -1].to(torch.float64)
+    windows._frames["predictions"] += 0.003
+    moved = windows.batch([7, 26])
+    predicted = windows.dataset.batch([7, 26]).predictions[:, -1] + 0.003
+    predicted = predicted.to(torch.float64)
     assert torch.equal(moved.snapshot.proposed[held], predicted[held])
     assert torch.equal(moved.snapshot.proposed[~held], state.proposed[~held])
     if placement == "guess":
         assert not moved.target[held].any()
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_noise_is_seen_and_to_be_corrected(folder, relative):
+def test_noise_is_seen_and_to_be_corrected(folder):
     settings = samples.config(samples.one_step())
     batch = samples.windows(folder, settings)[0].batch(list(range(0, 60, 4)))
     generator = torch.Generator().manual_seed(1)
-    tau = 0.5 if relative else 2e-3
-    noisy = batch.with_noise(tau, relative, generator)
+    tau = 0.5
+    noisy = batch.with_noise(tau, generator)
     noise = noisy.snapshot.proposed - batch.snapshot.proposed
     torch.testing.assert_close(
         noisy.snapshot.proposed + noisy.target, batch.snapshot.proposed + batch.target
     )
     assert not noise[~batch.bodies.free].any()
     free = batch.bodies.free.all(dim=1)
-    unit = batch.bodies.by_node((batch.scale / 3).sqrt())[:, None] if relative else 1.0
+    unit = batch.bodies.by_node((batch.scale / 3).sqrt())[:, None]
     sizes = (noise / unit)[free]
     assert float(sizes.square().mean().sqrt()) == pytest.approx(tau, rel=0.05)
     assert abs(float(sizes.mean())) < 0.1 * tau
     assert noisy.snapshot.positions is batch.snapshot.positions
 
 
-@pytest.mark.parametrize("features", [("node-type", "strain"), ("load", "previous-correction")])
-@pytest.mark.parametrize("placement", ["state", "force"])
-def test_windows_kept_in_memory_are_those_that_are_read(folder, features, placement):
-    changes = {**samples.SMALL["changes"], "node_features": features, "placement": placement}
-    stage = samples.unrolled(through_solver=True) if placement == "force" else samples.one_step()
-    settings = samples.config(stage, corrector={"preset": "compact", "changes": changes})
-    kept, read = (
-        samples.windows(folder, settings, resident=resident)[0] for resident in (True, False)
-    )
-    chosen = [45, 3, 18, 45, 20, 56, 0]  # both meshes, all simulations, first and last windows
-    pairs = [(kept.batch(chosen), read.batch(chosen))]
-    several = kept.batches(8, seed=3), read.batches(8, seed=3)
-    pairs += [(next(several[0]), next(several[1])) for _ in range(2 * len(several[0]))]
-    assert several[0].state_dict() == several[1].state_dict()
-    for one, other in pairs:
-        assert torch.equal(one.target, other.target)
-        assert torch.equal(one.scale, other.scale)
-        for x, y in ((one.bodies, other.bodies), (one.snapshot, other.snapshot)):
-            for field in fields(x):
-                a, b = getattr(x, field.name), getattr(y, field.name)
-                assert (a is None and b is None) or (a.dtype == b.dtype and torch.equal(a, b))
-        for name in KNOWN:
-            assert torch.equal(vars(one.bodies)[name], vars(other.bodies)[name])
-
-
-def test_windows_that_memory_does_not_hold_are_read_and_know_the_rest(folder, monkeypatch):
+def test_windows_are_those_of_the_files_and_know_their_bodies_at_rest(folder):
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
-    assert windows.resident
     assert len(windows.dataset) == 60
     for index in (60, 10**6):
         with pytest.raises(IndexError, match=str(index)):
             windows.batch([0, index])
-    monkeypatch.setattr("pdcorrect.training.windows.CACHE_BYTES", 10**5)
-    assert not samples.windows(folder, settings)[0].resident
-
-    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
-    bodies = windows.batch([3, 45, 4]).bodies
-    anew = bodies.to()
+    chosen = [45, 3, 18, 45, 20, 56, 0]  # both meshes, all simulations, first and last windows
+    batch, read = windows.batch(chosen), windows.dataset.batch(chosen)
+    state, bodies = batch.snapshot, batch.bodies
+    assert torch.equal(state.positions, read.positions.to(torch.float64))
+    assert torch.equal(state.velocities, read.velocities.to(torch.float64))
+    assert torch.equal(state.proposed, read.predictions[:, 0].to(torch.float64))
+    assert torch.equal(state.forces, read.forces[:, 0].to(torch.float64))
+    assert torch.equal(batch.target, read.targets[:, 0].to(torch.float64) - state.proposed)
+    alone = BodyGraph.of_batch(read).to(dtype=torch.float64)
+    for field in fields(bodies):
+        x, y = getattr(bodies, field.name), getattr(alone, field.name)
+        assert torch.equal(x, y) if not x.is_floating_point() else torch.allclose(x, y, rtol=1e-6)
     for name in KNOWN:
-        torch.testing.assert_close(vars(bodies)[name], getattr(anew, name))
-        assert len(getattr(bodies, name)) > 50 or name == "node_counts"
+        torch.testing.assert_close(vars(bodies)[name], getattr(bodies.to(), name))
+
+
+def test_batches_go_through_all_windows_in_an_order_of_their_number_alone(folder):
+    windows, _ = samples.windows(folder, samples.config(samples.one_step()))
+    stage = samples.one_step(batch=7)
+    batches = OneStepBatches(windows, stage, 3, ProcessGroup())
+    assert len(batches) == 60 // 7
+    parts = [OneStepBatches(windows, stage, 3, ProcessGroup(rank, 2)) for rank in (0, 1)]
+    assert [len(part) for part in parts] == [4, 4]
+    seen = [batches.batch(k).target for k in range(2 * len(batches))]
+    assert not torch.equal(seen[0], seen[len(batches)])
+    again = OneStepBatches(windows, stage, 3, ProcessGroup())
+    for k in (len(batches) + 1, 2):  # where a training goes on
+        assert torch.equal(again.batch(k).target, seen[k])
 
 
 # --- normalisation -----------------------------------------------------------------------
@@ -203,34 +197,35 @@ def test_bodies_of_the_training_split_are_like_it_whatever_part_is_fitted_to(fol
     every = windows.batch(range(len(windows.dataset)))
     view = FeatureView(every.bodies, every.snapshot)
     averages = every.bodies.body_means(corrector.inputs(view)[0])
-    normaliser = corrector.normaliser
+    envelope = corrector.envelope
     np.testing.assert_allclose(
-        normaliser.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
+        envelope.average_mean.numpy(), averages.mean(dim=0).numpy(), atol=1e-12
     )
     np.testing.assert_allclose(
-        normaliser.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
+        envelope.average_low.numpy(), averages.amin(dim=0).numpy(), atol=1e-12
     )
     np.testing.assert_allclose(
-        normaliser.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
+        envelope.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
     )
-    assert 1.0 < float(corrector.unlike(view).max()) <= 3.5 + 1e-9
+    assert 1.0 < float(envelope.strangeness(averages).max()) <= 3.5 + 1e-9
+    assert not (corrector.score(view) > 1.0).any()
 
     settings = samples.config(samples.one_step())
     windows, _ = samples.windows(folder, settings)
     corrector = samples.fitted(folder, settings)
-    corrector.normaliser.shape_low.fill_(torch.nan)
+    corrector.envelope.shape_low.fill_(torch.nan)
     fit_normaliser(corrector, windows, 1)
     bodies = windows.batch(range(len(windows.dataset))).bodies
     assert len(torch.unique(bodies.shapes, dim=0)) > 1
-    assert not corrector.shape_excess(bodies).any()
-    normaliser = corrector.normaliser
-    assert torch.equal(normaliser.shape_low, bodies.shapes.double().amin(dim=0))
-    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
-    normaliser.shape_low += 1.0  # as of larger bodies
-    assert (corrector.shape_excess(bodies) > 0.5).any()
+    envelope = corrector.envelope
+    assert not envelope.shape_excess(bodies.shapes).any()
+    assert torch.equal(envelope.shape_low, bodies.shapes.double().amin(dim=0))
+    assert torch.equal(envelope.shape_high, bodies.shapes.double().amax(dim=0))
+    envelope.shape_low += 1.0  # as of larger bodies
+    assert (envelope.shape_excess(bodies.shapes) > 0.5).any()
     widen_ranges(corrector, windows, 1)
-    assert not corrector.shape_excess(bodies).any()
-    assert torch.equal(normaliser.shape_high, bodies.shapes.double().amax(dim=0))
+    assert not envelope.shape_excess(bodies.shapes).any()
+    assert torch.equal(envelope.shape_high, bodies.shapes.double().amax(dim=0))
 
 
 def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
@@ -238,22 +233,24 @@ def test_the_time_step_of_the_training_data_is_fitted_and_widened(folder):
     windows, _ = samples.windows(folder, settings)
     corrector, size = samples.fitted(folder, settings), 0.05
     step = windows.dataset.headers[0].time_step / size
-    normaliser = corrector.normaliser
-    normaliser.time_step_low.fill_(torch.nan)
+    envelope = corrector.envelope
+    envelope.time_step_low.fill_(torch.nan)
     fit_normaliser(corrector, windows, 1)
-    assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+    assert envelope.time_steps == pytest.approx((step, step), rel=1e-6)
     bodies = windows.batch([0]).bodies
     assert bodies.time_steps.tolist() == pytest.approx([np.log(step)], abs=1e-6)
-    assert corrector.time_step_excess(bodies).tolist() == [0.0]
+    assert envelope.time_step_excess(bodies.time_steps).tolist() == [0.0]
     for shift in (np.log(2.0), -np.log(2.0)):  # as of data with another step
-        normaliser.time_step_low += shift
-        normaliser.time_step_high += shift
-        assert corrector.time_step_excess(bodies).tolist() == pytest.approx([np.log(2.0)], abs=1e-6)
+        envelope.time_step_low += shift
+        envelope.time_step_high += shift
+        assert envelope.time_step_excess(bodies.time_steps).tolist() == pytest.approx(
+            [np.log(2.0)], abs=1e-6
+        )
         both = sorted((step, step * np.exp(shift)))
         widen_ranges(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx(both, rel=1e-6)
+        assert envelope.time_steps == pytest.approx(both, rel=1e-6)
         fit_normaliser(corrector, windows, 1)
-        assert normaliser.time_steps == pytest.approx((step, step), rel=1e-6)
+        assert envelope.time_steps == pytest.approx((step, step), rel=1e-6)
 
 
 def test_fitting_to_a_part_is_a_matter_of_the_seed_alone(folder):
@@ -281,7 +278,10 @@ def test_first_steps_are_within_the_ranges_of_a_fit_to_a_part(folder, remembers)
 
     def outside(numbers):
         batch = windows.batch(numbers.tolist())
-        return corrector.outside(FeatureView(batch.bodies, batch.snapshot), 0.0)
+        view = FeatureView(batch.bodies, batch.snapshot)
+        config = corrector.config
+        names = ((NODE_FEATURES, config.node_features), (EDGE_FEATURES, config.edge_features))
+        return torch.cat([corrector.excess(values(*row, view)) for row in names])
 
     assert not outside(first).any()
     assert outside(others).any()  # so few windows do not hold all of the rest
@@ -319,13 +319,13 @@ def test_batches_without_a_finite_gradient_change_nothing_and_are_counted(folder
 
 
 def test_gradients_are_clipped_and_averaged_weights_follow_by_their_decay(folder):
-    settings = samples.config(samples.one_step(clip=0.25, ema=0.75))
+    settings = samples.config(samples.one_step(ema=0.75))
     corrector, averaged = samples.fitted(folder, settings), samples.fitted(folder, settings)
     before = weights(averaged)
     optimiser = Optimiser(corrector, settings.stages[0], averaged, ProcessGroup())
     optimiser.step(1e3 * sum(p.square().sum() for p in corrector.network.parameters()), 0.5)
     grads = [p.grad for p in corrector.network.parameters()]
-    assert float(torch.nn.utils.get_total_norm(grads)) == pytest.approx(0.25, rel=1e-4)
+    assert float(torch.nn.utils.get_total_norm(grads)) == pytest.approx(1.0, rel=1e-4)
     found = weights(averaged)
     torch.testing.assert_close(found, 0.75 * before + 0.25 * weights(corrector))
     assert not torch.equal(found, before)

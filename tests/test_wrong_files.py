@@ -92,8 +92,8 @@ STAGE = Stage(kind="one-step", iterations=1, rate=Rate(peak=0.5))
         (DatasetConfig, {"seeds": 0}, "seeds: unknown key"),
         (
             TrainingConfig,
-            {"stages": [{**STAGE.model_dump(), "clip": STAGE.rate}]},
-            "stages[0].clip = { peak = 0.5, ",
+            {"stages": [{**STAGE.model_dump(), "ema": STAGE.rate}]},
+            "stages[0].ema = { peak = 0.5, ",
         ),
         (
             TrainingConfig,

@@ -54,7 +54,7 @@ def held(data: Path, split: str) -> dict[str, Held]:
             / pc.metrics.rms_error(case.runs["best"], case.reference)
             for run, case in zip(runs, cases, strict=True)
         ]
-        refused = [run.refused.mean() for run in runs]
+        refused = [(run.reasons > 0).mean() for run in runs]
         found[name] = Held(np.array(errors), np.array(refused))
     return found
 

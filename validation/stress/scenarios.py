@@ -226,5 +226,6 @@ SCENARIOS = (
              "shape", scattered(0.5)),
     Scenario("200 000 cells", "a large compact body, one step under its weight",
              beam((50, 64, 64), 1, step=0.05, loads=[gravity(9.81)]), "motion",
-             solvers=("PD", "PD best", "Newton", "hybrid", "hybrid torsion")),
+             solvers=("PD", "PD best", "PD enhanced", "PD learned", "Newton", "hybrid",
+                      "hybrid torsion")),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,19 @@ NO_GATE = "no gate"
 """A corrector without a gate, which shows what the gate is for: nothing is expected of it."""
 MODELS = {"hybrid": "tiny", "hybrid torsion": "torsion-exact", NO_GATE: "torsion-exact"}
 """Correctors by solver."""
-SOLVERS = ("PD", "PD best", "Newton", "batch", "hybrid", "hybrid torsion")
-"""Projective dynamics on the plain and on the best coarse mesh, Newton and the batch stepper on
-the plain one, and correctors with their gate on the best."""
-KNOWN_SOLVERS = ("PD", "PD best", "Newton", "hybrid torsion", NO_GATE)
+ENHANCED, LEARNED = "PD enhanced", "PD learned"
+"""The best coarse model, and the learned element beside it."""
+SOLVERS = ("PD", "PD best", ENHANCED, LEARNED, "Newton", "batch", "hybrid", "hybrid torsion")
+"""Projective dynamics on the plain mesh, on that of the correctors, on the best coarse and on the
+learned one; Newton and the batch stepper on the plain one; and correctors with their gate."""
+KNOWN_SOLVERS = ("PD", "PD best", ENHANCED, LEARNED, "Newton", "hybrid torsion", NO_GATE)
 """Those of bodies that the torsion model knows."""
+CHOOSE: dict[str, Callable[[pc.Scene], pc.Scene]] = {
+    **dict.fromkeys(("PD best", *MODELS), trained_coarse),
+    ENHANCED: pc.best_coarse,
+    LEARNED: pc.learned_coarse,
+}
+"""What chooses the element and mass of a solver, if not the scene."""
 
 TIGHT = 1e-8
 """Of the coarse cell size: PD as Newton's reference.  Newton as that of PD has its own default."""
@@ -66,10 +74,15 @@ class Run:
 
 
 def problem_of(scenario: Scenario, solver: str, refine: int = 1) -> pc.Problem:
-    """The mesh that a solver works on."""
-    best = solver == "PD best" or solver in MODELS
-    scene = trained_coarse(scenario.scene) if best else scenario.scene
-    return pc.discretise(scene, refine=refine)
+    """The mesh that a solver works on; solvers of one element share it, since some are large."""
+    return _discretised(scenario, CHOOSE.get(solver), refine)
+
+
+@lru_cache(maxsize=5)
+def _discretised(
+    scenario: Scenario, choose: Callable[[pc.Scene], pc.Scene] | None, refine: int
+) -> pc.Problem:
+    return pc.discretise(choose(scenario.scene) if choose else scenario.scene, refine=refine)
 
 
 def run(scenario: Scenario, solver: str) -> Run:
@@ -88,7 +101,7 @@ def tight(scenario: Scenario, solver: str) -> Run:
 
 
 def finer(scenario: Scenario) -> Run:
-    """The same steps by PD on a finer mesh of the best coarse model's element, at its nodes."""
+    """The same steps by PD on a finer mesh of PD best's element, at its nodes."""
     fine = steps_of(
         scenario, pc.ProjectiveDynamics(problem_of(scenario, "PD best", scenario.finer))
     )
@@ -108,8 +121,7 @@ def _hybrid(solver: str, problem: pc.Problem) -> pc.HybridStepper:
 
 
 MAKE: dict[str, Callable[[pc.Problem], pc.Stepper]] = {
-    "PD": pc.ProjectiveDynamics,
-    "PD best": pc.ProjectiveDynamics,
+    **dict.fromkeys(("PD", "PD best", ENHANCED, LEARNED), pc.ProjectiveDynamics),
     "Newton": pc.Newton,
     **{solver: partial(_hybrid, solver) for solver in MODELS},
 }

@@ -1,4 +1,4 @@
-"""Forty scenes of five families of bodies that no training draw makes."""
+"""Forty scenes of five families of bodies that the training has no draw for."""
 
 from __future__ import annotations
 

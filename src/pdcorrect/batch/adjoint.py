@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.adjoint_terms import DampingTerms, Written
-from pdcorrect.batch.checks import check_kind, check_nodal, check_step
+from pdcorrect.batch.checks import check_nodal, check_state
 from pdcorrect.batch.follower import Mixing
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import largest_displacement
@@ -22,6 +22,9 @@ from pdcorrect.solvers.follower import MOST
 from pdcorrect.solvers.implicit import positive
 from pdcorrect.solvers.schemes import Linear
 
+_TIMES_DIFFER = 1e-6
+"""Of the step, or of the time, that times may be apart."""
+
 
 class BatchGradients:
     """Derivatives of a loss by the inputs of one step of B scenes.
@@ -33,7 +36,7 @@ class BatchGradients:
     ----------
     stepper : BatchStepper
     before : BatchState
-    result : BatchResult
+    result : BatchResult or Solved
         Of ``stepper(before, forces)``, with the material that the stepper has now.
     grad_positions, grad_velocities : (B, N, 3) tensors, optional
         Derivatives of the loss by the positions (1/m) and velocities (s/m) after the step.
@@ -63,7 +66,7 @@ class BatchGradients:
         self,
         stepper: BatchStepper,
         before: BatchState,
-        result: BatchResult | Solved,
+        result: Solved,
         grad_positions: Tensor | None = None,
         grad_velocities: Tensor | None = None,
         *,
@@ -71,9 +74,20 @@ class BatchGradients:
         forces: Tensor | None = None,
         tolerance: float = 1e-6,
     ) -> None:
-        check_kind("stepper", stepper, BatchStepper, "a BatchStepper")
-        check_step(stepper.cells, before, result, stepper.time_step)
-        check_kind("grad_memory", {} if grad_memory is None else grad_memory, Mapping, "a dict")
+        check_state(stepper.cells, before)
+        if result.y.shape != stepper.cells.rest.shape:
+            raise InputError(
+                f"result has configurations {tuple(result.y.shape)}: expected "
+                f"{tuple(stepper.cells.rest.shape)}, from a step of this stepper."
+            )
+        if isinstance(result, BatchResult):
+            step = stepper.time_step
+            for i, (start, end) in enumerate(zip(before.times, result.state.times, strict=True)):
+                if abs(end - start - step) > _TIMES_DIFFER * (step + abs(end)):
+                    raise InputError(
+                        f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
+                        f"a step of {step:g} s from before."
+                    )
         tolerance = positive("tolerance", tolerance)
         self._stepper, self._before, self._y = stepper, before, result.y
         self._nodes = stepper.cells.sizes.nodes

@@ -21,7 +21,7 @@ from pdcorrect.batch.correction import STATE, BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.shared_matrices import DistinctBodies, with_rows
+from pdcorrect.batch.shared_matrices import DistinctBodies, of_all, of_some, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 
@@ -100,9 +100,7 @@ class CellBatch:
         self._corners = self._numbers([p.cells for p in distinct], 0, n.cells, corners)
         found = [places(p.cells, len(p.positions)) for p in distinct]
         slots = self._numbers(found, -1, n.nodes, max(table.shape[1] for table in found))
-        values, scene = n.cells * corners, torch.arange(n.scenes, device=device)[:, None, None]
-        slots = torch.where(slots < 0, n.scenes * values, slots + values * scene)
-        self._slots = slots.flatten(0, 1)
+        self._slots = of_all(slots, n.cells * corners)
         self.present_cells = self._first([len(p.cells) for p in problems], n.cells)
         self.present_nodes = self._first(self.node_counts, n.nodes)
         quadratures = [p.quadrature for p in distinct]
@@ -122,11 +120,6 @@ class CellBatch:
     def narrowed(self, rows: Tensor) -> CellBatch:
         """Of some scenes."""
         n, numbers = self.sizes, rows.tolist()
-        moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None]
-        values = self._corners[0].numel()
-        slots = self._slots.reshape(n.scenes, -1)[rows]
-        shifted = slots + moved * values
-        slots = torch.where(slots < n.scenes * values, shifted, len(rows) * values)
         return with_rows(
             self, rows,
             "rest", "present_nodes", "present_cells", "_gradients", "_owners", "_corners",
@@ -134,7 +127,7 @@ class CellBatch:
             bodies=DistinctBodies(self.bodies.distinct, self.bodies.owners[numbers]),
             node_counts=[self.node_counts[i] for i in numbers],
             mode_counts=[self.mode_counts[i] for i in numbers],
-            _slots=slots.reshape(-1, self._slots.shape[1]),
+            _slots=of_some(self._slots, self._corners[0].numel(), n.scenes, rows),
             point_weights=self.of_scenes(self.point_weights, rows),
             volumes=self.of_scenes(self.volumes, rows),
             correction=self.correction and self.correction.narrowed(rows),
@@ -147,11 +140,11 @@ class CellBatch:
         return torch.as_tensor(np.ascontiguousarray(array), dtype=self.dtype, device=self.device)
 
     def nodal(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        """Nodal arrays (N, ...) of the bodies, padded to (B, U, ...)."""
-        return self.tensor(padded(arrays, (self.sizes.unknowns, *arrays[0].shape[1:])))
+        """Nodal arrays (N, ...) of the scenes, padded to (B, N, ...)."""
+        return self.tensor(padded(arrays, (self.sizes.nodes, *arrays[0].shape[1:])))
 
     def configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        """Configurations (N + B, 3) of the scenes, padded to (B, U, 3)."""
+        """Configurations (N + B, 3), or nodal arrays, of the scenes, padded to (B, U, 3)."""
         return self._spread(arrays, self.node_counts)
 
     def repeated(self, arrays: Sequence[NDArray[Any]], *shape: int) -> Tensor:
@@ -239,32 +232,17 @@ class CellBatch:
         values = torch.stack([mu, omega])[..., None] * volumes
         self.point_weights.copy_(torch.where(volumes != 0.0, values, 0.0).flatten(1, 2))
 
-    def smallest_volume_ratios(self, positions: Tensor) -> Tensor:
-        """Smallest det F over the quadrature points of each body, (B,), for (B, N, 3).
-
-        Of the nodes' displacements alone, see `ElasticBody.volume_ratios`.
-        """
-        return self.volume_ratios(positions).amin(dim=1)
-
     def volume_ratios(self, positions: Tensor) -> Tensor:
-        """The same of each cell, (B, C); infinite in padding."""
+        """Smallest det F over the quadrature points of each cell, (B, C), for (B, N, 3).
+
+        Of the nodes' displacements alone, see `ElasticBody.volume_ratios`; infinite in padding.
+        """
         n = self.sizes
         u = torch.zeros_like(self.rest)
         u[:, : n.nodes] = positions - self.rest[:, : n.nodes]
         ratios = self.points.volume_ratios(self.gradients(u))
         by_cell = ratios.reshape(n.scenes, n.cells, n.points).amin(dim=2)
         return torch.where(self.present_cells, by_cell, math.inf)
-
-    def rotations(self, F: Tensor) -> Tensor:
-        """Nearest rotations (9, L) of matrices (9, L)."""
-        return self.points.rotations(F)
-
-    def mean_rotations(self, u: Tensor, shares: Tensor) -> Tensor:
-        """Nearest rotations (9, B C) of each cell's mean F, for displacements (B, U, 3).
-
-        Points count by ``shares`` (B C, Q), which add up to one in each cell.
-        """
-        return self.points.rotations((self.gradients(u) * shares).sum(dim=-1), moved=True)
 
     def weight_slopes(self, y: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """Derivatives of x . dW/dy by each cell's mu and omega, two (B, C)."""

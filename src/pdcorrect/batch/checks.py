@@ -1,51 +1,26 @@
-"""Checks of what a batch, its steps and its derivatives are given; threads of torch."""
+"""Checks of what a batch, its steps and its derivatives are given."""
 
 from __future__ import annotations
 
 import math
-import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import Sequence
+from operator import attrgetter
 
 import torch
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.material import BatchMaterial, in_range
-from pdcorrect.batch.states import BatchResult, BatchState, Solved
+from pdcorrect.batch.states import BatchState
 from pdcorrect.errors import InputError
 from pdcorrect.fem.materials import RANGES
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
 
-_TIMES_DIFFER = 1e-6
-"""Of a step's length."""
-
 
 def scene_name(problems: Sequence[Problem], i: int) -> str:
     """A scene's number and name."""
     return f"{i} ({problems[i].scene.name!r})"
-
-
-def check_kind(name: str, value: object, kind: type, expected: str) -> None:
-    """Refuse what is not of a class."""
-    if not isinstance(value, kind):
-        raise wrong_kind(name, value, expected)
-
-
-def wrong_kind(name: str, value: object, expected: str) -> InputError:
-    """What to raise for a value of another kind than expected."""
-    return InputError(f"{name} is a {type(value).__name__}: expected {expected}.")
-
-
-def items(name: str, values: Any, kind: type, expected: str) -> tuple[Any, ...]:
-    """A sequence as a tuple; others, and other entries, are refused."""
-    check_kind(name, values, Iterable, f"a list, each {expected}")
-    found = tuple(values)
-    for i, value in enumerate(found):
-        check_kind(f"{name}[{i}]", value, kind, expected)
-    return found
 
 
 # --- scenes and options --------------------------------------------------------------------------
@@ -58,34 +33,24 @@ def check_problems(
 
     ``time_step`` and ``integrator`` are those asked for, or None for the scenes' own.
     """
-    problems = items("problems", problems, Problem, "pc.discretise(scene)")
+    problems = tuple(problems)
     if not problems:
         raise InputError("no problems: expected one or more scenes.")
-    first = problems[0]
+    first = problems[0].scene
+    names = ["solver.element", "material.energy", "material.volume_weight"]
+    names += ["damping.viscosity", "damping.mass", "damping.stiffness"]
+    if time_step is None:
+        names += ["time.step", "time.substeps"]
+    if integrator is None:
+        names.append("time.integrator")
+    if (integrator or first.time.integrator) == "generalised-alpha":
+        names.append("time.spectral_radius")
     for i, problem in enumerate(problems):
-        scene, other = problem.scene, first.scene
-        pairs = [
-            ("element", problem.element, first.element),
-            ("material.energy", scene.material.energy, other.material.energy),
-            ("material.volume_weight", scene.material.volume_weight, other.material.volume_weight),
-        ]
-        for name in ("viscosity", "mass", "stiffness"):
-            values = (getattr(damping, name) for damping in (scene.damping, other.damping))
-            pairs.append((f"damping.{name}", *values))
-        if time_step is None:
-            for name in ("step", "substeps"):
-                mine, theirs = (getattr(s.time, name) for s in (scene, other))
-                pairs.append((f"time.{name}", mine, theirs))
-        if integrator is None:
-            pairs.append(("time.integrator", scene.time.integrator, other.time.integrator))
-        name = other.time.integrator if integrator is None else integrator
-        if name == "generalised-alpha":
-            radii = scene.time.spectral_radius, other.time.spectral_radius
-            pairs.append(("time.spectral_radius", *radii))
-        for key, mine, theirs in pairs:
+        for name in names:
+            mine, theirs = (attrgetter(name)(scene) for scene in (problem.scene, first))
             if mine != theirs:
                 raise InputError(
-                    f"scene {scene_name(problems, i)}: {key} = {mine!r}, the first one's is "
+                    f"scene {scene_name(problems, i)}: {name} = {mine!r}, the first one's is "
                     f"{theirs!r}: expected the same. Make a batch of each kind."
                 )
     return problems
@@ -119,11 +84,11 @@ def check_precision(name: str, dtype: torch.dtype) -> None:
 
 def check_tensor(cells: CellBatch, name: str, x: Tensor) -> None:
     """Refuse what is no tensor of the batch's type on its device."""
-    check_kind(name, x, Tensor, "a tensor")
-    if x.dtype != cells.dtype or x.device != cells.rest.device:
+    kind = f"{x.dtype} on {x.device}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+    if kind != f"{cells.dtype} on {cells.rest.device}":
         raise InputError(
-            f"{name}: {x.dtype} on {x.device}; expected {cells.dtype} on {cells.rest.device}, "
-            "as the stepper: convert it, or make the stepper with other dtype= and device=."
+            f"{name}: {kind}; expected a tensor of {cells.dtype} on {cells.rest.device}, as the "
+            "stepper: convert it, or make the stepper with other dtype= and device=."
         )
 
 
@@ -148,10 +113,8 @@ def by_cell(cells: CellBatch, name: str, value: Tensor | float | None) -> Tensor
     if value is None:
         return None
     shape = (cells.sizes.scenes, cells.sizes.cells)
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float)):
         value = torch.tensor(float(value), dtype=cells.dtype, device=cells.rest.device)
-    if not isinstance(value, Tensor):
-        raise wrong_kind(name, value, "a number or a tensor")
     check_tensor(cells, name, value)
     try:
         return value.expand(shape)
@@ -193,7 +156,7 @@ def check_finite(problems: Sequence[Problem], name: str, x: Tensor) -> None:
 
 def check_states(cells: CellBatch, states: Sequence[State]) -> tuple[State, ...]:
     """The states; refused where there is not one for each scene, or shapes are wrong."""
-    states = items("states", states, State, "a State(positions, velocities)")
+    states = tuple(states)
     if len(states) != len(cells.node_counts):
         raise InputError(f"{len(states)} states: expected {len(cells.node_counts)}, one a scene.")
     for i, (state, count) in enumerate(zip(states, cells.node_counts, strict=True)):
@@ -205,13 +168,11 @@ def check_states(cells: CellBatch, states: Sequence[State]) -> tuple[State, ...]
     return states
 
 
-def check_state(cells: CellBatch, state: BatchState, name: str = "state") -> None:
+def check_state(cells: CellBatch, state: BatchState) -> None:
     """Refuse what is no state of the batch."""
-    check_kind(name, state, BatchState, "stepper.state(states) or the state of a result")
     check_nodal(cells, "positions", state.positions)
     check_nodal(cells, "velocities", state.velocities)
     finite_times(cells, state.times)
-    check_kind("memory", state.memory, Mapping, "a dict")
     for name, x in state.memory.items():
         check_nodal(cells, f"memory {name!r}", x)
 
@@ -231,62 +192,3 @@ def finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
     if len(found) != scenes or not all(map(math.isfinite, found)):
         raise InputError(f"times = {times!r}: expected {scenes} finite numbers, one a scene.")
     return found
-
-
-def check_step(cells: CellBatch, before: BatchState, result: Solved, time_step: float) -> None:
-    """Refuse what is no step of the batch."""
-    check_state(cells, before, "before")
-    check_kind("result", result, Solved, "the result of stepper(before, forces)")
-    if result.y.shape != cells.rest.shape:
-        raise InputError(
-            f"result has configurations {tuple(result.y.shape)}: expected "
-            f"{tuple(cells.rest.shape)}, from a step of this stepper."
-        )
-    if isinstance(result, BatchResult):
-        for i, (start, end) in enumerate(zip(before.times, result.state.times, strict=True)):
-            if abs(end - start - time_step) > _TIMES_DIFFER * (time_step + abs(end)):
-                raise InputError(
-                    f"result is at {end:g} s in scene {i}, and before at {start:g} s: expected "
-                    f"a step of {time_step:g} s from before."
-                )
-
-
-class _Restored:
-    """The number to go back to, shared by all Python threads that are on one torch thread."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._inside, self._number = 0, 1
-
-    def enter(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._number = torch.get_num_threads()
-            self._inside += 1
-            torch.set_num_threads(1)
-
-    def leave(self) -> None:
-        with self._lock:
-            self._inside -= 1
-            torch.set_num_threads(self._number)
-
-
-_restored = _Restored()
-
-
-@contextmanager
-def one_thread(device: torch.device) -> Iterator[None]:
-    """Torch on one CPU thread, if that is the device.
-
-    Batches on the CPU are small; their products gain nothing from threads that wait for
-    each other, and lose much where other processes want the cores.  Numba's kernels, which
-    share torch's OpenMP library, change the number for both.
-    """
-    if device.type != "cpu":
-        yield
-        return
-    _restored.enter()
-    try:
-        yield
-    finally:
-        _restored.leave()

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.decomposition import signed_svd
+from pdcorrect.batch.decomposition import product, signed_svd, transposed
 from pdcorrect.batch.gpu import small_products
 from pdcorrect.batch.points import Components, computed, moved
 from pdcorrect.batch.shared_matrices import with_rows
@@ -306,17 +306,12 @@ def _stretch(H: Components) -> list[Components]:
     U, s, V = signed_svd(moved(H))
     sums = [torch.clamp(s[(a + 1) % 3] + s[(a + 2) % 3], min=KINK) for a in range(3)]
 
-    def product(A: Components, d: Components | None) -> Components:
-        out = []
-        for i in range(3):
-            for j in range(3):
-                terms = [A[3 * i + a] * V[3 * j + a] for a in range(3)]
-                if d is not None:
-                    terms = [t * x for t, x in zip(terms, d, strict=True)]
-                out.append(terms[0] + terms[1] + terms[2])
-        return out
+    def with_values(d: Components) -> Components:
+        """V diag(d) V^T."""
+        both = [[V[3 * i + a] * V[3 * j + a] for a in range(3)] for i in range(3) for j in range(3)]
+        return [x * d[0] + y * d[1] + z * d[2] for x, y, z in both]
 
-    return [product(U, None), product(V, list(s)), product(V, [1.0 / x for x in sums])]
+    return [product(U, transposed(V)), with_values(s), with_values([1.0 / x for x in sums])]
 
 
 def _vectors(y: Tensor) -> Tensor:

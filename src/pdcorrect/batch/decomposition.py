@@ -12,6 +12,8 @@ import math
 import torch
 from torch import Tensor
 
+_UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Entries of a symmetric matrix (6) in their order."""
 _SWEEPS = {torch.float64: 5, torch.float32: 3}
 _VOLUME_STEPS = 8
 _UNIT_VOLUME = {torch.float64: 1e-8, torch.float32: 1e-3}
@@ -25,6 +27,17 @@ _RANK = {torch.float64: 1e-14, torch.float32: 1e-6}
 def tiny(a: Tensor) -> float:
     """A number that changes nothing but keeps a division finite."""
     return _TINY[a.dtype]
+
+
+def _diagonal(A: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """Eigenvalues (3) and eigenvectors (9) of a symmetric matrix (6), by Jacobi's sweeps."""
+    S, one, zero = list(A), torch.ones_like(A[0]), torch.zeros_like(A[0])
+    V = [one, zero, zero, zero, one, zero, zero, zero, one]
+    for _ in range(_SWEEPS[one.dtype]):
+        _rotate(S, V, 0, 1, 3, 4, 5)
+        _rotate(S, V, 0, 2, 4, 3, 5)
+        _rotate(S, V, 1, 2, 5, 3, 4)
+    return S[:3], V
 
 
 def _rotate(S: list[Tensor], V: list[Tensor], p: int, q: int, pq: int, pr: int, qr: int) -> None:
@@ -60,14 +73,7 @@ def _squares(B: list[Tensor], j: int) -> Tensor:
 
 def signed_svd(F: list[Tensor]) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
     """U (9), s (3), V (9) with F = U diag(s) V^T, both rotations proper, s1 >= s2 >= |s3|."""
-    one, zero = torch.ones_like(F[0]), torch.zeros_like(F[0])
-    V = [one, zero, zero, zero, one, zero, zero, zero, one]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    S = [F[a] * F[b] + F[3 + a] * F[3 + b] + F[6 + a] * F[6 + b] for a, b in pairs]
-    for _ in range(_SWEEPS[F[0].dtype]):
-        _rotate(S, V, 0, 1, 3, 4, 5)
-        _rotate(S, V, 0, 2, 4, 3, 5)
-        _rotate(S, V, 1, 2, 5, 3, 4)
+    _, V = _diagonal([F[a] * F[b] + F[3 + a] * F[3 + b] + F[6 + a] * F[6 + b] for a, b in _UPPER])
     B = product(F, V)
     _order(B, V, 0, 1)
     _order(B, V, 0, 2)
@@ -147,20 +153,13 @@ def transposed(A: list[Tensor]) -> list[Tensor]:
 
 def positive_part(A: list[Tensor]) -> list[Tensor]:
     """A symmetric matrix (6), 00 11 22 01 02 12, with its negative eigenvalues raised to zero."""
-    S = list(A)
-    one, zero = torch.ones_like(A[0]), torch.zeros_like(A[0])
-    V = [one, zero, zero, zero, one, zero, zero, zero, one]
-    for _ in range(_SWEEPS[A[0].dtype]):
-        _rotate(S, V, 0, 1, 3, 4, 5)
-        _rotate(S, V, 0, 2, 4, 3, 5)
-        _rotate(S, V, 1, 2, 5, 3, 4)
-    values = [torch.clamp(x, min=0.0) for x in S[:3]]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    values, V = _diagonal(A)
+    values = [torch.clamp(x, min=0.0) for x in values]
     return [
         values[0] * V[3 * i] * V[3 * j]
         + values[1] * V[3 * i + 1] * V[3 * j + 1]
         + values[2] * V[3 * i + 2] * V[3 * j + 2]
-        for i, j in pairs
+        for i, j in _UPPER
     ]
 
 

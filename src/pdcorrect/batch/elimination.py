@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from torch import Tensor, cat
 
 from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.batch.gpu import small_products, tall_product
+from pdcorrect.batch.gpu import small_products
 from pdcorrect.batch.shared_matrices import Sharing, with_rows
+from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
 
@@ -151,11 +152,6 @@ class DenseInverse:
     storage : torch.dtype
         Of the inverses.
     device : torch.device
-
-    Attributes
-    ----------
-    bytes : int
-        Of all inverses.
     """
 
     def __init__(
@@ -173,7 +169,6 @@ class DenseInverse:
         size = width * max(map(len, free))
         shape = (len(free), self._axes, size, size)
         self._inverse = torch.zeros(shape, dtype=storage, device=device)
-        self.bytes = self._inverse.numel() * self._inverse.element_size()
 
     def fill(self, i: int, matrix: Tensor) -> bool:
         """Invert one problem's matrix (w N, w N) into the store, if it is positive definite."""
@@ -191,8 +186,8 @@ class DenseInverse:
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
         return True
 
-    def narrowed(self, sharing: Sharing, kept: Tensor) -> DenseInverse:
-        """With some of the matrices."""
+    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> DenseInverse:
+        """Of some scenes, with the matrices that they have."""
         return with_rows(
             self, kept, "_inverse", _sharing=sharing, _free=[self._free[k] for k in kept.tolist()]
         )

@@ -30,7 +30,7 @@ from pdcorrect.batch.elimination import (
     scalar_blocks,
     summed_blocks,
 )
-from pdcorrect.batch.gpu import as_kernel
+from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
 from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.errors import ConvergenceError, InputError
@@ -38,56 +38,15 @@ from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
 
 
-class Turning:
-    """How nodes and modes have turned since rest, as `first_hessian.Rotations`."""
-
-    def __init__(self, cells: CellBatch) -> None:
-        self._cells = cells
-        n = cells.sizes
-        distinct = cells.bodies.distinct
-        weights = [p.quadrature.weights for p in distinct]
-        shares = [w / w.sum(axis=1, keepdims=True) for w in weights]
-        self._shares = cells.repeated(shares, n.cells, n.points)
-        held = [np.where(p.free.all(axis=1), 0.0, 1.0) for p in distinct]
-        self._held = cells.repeated(held, n.unknowns) > 0.5
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> Turning:
-        """Of some scenes, with their cells."""
-        return with_rows(self, rows, "_shares", "_held", _cells=cells)
-
-    def since_rest(self, y: Tensor) -> list[Tensor]:
-        """Rotations of nodes and modes, nine tensors (B, U)."""
-        cells, n = self._cells, self._cells.sizes
-        u = y - cells.rest
-        u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
-        turns = cells.mean_rotations(u, self._shares.flatten(0, 1)).T
-        by_cell = turns.reshape(n.scenes, n.cells, 1, 9).expand(-1, -1, n.width, -1)
-        sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
-        total = torch.cat(sums, dim=-1)  # (B, U, 9)
-        identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
-        still = self._held | (total.abs().sum(dim=-1) == 0.0)
-        total = torch.where(still[..., None], identity, total)
-        out = cells.rotations(total.reshape(-1, 9).T.contiguous())
-        return list(out.reshape(9, n.scenes, n.unknowns))
-
-
-def rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
-    """R x at each node where it is free, for nine (B, U), (B, U, 3) and 0 or 1 (B, U, 3)."""
-    out: Tensor = as_kernel(_rotated, x.is_cuda)(R, x, free)
-    return out
-
-
-def rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
-    """R^T of what is free of x at each node."""
-    out: Tensor = as_kernel(_rotated_back, x.is_cuda)(R, x, free)
-    return out
-
-
-def _rotated(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+@one_kernel
+def _rotated(x: Tensor, R: list[Tensor], free: Tensor) -> Tensor:
+    """R x at each node where it is free, for (B, U, 3), nine (B, U) and 0 or 1 (B, U, 3)."""
     return _products(R, x) * free
 
 
-def _rotated_back(R: list[Tensor], x: Tensor, free: Tensor) -> Tensor:
+@one_kernel
+def _rotated_back(x: Tensor, R: list[Tensor], free: Tensor) -> Tensor:
+    """R^T of what is free of x at each node."""
     return _products(transposed(R), x * free)
 
 
@@ -150,10 +109,8 @@ class FirstHessian:
 
     Attributes
     ----------
-    bytes : int
-        Of what is stored for the nodes' matrices.
     count : int
-        Distinct ones.
+        Distinct matrices.
     regular : (B,) bool
         Whether there is an inverse; where not, the products mean nothing.
 
@@ -197,12 +154,15 @@ class FirstHessian:
                 f"scene {problems[0].scene.name!r}: the matrix of the step is not positive "
                 "definite: expected clamps, or inertia that matters beside the stiffness."
             )
-        self.bytes = self._solver.bytes
         self.regular = torch.tensor(regular, device=cells.device)[owners]
         self._rotations: list[Tensor] = []
         if self._turned:
             n = cells.sizes
-            self._turning = Turning(cells)
+            weights = [p.quadrature.weights for p in cells.bodies.distinct]
+            shares = [w / w.sum(axis=1, keepdims=True) for w in weights]
+            self._shares = cells.repeated(shares, n.cells, n.points)
+            held = [np.where(p.free.all(axis=1), 0.0, 1.0) for p in cells.bodies.distinct]
+            self._held = cells.repeated(held, n.unknowns) > 0.5
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
         every = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
@@ -221,29 +181,39 @@ class FirstHessian:
         """Of some scenes with their cells, turned as it is now."""
         sharing, numbers = self._sharing.narrowed(rows)
         kept = torch.tensor(numbers, device=rows.device)
-        dense = isinstance(self._solver, DenseInverse)
-        solver = self._solver.narrowed(sharing, kept, *(() if dense else (rows,)))
-        out = with_rows(
-            self, rows, "_free", "regular",
+        solver = self._solver.narrowed(sharing, kept, rows)
+        turning = ("_shares", "_held") if self._turned else ()
+        return with_rows(
+            self, rows, "_free", "regular", *turning,
             _cells=cells, _sharing=sharing, _solver=solver,
             _modes=self._modes.narrowed(cells, rows),
             _rotations=[a[rows] for a in self._rotations],
         )  # fmt: skip
-        if self._turned:
-            out._turning = self._turning.narrowed(cells, rows)
-        return out
 
     def turn(self, y: Tensor) -> None:
-        """Turn the rest Hessian to a configuration."""
-        if self._turned:
-            for kept, new in zip(self._rotations, self._turning.since_rest(y), strict=True):
-                kept.copy_(new)
+        """Turn the rest Hessian to a configuration, see `first_hessian.Rotations`."""
+        if not self._turned:
+            return
+        cells, n = self._cells, self._cells.sizes
+        u = y - cells.rest
+        u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
+        mean = (cells.gradients(u) * self._shares.flatten(0, 1)).sum(dim=-1)
+        turns = cells.points.rotations(mean, moved=True).T
+        by_cell = turns.reshape(n.scenes, n.cells, 1, 9).expand(-1, -1, n.width, -1)
+        sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
+        total = torch.cat(sums, dim=-1)  # (B, U, 9)
+        identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
+        still = self._held | (total.abs().sum(dim=-1) == 0.0)
+        total = torch.where(still[..., None], identity, total)
+        out = cells.points.rotations(total.reshape(-1, 9).T.contiguous())
+        for kept, new in zip(self._rotations, out.reshape(9, n.scenes, n.unknowns), strict=True):
+            kept.copy_(new)
 
     def __call__(self, r: Tensor) -> Tensor:
         if not self._turned:
             return self._solved(r * self._free) * self._free
-        x = self._solved(rotated_back(self._rotations, r, self._free))
-        return rotated(self._rotations, x, self._free)
+        x = self._solved(_rotated_back(r, self._rotations, self._free))
+        return _rotated(x, self._rotations, self._free)
 
     def _solved(self, r: Tensor) -> Tensor:
         return self._modes.recovered(self._solver(self._modes.reduced(r)), r)

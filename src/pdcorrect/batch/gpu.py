@@ -8,19 +8,30 @@ them on the way.
 from __future__ import annotations
 
 import gc
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from typing import Any
+from functools import cache, wraps
+from typing import Any, TypeVar, cast
 from weakref import WeakMethod
 
 import torch
 from torch import Tensor
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 
-def as_kernel(function: Callable[..., Any], on_gpu: bool) -> Callable[..., Any]:
-    """On a GPU the function as one kernel for tensors of any size; else as it is."""
-    return _compiled(function) if on_gpu else function
+
+def one_kernel(function: Function) -> Function:
+    """The function as one kernel on a GPU, for tensors of any size; elsewhere as it is.
+
+    Its first argument is a tensor, which tells where.  It calls none of its kind.
+    """
+
+    @wraps(function)
+    def call(first: Tensor, *others: Any) -> Any:
+        return (_compiled(function) if first.is_cuda else function)(first, *others)
+
+    return cast(Function, call)
 
 
 @cache
@@ -30,29 +41,42 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def small_products(matrices: Tensor, x: Tensor) -> Tensor:
     """A x for each cell, (..., m, n) times (..., n, k)."""
-    out: Tensor = as_kernel(_products, True)(matrices, x) if x.is_cuda else matrices @ x
-    return out
+    return _products(matrices, x) if x.is_cuda else matrices @ x
 
 
+@one_kernel
+def _products(matrices: Tensor, x: Tensor) -> Tensor:
+    terms = [matrices[..., i, None] * x[..., i, None, :] for i in range(x.shape[-2])]
+    return _sum(terms)
+
+
+@one_kernel
 def rows_of(u: Tensor, numbers: Tensor) -> Tensor:
     """Rows of u (M, k) by their numbers (L,)."""
-    out: Tensor = as_kernel(_rows, u.is_cuda)(u, numbers)
-    return out
+    return u[numbers]
 
 
-def at_corners(x: Tensor, corners: Tensor) -> Tensor:
+def _at_corners(x: Tensor, corners: Tensor) -> Tensor:
     """Values (B, C, K, 3) of fields (B, M, 3) at each scene's own rows ``corners`` (B, C, K)."""
-    out: Tensor = as_kernel(_at_corners, x.is_cuda)(x, corners)
-    return out
+    scene = torch.arange(len(corners), device=x.device)[:, None, None]
+    return x[scene, corners]
 
 
+at_corners = one_kernel(_at_corners)
+
+
+@one_kernel
 def in_cells(u: Tensor, corners: Tensor, modes: int) -> Tensor:
     """The same by component, (B, C, 3, K), followed by the cells' modes, (B, C, 3, L).
 
     Modes are the last rows of u (B, U, 3), cell by cell.
     """
-    out: Tensor = as_kernel(_in_cells, u.is_cuda)(u, corners, modes)
-    return out
+    values = _at_corners(u, corners)
+    if modes:
+        scenes, cells, _ = corners.shape
+        own = u[:, u.shape[1] - modes :].reshape(scenes, cells, -1, 3)
+        values = torch.cat([values, own], dim=2)
+    return values.transpose(2, 3).contiguous()
 
 
 def assembled(local: Tensor, slots: Tensor, corners: int) -> Tensor:
@@ -62,36 +86,13 @@ def assembled(local: Tensor, slots: Tensor, corners: int) -> Tensor:
     found (see `sums`); the others are modes, which have one cell each.
     """
     scenes = len(local)
-    kernel = as_kernel(_summed, local.is_cuda)
-    nodal: Tensor = kernel(local, slots, corners).reshape(scenes, -1, 3)
+    nodal = _summed(local, slots, corners).reshape(scenes, -1, 3)
     if local.shape[2] == corners:
         return nodal
     return torch.cat([nodal, local[:, :, corners:].reshape(scenes, -1, 3)], dim=1)
 
 
-def _products(matrices: Tensor, x: Tensor) -> Tensor:
-    terms = [matrices[..., i, None] * x[..., i, None, :] for i in range(x.shape[-2])]
-    return _sum(terms)
-
-
-def _rows(u: Tensor, numbers: Tensor) -> Tensor:
-    return u[numbers]
-
-
-def _at_corners(x: Tensor, corners: Tensor) -> Tensor:
-    scene = torch.arange(len(corners), device=x.device)[:, None, None]
-    return x[scene, corners]
-
-
-def _in_cells(u: Tensor, corners: Tensor, modes: int) -> Tensor:
-    values = _at_corners(u, corners)
-    if modes:
-        scenes, cells, _ = corners.shape
-        own = u[:, u.shape[1] - modes :].reshape(scenes, cells, -1, 3)
-        values = torch.cat([values, own], dim=2)
-    return values.transpose(2, 3).contiguous()
-
-
+@one_kernel
 def _summed(local: Tensor, slots: Tensor, corners: int) -> Tensor:
     return sums(local[:, :, :corners].reshape(-1, 3), slots)
 
@@ -107,11 +108,7 @@ def sums(values: Tensor, numbers: Tensor) -> Tensor:
         row = values[torch.clamp(column, max=count - 1)]
         return torch.where((column < count)[:, None], row, 0.0)
 
-    first, *others = numbers.unbind(dim=1)
-    total = term(first)
-    for column in others:
-        total = total + term(column)
-    return total
+    return _sum([term(column) for column in numbers.unbind(dim=1)])
 
 
 def _sum(terms: list[Tensor]) -> Tensor:
@@ -119,6 +116,35 @@ def _sum(terms: list[Tensor]) -> Tensor:
     for term in terms[1:]:
         total = total + term
     return total
+
+
+_one_thread = threading.Lock()
+_inside, _threads = 0, 1
+
+
+@contextmanager
+def one_thread(device: torch.device) -> Iterator[None]:
+    """Torch on one CPU thread, if that is the device, as long as any Python thread asks for it.
+
+    Batches on the CPU are small; their products gain nothing from threads that wait for
+    each other, and lose much where other processes want the cores.  Numba's kernels, which
+    share torch's OpenMP library, change the number for both.
+    """
+    global _inside, _threads
+    if device.type != "cpu":
+        yield
+        return
+    with _one_thread:
+        if not _inside:
+            _threads = torch.get_num_threads()
+        _inside += 1
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _one_thread:
+            _inside -= 1
+            torch.set_num_threads(_threads)
 
 
 class Recorder:
@@ -174,65 +200,3 @@ def _no_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-
-
-_MOST_COLUMNS = 4
-_ROWS, _COLUMNS, _WARPS = 8, 256, 4
-
-
-def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
-    """(K, n, n) @ (K, n, m) -> (K, n, m)."""
-    count, size, _ = matrices.shape
-    few = columns.shape[2] <= _MOST_COLUMNS
-    if not (few and matrices.is_cuda and matrices.dtype == torch.float32 and size >= _COLUMNS):
-        return matrices @ columns
-    import triton
-
-    columns = columns.contiguous()
-    out = torch.empty_like(columns)
-    grid = (triton.cdiv(size, _ROWS), count)
-    _kernel()[grid](
-        matrices, columns, out, size, M=columns.shape[2], ROWS=_ROWS, COLUMNS=_COLUMNS,
-        num_warps=_WARPS,
-    )  # fmt: skip
-    return out
-
-
-@cache
-def _kernel() -> Any:
-    import triton
-    import triton.language as tl
-
-    @triton.jit
-    def kernel(a, x, y, n, M: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
-        k = tl.program_id(1).to(tl.int64)
-        row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
-        rows = (k * n + row.to(tl.int64)) * n
-        s0 = tl.zeros((ROWS, COLUMNS), tl.float32)
-        s1 = tl.zeros((ROWS, COLUMNS), tl.float32)
-        s2 = tl.zeros((ROWS, COLUMNS), tl.float32)
-        s3 = tl.zeros((ROWS, COLUMNS), tl.float32)
-        for begin in range(0, n, COLUMNS):
-            col = begin + tl.arange(0, COLUMNS)
-            inside = col < n
-            mask = (row[:, None] < n) & inside[None, :]
-            block = tl.load(a + rows[:, None] + col[None, :], mask=mask, other=0.0)
-            place = x + (k * n + col) * M
-            s0 += block * tl.load(place, mask=inside, other=0.0)[None, :]
-            if M > 1:
-                s1 += block * tl.load(place + 1, mask=inside, other=0.0)[None, :]
-            if M > 2:
-                s2 += block * tl.load(place + 2, mask=inside, other=0.0)[None, :]
-            if M > 3:
-                s3 += block * tl.load(place + 3, mask=inside, other=0.0)[None, :]
-        target = y + (k * n + row) * M
-        fits = row < n
-        tl.store(target, tl.sum(s0, axis=1), mask=fits)
-        if M > 1:
-            tl.store(target + 1, tl.sum(s1, axis=1), mask=fits)
-        if M > 2:
-            tl.store(target + 2, tl.sum(s2, axis=1), mask=fits)
-        if M > 3:
-            tl.store(target + 3, tl.sum(s3, axis=1), mask=fits)
-
-    return kernel

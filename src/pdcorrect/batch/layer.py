@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -22,9 +22,9 @@ from pdcorrect.batch.adjoint import BatchGradients
 from pdcorrect.batch.checks import (
     by_cell,
     check_finite,
-    check_kind,
     check_material,
     check_nodal,
+    check_state,
     check_tensor,
     scene_name,
     start_times,
@@ -72,12 +72,9 @@ class _Call:
 
     def before(self, step: int, frame: Frame) -> BatchState:
         """The state that a step starts from."""
+        times = tuple(t + step * self.layer.stepper.time_step for t in self.times)
         memory = dict(zip(self.names[step], frame[2:], strict=True))
-        return BatchState(frame[0], frame[1], self.times_before(step), memory)
-
-    def times_before(self, step: int) -> tuple[float, ...]:
-        h = self.layer.stepper.time_step
-        return tuple(t + step * h for t in self.times)
+        return BatchState(frame[0], frame[1], times, memory)
 
     def stepped(
         self, step: int, statuses: list[Status], inputs: Mapping[str, Tensor | None]
@@ -168,7 +165,6 @@ class PDLayer(nn.Module):
             raise InputError(f"mode = {mode!r}: expected unrolled, checkpointed or detached.")
         if on_failure not in ("raise", "zero"):
             raise InputError(f"on_failure = {on_failure!r}: expected raise or zero.")
-        check_kind("stepper", stepper, BatchStepper, "a BatchStepper(problems)")
         self.stepper, self.steps, self.mode = stepper, whole("steps", steps, 1), mode
         self.on_failure, self.tolerance = on_failure, positive("tolerance", tolerance)
         self.statuses: list[list[Status]] = []
@@ -234,27 +230,17 @@ class PDLayer(nn.Module):
         ConvergenceError
             If a scene fails otherwise, unless ``on_failure`` is "zero".
         """
-        frame, _ = self._run(
-            positions, velocities, forces, (young, poisson, density), times, memory, keep=False
-        )
+        frame, _ = self._run(positions, velocities, forces, young, poisson, density, times, memory)
         return frame[0], frame[1]
 
     def trajectory(
-        self,
-        positions: Tensor,
-        velocities: Tensor,
-        forces: Tensor | None = None,
-        *,
-        young: Tensor | float | None = None,
-        poisson: Tensor | float | None = None,
-        density: Tensor | float | None = None,
-        times: Sequence[float] | None = None,
-        memory: Mapping[str, Tensor] | None = None,
+        self, positions: Tensor, velocities: Tensor, forces: Tensor | None = None, **options: Any
     ) -> tuple[Tensor, Tensor]:
-        """Like `forward`, with all frames: (steps + 1, B, N, 3), frame 0 as given."""
-        _, frames = self._run(
-            positions, velocities, forces, (young, poisson, density), times, memory, keep=True
-        )
+        """Like `forward`, of the same options, with all frames: (steps + 1, B, N, 3).
+
+        Frame 0 is as given.
+        """
+        _, frames = self._run(positions, velocities, forces, keep=True, **options)
         out = [torch.stack(parts) for parts in zip(*frames, strict=True)]
         return out[0], out[1]
 
@@ -263,30 +249,30 @@ class PDLayer(nn.Module):
         positions: Tensor,
         velocities: Tensor,
         forces: Tensor | None,
-        material: Sequence[Tensor | float | None],
-        times: Sequence[float] | None,
-        memory: Mapping[str, Tensor] | None,
-        keep: bool,
+        young: Tensor | float | None = None,
+        poisson: Tensor | float | None = None,
+        density: Tensor | float | None = None,
+        times: Sequence[float] | None = None,
+        memory: Mapping[str, Tensor] | None = None,
+        *,
+        keep: bool = False,
     ) -> tuple[Frame, list[Frame]]:
         """The last frame and, if they are to be kept, all."""
         stepper, cells = self.stepper, self.stepper.cells
-        one = stepper.batched(positions)
-        single = one is not positions
-        positions, velocities = one, stepper.batched(velocities)
-        check_nodal(cells, "positions", positions)
-        check_nodal(cells, "velocities", velocities)
+        single = stepper.batched(positions) is not positions
+        positions, velocities = map(stepper.batched, (positions, velocities))
+        remembered = {name: stepper.batched(x) for name, x in sorted((memory or {}).items())}
+        start = BatchState(positions, velocities, start_times(cells, times), remembered)
+        check_state(cells, start)
         pushes = self._pushes(forces, single)
-        given = [by_cell(cells, n, m) for n, m in zip(NAMES, material, strict=True)]
+        pairs = zip(NAMES, (young, poisson, density), strict=True)
+        given = [by_cell(cells, name, value) for name, value in pairs]
         values = stepper.with_material(given)
         if self.on_failure == "raise" and values is not stepper.present:
             check_material(cells, stepper.problems, values)
-        call = _Call(self, values, start_times(cells, times))
+        call = _Call(self, values, start.times, names=[tuple(remembered)])
         self.statuses, self.failed_derivatives = call.statuses, call.failures
-        given_memory = {name: stepper.batched(x) for name, x in sorted((memory or {}).items())}
-        for name, x in given_memory.items():
-            check_nodal(cells, f"memory {name!r}", x)
-        call.names.append(tuple(given_memory))
-        frame: Frame = (positions, velocities, *given_memory.values())
+        frame: Frame = (positions, velocities, *remembered.values())
         frames = [frame]
         repeated = self.mode == "checkpointed" and torch.is_grad_enabled()
         length = math.isqrt(self.steps - 1) + 1 if repeated else self.steps
@@ -317,7 +303,7 @@ class PDLayer(nn.Module):
                 f"forces of {len(each)} steps: expected one set, or one for each of the layer's "
                 f"{self.steps} steps."
             )
-        for push in each[: self.steps if forces.ndim == 4 else 1]:
+        for push in each:
             check_nodal(self.stepper.cells, "forces", push)
         return list(each)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.gpu import Recorder, as_kernel
+from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.objective import (
     BatchObjective,
     Tangents,
@@ -128,13 +128,12 @@ class BatchConjugateGradients:
         curvature = dot(self._d, image)
         active = self._active & (curvature > 0.0)
         alpha = torch.where(active, self._r_z / curvature, 0.0)
-        on_gpu = image.is_cuda
         change = by_scene(alpha) * self._d
-        as_kernel(_advance, on_gpu)(self.x, self._r, change, image, alpha, active)
+        _advance(self.x, self._r, change, image, alpha, active)
         z = self._precondition(self._r)
         r_z = torch.where(active, dot(self._r, z), self._r_z)
         ratio = torch.where(active, r_z / self._r_z, 0.0)
-        as_kernel(_turn, on_gpu)(self._d, z, ratio, active)
+        _turn(self._d, z, ratio, active)
         short = largest_displacement(change) <= self._settled * largest_displacement(self.x)
         done = (r_z <= self._target) & (dot(self._r, self._r) <= self._limit) & short
         self._r_z.copy_(r_z)
@@ -142,6 +141,7 @@ class BatchConjugateGradients:
         self._active.copy_(active & ~done & (r_z > 0.0) & torch.isfinite(r_z))
 
 
+@one_kernel
 def _advance(
     x: Tensor, r: Tensor, change: Tensor, image: Tensor, alpha: Tensor, active: Tensor
 ) -> None:
@@ -150,5 +150,6 @@ def _advance(
     r.sub_(torch.where(by_scene(active), by_scene(alpha) * image, 0.0))
 
 
+@one_kernel
 def _turn(d: Tensor, z: Tensor, ratio: Tensor, active: Tensor) -> None:
     d.copy_(torch.where(by_scene(active), z + by_scene(ratio) * d, d))

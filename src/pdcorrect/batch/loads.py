@@ -32,7 +32,7 @@ class BatchLoads:
         ]
         most = max(map(len, self._fixed))
         self._patterns = [
-            cells.nodal(
+            cells.configurations(
                 [
                     loads[k].pattern if k < len(loads) else np.zeros_like(p.positions)
                     for loads, p in zip(self._fixed, problems, strict=True)
@@ -61,7 +61,7 @@ class BatchLoads:
                 for load in loads:
                     out += load.forces(*span, at)
             sampled.append(out)
-        return total + self._cells.nodal(sampled)
+        return total + self._cells.configurations(sampled)
 
     def acceleration(self, spans: Spans) -> Tensor:
         """Of gravity, (B, 1, 3), m/s2."""
@@ -82,7 +82,7 @@ class BatchLoads:
             for load in loads:
                 slope += load.pulled(*span, at, along)
             out.append(slope)
-        return self._cells.nodal(out)[:, : positions.shape[1]]
+        return self._cells.nodal(out)
 
     def _update(self, amplitudes: tuple[tuple[float, ...], ...]) -> None:
         total = torch.zeros_like(self._cells.rest)

@@ -68,6 +68,8 @@ def changed(
 
     ``rule`` says which terms the energy has and how Poisson's ratio weighs volume.
     """
+    if all(m is None for m in given):
+        return base
     young, poisson, density = (
         old if m is None else m.detach().clone() for m, old in zip(given, base.values, strict=True)
     )

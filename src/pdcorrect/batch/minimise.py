@@ -13,15 +13,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from pdcorrect.batch.first_hessian import FirstHessian
-from pdcorrect.batch.gpu import Recorder, as_kernel
+from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement, node_dot
 from pdcorrect.batch.shared_matrices import with_rows
@@ -78,8 +76,7 @@ class BatchHistory:
         mixed = self._d * w + _times(self._yz, w) - zg
         back = _times(self._r_inverse.transpose(1, 2), mixed)
         ahead = torch.bmm(w[:, None], self._Z), torch.bmm(back[:, None], self._S)
-        out: Tensor = as_kernel(_combined, x.is_cuda)(*ahead, x)
-        return out
+        return _combined(*ahead, x)
 
     def append(
         self, step: Tensor, change: Tensor, gradient: Tensor, new_gradient: Tensor, moved: Tensor
@@ -91,7 +88,7 @@ class BatchHistory:
         """
         sg, zg = _times(self._S, new_gradient), _times(self._Z, new_gradient)
         fields = [x.reshape(len(x), -1, 3) for x in (step, change, gradient, new_gradient)]
-        by_node = as_kernel(_pair_products, step.is_cuda)(*fields)
+        by_node = _pair_products(*fields)
         s_new, z_new, s_old, z_old, s_s = by_node.sum(dim=-1)
         y_s, y_z = s_new - s_old, z_new - z_old
         floor = _CURVATURE * torch.sqrt(y_z.abs() * s_s)
@@ -128,10 +125,12 @@ def _times(matrix: Tensor, vector: Tensor) -> Tensor:
     return torch.bmm(matrix, vector[:, :, None])[:, :, 0]
 
 
+@one_kernel
 def _combined(plus: Tensor, minus: Tensor, x: Tensor) -> Tensor:
     return (plus - minus)[:, 0] - x
 
 
+@one_kernel
 def _pair_products(s: Tensor, z: Tensor, old: Tensor, new: Tensor) -> Tensor:
     """Of (B, U, 3), what each node has in their inner products, (5, B, U)."""
     pairs = ((s, new), (z, new), (s, old), (z, old), (s, s))
@@ -159,16 +158,13 @@ class Phase(IntEnum):
     LIMIT = 5
 
 
-@dataclass
-class LbfgsInverse:
+def _improved(inverse: FirstHessian, history: BatchHistory) -> Callable[[Tensor], Tensor]:
     """The first Hessian's inverse, improved by the pairs of the steps since the start."""
 
-    inverse: FirstHessian
-    history: BatchHistory
+    def product(r: Tensor) -> Tensor:
+        return history.improved(r.flatten(1), inverse(r).flatten(1)).reshape(r.shape)
 
-    def __call__(self, r: Tensor) -> Tensor:
-        x = self.inverse(r)
-        return self.history.improved(r.flatten(1), x.flatten(1)).reshape(r.shape)
+    return product
 
 
 class BatchMinimiser:
@@ -218,7 +214,7 @@ class BatchMinimiser:
         self._narrows = rest.device.type == "cpu" and scenes >= _FEW
         self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        improved = LbfgsInverse(inverse, self._history)
+        improved = _improved(inverse, self._history)
         self.linear_solver = BatchConjugateGradients(objective, improved, recorder)
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._next)
@@ -273,12 +269,10 @@ class BatchMinimiser:
         """Where the last run began, (B, U, 3); the next one overwrites it."""
         return self._start
 
-    def forget(self) -> None:
-        """Drop the pairs of the last step, which improve the linear solver's preconditioner."""
+    def forget(self, y: Tensor) -> None:
+        """Precondition by the first Hessian at y alone, without the last step's pairs."""
+        self._inverse.turn(y)
         self._history.clear(torch.ones_like(self._alive))
-
-    def _kernel(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        return as_kernel(function, self.y.is_cuda)
 
     # --- one iteration ------------------------------------------------------------------
 
@@ -316,7 +310,7 @@ class BatchMinimiser:
 
     def _iterate(self) -> None:
         running = self.phase == Phase.RUNNING
-        step, trial = self._kernel(_trial)(self.y, self._d, self._step, running)
+        step, trial = _trial(self.y, self._d, self._step, running)
         value, gradient, scale = self._objective(trial)
         fall = value - self._value
         good = fall <= ARMIJO * self._step * self._slope
@@ -327,8 +321,7 @@ class BatchMinimiser:
         x = self._inverse(gradient)
         s, z = step.flatten(1), (x - self._x).flatten(1)
         self._history.append(s, z, self.gradient.flatten(1), gradient.flatten(1), moved)
-        known, found = [self.y, self.gradient, self._x], [trial, gradient, x]
-        self._kernel(_accept)(moved, known, found)
+        _accept(moved, [self.y, self.gradient, self._x], [trial, gradient, x])
         self._value.copy_(torch.where(moved, value, self._value))
         self._scale.copy_(torch.where(moved, scale, self._scale))
         self._backtrack(running & ~moved, fall)
@@ -357,7 +350,7 @@ class BatchMinimiser:
     def _turn(self, moved: Tensor) -> None:
         """New directions for the scenes that moved."""
         d = self._history.direction(self._x.flatten(1)).reshape(self._d.shape)
-        self._kernel(_accept)(moved, [self._d], [d])
+        _accept(moved, [self._d], [d])
         self._slope.copy_(torch.where(moved, dot(self.gradient, self._d), self._slope))
         short = moved & (largest_displacement(self._d) <= self._threshold)
         self.phase.copy_(torch.where(short, int(Phase.WAITING), self.phase))
@@ -398,11 +391,13 @@ class BatchMinimiser:
         self._look()
 
 
+@one_kernel
 def _trial(y: Tensor, d: Tensor, length: Tensor, running: Tensor) -> tuple[Tensor, Tensor]:
     step = torch.where(by_scene(running), by_scene(length) * d, 0.0)
     return step, y + step
 
 
+@one_kernel
 def _accept(moved: Tensor, known: Sequence[Tensor], found: Sequence[Tensor]) -> None:
     """Put what was found, (B, U, 3) each, in the place of what was known, where moved (B,)."""
     for old, new in zip(known, found, strict=True):

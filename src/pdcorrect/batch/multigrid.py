@@ -19,9 +19,9 @@ from torch import Tensor
 
 from pdcorrect.batch.cells import padded
 from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
-from pdcorrect.batch.gpu import as_kernel, rows_of, sums
+from pdcorrect.batch.gpu import one_kernel, rows_of, sums
 from pdcorrect.batch.mesh_levels import Level, Numbers, hierarchy, places, table
-from pdcorrect.batch.shared_matrices import Sharing, with_rows
+from pdcorrect.batch.shared_matrices import Sharing, of_all, of_some, with_rows
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -64,20 +64,23 @@ class Grid:
         nodes = max(len(level.free) for level in levels)
         count = max(len(level.cells) for level in levels)
 
-        scene = torch.arange(len(owners), device=device)[:, None, None]
-
         def real(arrays: Sequence[Array], *shape: int) -> Tensor:
             return torch.as_tensor(padded(arrays, shape), dtype=storage, device=device)
 
         def numbers(arrays: Sequence[Numbers], fill: int, *shape: int) -> Tensor:
             return torch.as_tensor(padded(arrays, shape, fill), device=device)[owners]
 
+        def weighted(transposed: bool, rows: int, columns: int) -> tuple[Tensor, Tensor]:
+            tables = [table(level.interpolation, transposed) for level in levels]
+            most = max(t.shape[1] for t, _ in tables)
+            weights = real([w for _, w in tables], rows, most)[owners].flatten(0, 1)
+            return of_all(numbers([t for t, _ in tables], 0, rows, most), columns), weights
+
         cells = numbers([level.cells for level in levels], 0, count, 8)
-        self._cells = (cells + nodes * scene).reshape(-1)
+        self._cells = of_all(cells, nodes)
         found = [places(level.cells, len(level.free)) for level in levels]
         slots = numbers(found, -1, nodes, max(p.shape[1] for p in found))
-        slots = torch.where(slots < 0, 8 * count * len(owners), slots + 8 * count * scene)
-        self._slots = slots.flatten(0, 1)
+        self._slots = of_all(slots, 8 * count)
         self._alike = all(len(level.blocks) == 1 for level in levels)
         if self._alike:
             self._blocks = real([level.blocks[0] for level in levels], 24, 24)[owners]
@@ -89,78 +92,52 @@ class Grid:
         inverses = [_scaled_inverse(level, device) for level in levels]
         self.regular = [bool(inverse.any()) for inverse in inverses]
         self._inverse = real(inverses, nodes, 3, 3)[owners]
-        self._up, self._down = (
-            (
-                (numbers([t for t, _ in tables], 0, rows, most) + columns * scene).flatten(0, 1),
-                real([w for _, w in tables], rows, most)[owners].flatten(0, 1),
-            )
-            for tables, most, rows, columns in _both_ways(levels, nodes, coarse)
-        )
-
-    @property
-    def bytes(self) -> int:
-        """Memory of its tensors."""
-        tensors = (
-            self._cells, self._slots, self._blocks, self._nodal, self._free, self._inverse,
-            *self._up, *self._down,
-        )  # fmt: skip
-        return sum(t.numel() * t.element_size() for t in tensors)
+        self._up, self._down = weighted(False, nodes, coarse), weighted(True, coarse, nodes)
 
     def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Grid:
         """Of some scenes, with the matrices that they have."""
         scenes, nodes, _ = self._free.shape
-        moved = (torch.arange(len(rows), device=rows.device) - rows)[:, None, None]
+        values, coarse = self._cells.numel() // scenes, len(self._down[0]) // scenes
 
-        def some(table: Tensor) -> Tensor:
-            return table.reshape(scenes, -1, table.shape[-1])[rows]
+        def numbers(table: Tensor, size: int) -> Tensor:
+            return of_some(table, size, scenes, rows)
 
-        def shifted(table: Tensor, size: int) -> Tensor:
-            return (some(table) + size * moved).flatten(0, 1)
+        def weights(table: Tensor) -> Tensor:
+            return table.reshape(scenes, -1, table.shape[-1])[rows].flatten(0, 1)
 
-        values = len(self._cells) // scenes
-        slots = some(self._slots)
-        none = slots == values * scenes
-        slots = torch.where(none, values * len(rows), slots + values * moved).flatten(0, 1)
-        coarse = len(self._down[0]) // scenes
         return with_rows(
-            self, rows, "_nodal", "_free", "_inverse", _sharing=sharing, _slots=slots,
-            _cells=shifted(self._cells[:, None], nodes)[:, 0],
+            self, rows, "_nodal", "_free", "_inverse", _sharing=sharing,
+            _cells=numbers(self._cells, nodes),
+            _slots=numbers(self._slots, values),
             _blocks=self._blocks[rows if self._alike else kept],
-            _up=(shifted(self._up[0], coarse), some(self._up[1]).flatten(0, 1)),
-            _down=(shifted(self._down[0], nodes), some(self._down[1]).flatten(0, 1)),
+            _up=(numbers(self._up[0], coarse), weights(self._up[1])),
+            _down=(numbers(self._down[0], nodes), weights(self._down[1])),
         )  # fmt: skip
 
     def residual(self, b: Tensor, x: Tensor) -> Tensor:
         """B - A x; of no meaning where clamped."""
-        local = rows_of(x.reshape(-1, 3), self._cells)
+        local = rows_of(x.reshape(-1, 3), self._cells.reshape(-1))
         images = self._images(local.reshape(len(x), -1, 24)).reshape(-1, 3)
-        kernel = as_kernel(_residual, x.is_cuda)
-        out: Tensor = kernel(b, x, self._nodal, images, self._slots)
-        return out
+        return _residual(b, x, self._nodal, images, self._slots)
 
     def smoothed(self, b: Tensor) -> Tensor:
         """A Chebyshev polynomial in D^-1 A, times D^-1 b: symmetric, zero where clamped."""
-        kernel = as_kernel(_advanced, b.is_cuda)
         x, step = torch.zeros_like(b), torch.zeros_like(b)
         r = b
         for k, factors in enumerate(self._factors):
             if k:
                 r = self.residual(b, x)
-            step, x = kernel(self._inverse, r, step, x, factors)
+            step, x = _advanced(self._inverse, r, step, x, factors)
         return x
 
     def restricted(self, r: Tensor) -> Tensor:
         """P^T r, on the next coarser level, for a field that counts where free."""
-        kernel = as_kernel(_weighted, r.is_cuda)
         flat = (r * self._free).reshape(-1, 3)
-        out: Tensor = kernel(flat, *self._down)
-        return out.reshape(len(r), -1, 3)
+        return _weighted(flat, *self._down).reshape(len(r), -1, 3)
 
     def prolonged(self, x: Tensor) -> Tensor:
         """P x, zero where clamped."""
-        kernel = as_kernel(_weighted, x.is_cuda)
-        out: Tensor = kernel(x.reshape(-1, 3), *self._up)
-        return out.reshape(self._free.shape) * self._free
+        return _weighted(x.reshape(-1, 3), *self._up).reshape(self._free.shape) * self._free
 
     def _images(self, local: Tensor) -> Tensor:
         """The cells' matrices times their values (B, C, 24)."""
@@ -171,13 +148,12 @@ class Grid:
         return self._sharing.scattered(moved.permute(0, 3, 1, 2))
 
 
-# --- what is one kernel on a GPU -----------------------------------------------------------------
-
-
+@one_kernel
 def _residual(b: Tensor, x: Tensor, nodal: Tensor, images: Tensor, slots: Tensor) -> Tensor:
     return b - nodal * x - sums(images, slots).reshape(b.shape)
 
 
+@one_kernel
 def _advanced(
     inverse: Tensor, r: Tensor, step: Tensor, x: Tensor, factors: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -187,6 +163,7 @@ def _advanced(
     return step, x + step
 
 
+@one_kernel
 def _weighted(values: Tensor, numbers: Tensor, weights: Tensor) -> Tensor:
     total = weights[:, 0, None] * values[numbers[:, 0]]
     for i in range(1, numbers.shape[1]):
@@ -251,17 +228,6 @@ def _scaled_inverse(level: Level, device: torch.device) -> Array:
         return np.zeros_like(D)
 
 
-def _both_ways(
-    levels: Sequence[Level], nodes: int, coarse: int
-) -> list[tuple[list[tuple[Numbers, Array]], int, int, int]]:
-    """Of P and of P^T: each level's table, its width, and how many nodes both sides have."""
-    out = []
-    for transposed, rows, columns in ((False, nodes, coarse), (True, coarse, nodes)):
-        tables = [table(level.interpolation, transposed) for level in levels]
-        out.append((tables, max(t.shape[1] for t, _ in tables), rows, columns))
-    return out
-
-
 _ROUNDING = 1e-9
 """Of the largest nodal mass: to which masses of cells and of the problem count as equal."""
 
@@ -283,8 +249,6 @@ class BatchMultigrid:
 
     Attributes
     ----------
-    bytes : int
-        Of all levels.
     regular : list of bool
         Whether each distinct problem's coarsest matrix is positive definite, and the nodes'
         blocks on the other levels.
@@ -315,12 +279,11 @@ class BatchMultigrid:
             and all(grid.regular[i] for grid in self._grids)
             for i, level in enumerate(coarsest)
         ]
-        self.bytes = self._coarsest.bytes + sum(grid.bytes for grid in self._grids)
 
     def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> BatchMultigrid:
         """Of some scenes, with the matrices that they have."""
         return with_rows(
-            self, rows, _coarsest=self._coarsest.narrowed(sharing, kept),
+            self, rows, _coarsest=self._coarsest.narrowed(sharing, kept, rows),
             _grids=[grid.narrowed(sharing, kept, rows) for grid in self._grids],
         )  # fmt: skip
 

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from pdcorrect.batch import viscosity
 from pdcorrect.batch.cells import CellBatch, padded
-from pdcorrect.batch.gpu import as_kernel, small_products
+from pdcorrect.batch.gpu import one_kernel, small_products
 from pdcorrect.batch.points import Tangent
 from pdcorrect.batch.shared_matrices import with_rows
-from pdcorrect.batch.viscosity import ViscousTangent
 from pdcorrect.scene import Damping
 
 
@@ -64,27 +63,19 @@ class BatchMass:
         if self._diagonal:
             return (factor * self.nodal)[..., None] * x
         local = (factor * self.density)[..., None, None] * self._by_cell(x)
-        return self._cells.summed(self._filled(local))
+        return self._cells.of_corners(local)
 
     def slopes(self, a: Tensor, b: Tensor) -> Tensor:
         """Derivatives of a . M b by the densities, (B, C), for (B, U, 3)."""
-        return (self._local(a) * self._by_cell(b)).sum(dim=(2, 3))
+        return (self._cells.local(a) * self._by_cell(b)).sum(dim=(2, 3))
 
     def row_slopes(self, x: Tensor) -> Tensor:
         """Derivatives (B, C) of the sum of x (B, U) times ``nodal`` by the densities."""
         columns = x[..., None].expand(-1, -1, 3).contiguous()
-        return (self._blocks.sum(dim=-1) * self._local(columns)[..., 0]).sum(dim=2)
+        return (self._blocks.sum(dim=-1) * self._cells.local(columns)[..., 0]).sum(dim=2)
 
     def _by_cell(self, x: Tensor) -> Tensor:
-        return small_products(self._blocks, self._local(x))
-
-    def _local(self, x: Tensor) -> Tensor:
-        return self._cells.local(x)
-
-    def _filled(self, local: Tensor) -> Tensor:
-        """Zeros for the cells' modes."""
-        missing = self._cells.sizes.width - local.shape[2]
-        return torch.nn.functional.pad(local, (0, 0, 0, missing))
+        return small_products(self._blocks, self._cells.local(x))
 
 
 class Tangents(NamedTuple):
@@ -94,7 +85,7 @@ class Tangents(NamedTuple):
     """
 
     elastic: Tangent
-    viscous: ViscousTangent | None
+    viscous: tuple[Tensor, ...] | None
     written: Tensor | None = None
 
 
@@ -155,17 +146,12 @@ class BatchObjective:
             before=self.cells.of_scenes(self.before, rows),
         )  # fmt: skip
 
-    @property
-    def inertia(self) -> Tensor:
-        """c, 1/s2."""
-        return self.factors[0]
-
     def __call__(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""
         energy, elastic = self.cells.energy_and_forces(y)
         offset = y - self.target
-        momentum = self.mass(offset, self.inertia)
-        gradient, by_node = as_kernel(_terms, y.is_cuda)(
+        momentum = self.mass(offset, self.factors[0])
+        gradient, by_node = _terms(
             elastic, offset, momentum, self.forces, y - self.cells.rest, self.free
         )
         kinetic, work = by_node.sum(dim=-1)
@@ -187,14 +173,11 @@ class BatchObjective:
             return out
         return out + self.factors[2] * self.cells.apply(self.tangent, x)
 
-    def viscous_stress(self, S: Tensor) -> Tensor:
-        """See `viscosity.stress`, for stretches S (6, B C, Q)."""
-        return viscosity.stress(S - self.before, self._viscous_weights)
-
     def _viscous(self, y: Tensor) -> tuple[Tensor, Tensor]:
         S, frames = viscosity.stretches(self.cells, y)
-        stress = self.viscous_stress(S)
-        energy = viscosity.energies(self.cells, S - self.before, stress)
+        change = S - self.before
+        stress = viscosity.stress(change, self._viscous_weights)
+        energy = viscosity.energies(self.cells, change, stress)
         forces, cells = viscosity.forces(self.cells, frames, stress), self.cells
         if cells.correction is None:
             return energy, forces
@@ -217,7 +200,8 @@ class BatchObjective:
         if not self.viscous:
             return Tangents(self.cells.linearise(y), None)
         S, frames = viscosity.stretches(self.cells, y)
-        viscous = ViscousTangent(frames, self.viscous_stress(S), self._viscous_weights)
+        weights = self._viscous_weights
+        viscous = (*frames, viscosity.stress(S - self.before, weights), weights)
         written, cells = None, self.cells
         if cells.correction is not None:
             written = cells.correction.linearise_viscous(
@@ -243,14 +227,12 @@ class BatchObjective:
 
 def largest_displacement(x: Tensor) -> Tensor:
     """Largest node norm of each scene, (B,), for (B, U, 3)."""
-    squares: Tensor = as_kernel(node_dot, x.is_cuda)(x, x)
-    return torch.sqrt(squares.amax(dim=1))
+    return torch.sqrt(_by_node(x, x).amax(dim=1))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products (B,) of (B, U, 3)."""
-    by_node: Tensor = as_kernel(node_dot, a.is_cuda)(a, b)
-    return by_node.sum(dim=1)
+    return _by_node(a, b).sum(dim=1)
 
 
 def by_scene(values: Tensor) -> Tensor:
@@ -258,9 +240,7 @@ def by_scene(values: Tensor) -> Tensor:
     return values[:, None, None]
 
 
-# --- what is one kernel on a GPU -----------------------------------------------------------------
-
-
+@one_kernel
 def _terms(
     elastic: Tensor,
     offset: Tensor,
@@ -278,3 +258,6 @@ def node_dot(a: Tensor, b: Tensor) -> Tensor:
     """What each node has in the inner product of (B, U, 3), (B, U); part of larger kernels."""
     x, y, z = (a * b).unbind(dim=-1)
     return x + y + z
+
+
+_by_node = one_kernel(node_dot)

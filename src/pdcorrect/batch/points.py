@@ -1,7 +1,7 @@
 """What is computed at each quadrature point, on tensors (k, C, Q) of Q points in C cells.
 
 Deformation is given by the displacement's gradient H = F - I.  Each function is written for
-lists of components; on a GPU it is one kernel (see `pdcorrect.batch.point_kernel`).
+lists of components; on a GPU it is one kernel (see `pdcorrect.batch.triton_kernels`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pdcorrect.batch import energies
 from pdcorrect.batch.decomposition import nearest_volume, product, signed_svd, transposed
-from pdcorrect.batch.point_kernel import PointFunction, at_points
+from pdcorrect.batch.triton_kernels import PointFunction, at_points
 from pdcorrect.fem.hyperelasticity import COROTATED
 
 Tangent = tuple[Tensor, ...]

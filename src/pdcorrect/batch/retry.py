@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,13 +10,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.states import BatchResult, BatchState, state_of, with_states
+from pdcorrect.batch.states import BatchResult, BatchState, state_of
 from pdcorrect.errors import PdcorrectError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
+
+Array = NDArray[np.float64]
 
 _WORTH_IT = (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
 
@@ -51,55 +52,37 @@ class SingleRetry:
         forces: Tensor | None,
         result: BatchResult,
         problem_now: Callable[[int], Problem],
-    ) -> BatchResult:
-        """The result with those scenes' in it that now converged.
+    ) -> None:
+        """Write into the result the steps of those scenes that now converge.
 
         ``problem_now`` gives the problem of a scene, by its number, as it is now.
         """
-        failed = [i for i, status in enumerate(result.statuses) if status in _WORTH_IT]
-        found = {i: self._step(i, before, forces, result, problem_now(i)) for i in failed}
-        steps = {i: step for i, step in found.items() if step is not None}
-        if not steps:
-            return result
-        statuses, y = list(result.statuses), result.y.clone()
-        estimates, iterations = result.error_estimates.copy(), result.iterations.copy()
-        ratios = result.smallest_volume_ratios.copy()
-        for i, step in steps.items():
-            converged = step.status is Status.CONVERGED
-            statuses[i] = Status.RECOVERED if converged else step.status
-            estimates[i] = step.error_estimate
-            iterations[i] += step.iterations
-            ratios[i] = step.stats["smallest_volume_ratio"]
-            y[i] = self._configuration(i, state_of(self._cells, before, i), step, forces)
-        return replace(
-            result,
-            state=with_states(
-                self._cells, result.state, {i: step.state for i, step in steps.items()}
-            ),
-            y=y,
-            statuses=statuses,
-            iterations=iterations,
-            error_estimates=estimates,
-            smallest_volume_ratios=ratios,
-        )
+        for i, status in enumerate(result.statuses):
+            if status in _WORTH_IT:
+                state, push = state_of(self._cells, before, i), self._push(i, forces)
+                stepper = self._stepper(i, problem_now(i))
+                try:
+                    step = stepper(state, push)
+                except PdcorrectError:
+                    continue  # the batch's own status stands
+                if set(step.state.memory) == set(result.state.memory):
+                    self._write(i, step, result, _solution(stepper, state, push, step))
 
-    def _step(
-        self,
-        i: int,
-        before: BatchState,
-        forces: Tensor | None,
-        result: BatchResult,
-        problem: Problem,
-    ) -> StepResult | None:
-        """The step of one scene; None, and the batch's own status stands, if that fails too."""
-        try:
-            alone = state_of(self._cells, before, i)
-            found = self._stepper(i, problem)(alone, self._extra(i, forces))
-        except PdcorrectError:
-            return None
-        return found if set(found.state.memory) == set(result.state.memory) else None
+    def _write(self, i: int, step: StepResult, result: BatchResult, y: Array) -> None:
+        converged, after = step.status is Status.CONVERGED, result.state
+        result.statuses[i] = Status.RECOVERED if converged else step.status
+        result.error_estimates[i] = step.error_estimate
+        result.iterations[i] += step.iterations
+        result.smallest_volume_ratios[i] = step.stats["smallest_volume_ratio"]
+        nothing = np.zeros((0, 3))
+        every = [y if k == i else nothing for k in range(len(result.statuses))]
+        result.y[i] = self._cells.configurations(every)[i]
+        rows = [(after.positions, step.state.positions), (after.velocities, step.state.velocities)]
+        rows += [(x, step.state.memory[name]) for name, x in after.memory.items()]
+        for x, array in rows:
+            x[i, : len(array)] = self._cells.tensor(array)
 
-    def _extra(self, i: int, forces: Tensor | None) -> NDArray[np.float64] | None:
+    def _push(self, i: int, forces: Tensor | None) -> Array | None:
         if forces is None:
             return None
         rows = forces[i, : self._cells.node_counts[i]]
@@ -115,17 +98,12 @@ class SingleRetry:
             )
         return self._steppers[i]
 
-    def _configuration(
-        self, i: int, before: State, step: StepResult, forces: Tensor | None
-    ) -> Tensor:
-        """The y of a scene that was stepped alone."""
-        stepper = self._steppers[i]
-        integrate, h = stepper.integrate, stepper.time_step
-        if step.status is Status.SUBSTEPPED:  # has no y
-            y = solution(integrate.scheme(before, h), before, step.state, stepper.problem)
-        else:
-            objective = stepper.objective(before, self._extra(i, forces), h)
-            y = step_solution(objective, integrate, h, step)
-        nothing = np.zeros((0, 3))
-        every = [y if k == i else nothing for k in range(self._cells.sizes.scenes)]
-        return self._cells.configurations(every)[i]
+
+def _solution(
+    stepper: ProjectiveDynamics, before: State, push: Array | None, step: StepResult
+) -> Array:
+    """The y of a scene that was stepped alone."""
+    integrate, h = stepper.integrate, stepper.time_step
+    if step.status is Status.SUBSTEPPED:  # has no y
+        return solution(integrate.scheme(before, h), before, step.state, stepper.problem)
+    return step_solution(stepper.objective(before, push, h), integrate, h, step)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -14,6 +14,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.fem.problem import Problem
+
+
+def _kinds(
+    problems: Sequence[Problem], key: Callable[[Problem], Hashable]
+) -> tuple[list[Problem], list[int]]:
+    """One problem of each key, and which of them each problem is like."""
+    seen: dict[Hashable, int] = {}
+    owners = [seen.setdefault(key(p), len(seen)) for p in problems]
+    firsts = [owners.index(k) for k in range(len(seen))]
+    return [problems[i] for i in firsts], owners
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,17 +46,13 @@ class DistinctBodies:
     @classmethod
     def of(cls, problems: Sequence[Problem]) -> DistinctBodies:
         """Known by the objects that `Problem.with_loads` shares; numbers are not compared."""
-        seen: dict[tuple[object, ...], int] = {}
-        distinct: list[Problem] = []
-        owners = np.empty(len(problems), dtype=np.int64)
-        for i, p in enumerate(problems):
+
+        def key(p: Problem) -> tuple[Hashable, ...]:
             parts = (p.mesh, p.space, p.quadrature, p.materials, p.mass_matrix, p.clamps)
-            key = (p.mass_rule, *map(id, parts))
-            if key not in seen:
-                seen[key] = len(distinct)
-                distinct.append(p)
-            owners[i] = seen[key]
-        return cls(distinct, owners)
+            return p.mass_rule, *map(id, parts)
+
+        distinct, owners = _kinds(problems, key)
+        return cls(distinct, np.array(owners, dtype=np.int64))
 
     @property
     def one_a_scene(self) -> bool:
@@ -66,16 +72,8 @@ class Sharing:
     """
 
     def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
-        seen: dict[bytes, int] = {}
-        self.distinct: list[Problem] = []
         bodies = DistinctBodies.of(problems)
-        kinds = []
-        for problem in bodies.distinct:
-            key = _key(problem)
-            if key not in seen:
-                seen[key] = len(self.distinct)
-                self.distinct.append(problem)
-            kinds.append(seen[key])
+        self.distinct, kinds = _kinds(bodies.distinct, _key)
         self.owners: list[int] = [kinds[body] for body in bodies.owners]
         self._arrange(device)
 
@@ -126,6 +124,24 @@ def _key(problem: Problem) -> bytes:
     ):  # fmt: skip
         digest.update(np.ascontiguousarray(array).data)
     return digest.digest()
+
+
+def of_all(numbers: Tensor, size: int) -> Tensor:
+    """Numbers (B, R, n) of each scene's own ``size`` rows as those of all scenes, (B R, n).
+
+    Those below zero stand for nothing, and become B times ``size``.
+    """
+    scene = torch.arange(len(numbers), device=numbers.device)[:, None, None]
+    of_its_own = numbers + size * scene
+    return torch.where(numbers < 0, size * len(numbers), of_its_own).flatten(0, 1)
+
+
+def of_some(table: Tensor, size: int, scenes: int, rows: Tensor) -> Tensor:
+    """What `of_all` makes of some scenes' numbers, from what it made of all."""
+    scene = torch.arange(scenes, device=table.device)[:, None, None]
+    by_scene = table.reshape(scenes, -1, table.shape[1])
+    numbers = torch.where(by_scene == size * scenes, -1, by_scene - size * scene)
+    return of_all(numbers[rows], size)
 
 
 Batch = TypeVar("Batch")

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
@@ -188,20 +187,16 @@ class BatchStaging:
         rates = [clamp_rates(problem, t, self._h) for problem, t in pairs]
         still = [np.zeros_like(problem.positions) for problem in self._problems]
         return {
-            name: self._nodal([a[name] + zero for a, zero in zip(rates, still, strict=True)])
+            name: self._cells.nodal([a[name] + zero for a, zero in zip(rates, still, strict=True)])
             for name in rates[0]
         }
 
     def prescribed(self, times: Sequence[float]) -> Tensor:
         """Clamped positions of the scenes at their times (s), (B, N, 3), m."""
-        return self._held(times) if self._moving else self._clamped
-
-    def _held(self, times: Sequence[float]) -> Tensor:
+        if not self._moving:
+            return self._clamped
         pairs = zip(self._problems, times, strict=True)
-        return self._nodal([p.clamped_positions(t) for p, t in pairs])
-
-    def _nodal(self, arrays: Sequence[NDArray[np.float64]]) -> Tensor:
-        return self._cells.nodal(arrays)[:, : self._cells.sizes.nodes]
+        return self._cells.nodal([p.clamped_positions(t) for p, t in pairs])
 
     def _split(self, known: dict[str, Any], on_free: Linear, on_clamped: Linear | None) -> Tensor:
         """A sum (B, N, 3) in memory of its own."""

@@ -6,6 +6,7 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,12 @@ from pdcorrect.batch.checks import (
     check_problems,
     check_state,
     check_states,
-    one_thread,
     start_times,
     usable_device,
 )
-from pdcorrect.batch.elimination import alike_cells
 from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.follower import settle
+from pdcorrect.batch.gpu import one_thread
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
@@ -36,8 +36,7 @@ from pdcorrect.batch.minimise import BatchMinimiser, Phase
 from pdcorrect.batch.modes import relaxed
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
-from pdcorrect.batch.shared_matrices import Sharing
-from pdcorrect.batch.states import BatchResult, BatchState, apart, expected_bytes, together
+from pdcorrect.batch.states import BatchResult, BatchState, state_of, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
 from pdcorrect.batch.viscosity import stretches
 from pdcorrect.fem.cell_correction import CellCorrection
@@ -94,6 +93,11 @@ class BatchStepper:
         Whether scenes that do not converge are tried again, one at a time, with
         `ProjectiveDynamics` and its fallbacks.
 
+    Attributes
+    ----------
+    present, own : BatchMaterial
+        What the scenes are of now, and as the problems have it.
+
     Raises
     ------
     InputError
@@ -140,8 +144,8 @@ class BatchStepper:
         self.cells = CellBatch(self.problems, usable_device(device), dtype)
         self.device, self.dtype = self.cells.rest.device, dtype  # "cuda:0" where "cuda" was meant
         self.objective = BatchObjective(self.cells, damping)
-        self._own = self._material = own_material(self.cells)
-        self._write(self._own)
+        self.own = self.present = own_material(self.cells)
+        self._write(self.own)
         self.loads = BatchLoads(self.cells, self.problems, self.objective.mass)
         self.staging = BatchStaging(self.cells, self.problems, self.integrate, self.time_step)
         self._forget()
@@ -149,12 +153,10 @@ class BatchStepper:
     def _forget(self) -> None:
         """Make what is not kept in copies of the stepper, or anew when it is first needed."""
         self._lock = threading.RLock()
-        self._minimiser: BatchMinimiser | None = None
-        self._inverse: FirstHessian | None = None
         self._one_by_one = SingleRetry(self.cells, self.tolerances, self.time_step, self.integrator)
 
     def __getstate__(self) -> dict[str, Any]:
-        left = ("_lock", "_minimiser", "_inverse", "_one_by_one")
+        left = ("_lock", "_minimiser", "_one_by_one")
         return {name: value for name, value in self.__dict__.items() if name not in left}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -204,7 +206,7 @@ class BatchStepper:
             positions, velocities = map(self.batched, batch)
             batch = BatchState(positions, velocities, start_times(self.cells, times))
         check_state(self.cells, batch)
-        return apart(self.cells, batch)
+        return [state_of(self.cells, batch, i) for i in range(len(self.problems))]
 
     def batched(self, x: Tensor) -> Tensor:
         """A nodal tensor (N, 3) of a stepper of one scene as (1, N, 3); others as they are."""
@@ -226,7 +228,7 @@ class BatchStepper:
     @property
     def material(self) -> tuple[Tensor, Tensor, Tensor]:
         """Young's modulus (Pa), Poisson's ratio and density (kg/m3) of each cell now, (B, C)."""
-        return self._material.values
+        return self.present.values
 
     def set_material(
         self,
@@ -248,45 +250,33 @@ class BatchStepper:
         pairs = zip(NAMES, (young, poisson, density), strict=True)
         with self.alone():
             given = [by_cell(self.cells, name, value) for name, value in pairs]
-            material = self._with(self._own, given)
+            material = self.with_material(given, self.own)
             check_material(self.cells, self.problems, material)
             self._apply(material)
 
-    def with_material(self, given: Sequence[Tensor | None]) -> BatchMaterial:
-        """The present material with other values, each (B, C) or None, for `using`."""
+    def with_material(
+        self, given: Sequence[Tensor | None], base: BatchMaterial | None = None
+    ) -> BatchMaterial:
+        """The present material, or another, with other values, each (B, C) or None, for `using`."""
+        rule, base = self.problems[0].scene.material, self.present if base is None else base
         with self.alone():
-            return self._with(self._material, given)
+            return changed(self.cells, rule, base, given)
 
     @contextmanager
     def using(self, material: BatchMaterial) -> Iterator[None]:
         """Work alone and with a material; afterwards the present one is back."""
         with self.alone():
-            before = self._material
+            before = self.present
             self._apply(material)
             try:
                 yield
             finally:
                 self._apply(before)
 
-    @property
-    def present(self) -> BatchMaterial:
-        """The present material, for `using`."""
-        return self._material
-
-    @property
-    def own(self) -> BatchMaterial:
-        """The problems' material."""
-        return self._own
-
-    def _with(self, base: BatchMaterial, given: Sequence[Tensor | None]) -> BatchMaterial:
-        if all(m is None for m in given):
-            return base
-        return changed(self.cells, self.problems[0].scene.material, base, given)
-
     def _apply(self, material: BatchMaterial) -> None:
-        if material is not self._material:
+        if material is not self.present:
             self._write(material)
-            self._material = material
+            self.present = material
 
     def _write(self, material: BatchMaterial) -> None:
         self.cells.set_weights(material.mu, material.volume_weight)
@@ -298,7 +288,7 @@ class BatchStepper:
 
     def corrections(self, material: BatchMaterial | None = None) -> list[CellCorrection]:
         """What the scenes' learned elements add with a material, the present one by default."""
-        material = self._material if material is None else material
+        material = self.present if material is None else material
         weights = (
             m.to("cpu", torch.float64).numpy() for m in (material.mu, material.volume_weight)
         )
@@ -309,7 +299,7 @@ class BatchStepper:
         ):
             correction, count = problem.correction, len(problem.cells)
             assert correction is not None
-            if material is not self._own and sound and correction.writer is not None:
+            if material is not self.own and sound and correction.writer is not None:
                 correction = correction.writer.correction(mu[i, :count], omega[i, :count])
             out.append(correction)
         return out
@@ -317,7 +307,7 @@ class BatchStepper:
     def problem_now(self, i: int) -> Problem:
         """The problem of a scene with the material that it has now."""
         problem = self.problems[i]
-        if self._material is self._own:
+        if self.present is self.own:
             return problem
         count = len(problem.cells)
         values = (m[i, :count].to("cpu", torch.float64).numpy() for m in self.material)
@@ -344,27 +334,26 @@ class BatchStepper:
         """
         with self.alone():
             result = self._step(state, forces, guess)
-            if not self._recover:
-                return result
-            return self._one_by_one(state, forces, result, self.problem_now)
+            if self._recover:
+                self._one_by_one(state, forces, result, self.problem_now)
+            return result
 
     def _step(self, state: BatchState, forces: Tensor | None, guess: Tensor | None) -> BatchResult:
         if guess is not None:
             check_nodal(self.cells, "guess", guess)
         stage = self.prepare(state, forces)
-        minimiser = self._minimiser
-        assert minimiser is not None
-        start = self.staging.start(stage, guess)
-        alive = torch.isfinite(start).all(dim=2).all(dim=1) & self._material.sound
-        minimiser.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
-        m = minimiser
+        m, start = self._minimiser, self.staging.start(stage, guess)
+        alive = torch.isfinite(start).all(dim=2).all(dim=1) & self.present.sound
+        m.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
         found = m.y.clone(), m.phase, m.iterations, m.evaluations, m.estimate  # y is overwritten
         if self.loads.follow:
             nodes = self.cells.sizes.nodes
             found = settle(m, alive, lambda y: self._push(stage, forces, y[:, :nodes]))
         y, phase, iterations, evaluations, estimate = found
         after = self.staging.finish(stage, y, state, self._internal(stage, y))
-        ratios = self.cells.smallest_volume_ratios(after.positions).to("cpu", torch.float64).numpy()
+        ratios = (
+            self.cells.volume_ratios(after.positions).amin(dim=1).to("cpu", torch.float64).numpy()
+        )
         statuses = [_STATUSES[Phase(p)] for p in phase.tolist()]
         return BatchResult(
             y,
@@ -382,7 +371,7 @@ class BatchStepper:
     def prepare(
         self, state: BatchState, forces: Tensor | None = None, y: Tensor | None = None
     ) -> BatchStepEquation:
-        """Set up the step's objective and first Hessian.
+        """Set up the step's objective.
 
         Loads that follow the body are sampled at ``y`` (B, U, 3), or where the step is expected
         to lead.
@@ -395,8 +384,6 @@ class BatchStepper:
         objective.target.copy_(stage.target)
         self._damp(stage)
         self._push(stage, forces, stage.start if y is None else y[:, : self.cells.sizes.nodes])
-        if self._minimiser is None:
-            self._make_minimiser()
         return stage
 
     def _factors(self, scheme: Scheme) -> tuple[float, float, float, float]:
@@ -447,20 +434,19 @@ class BatchStepper:
                 whole = [cells.correction.whole(u) for _, u in local]
                 objective.whole.copy_(torch.stack(whole).all(dim=0))
 
-    def _make_minimiser(self) -> None:
+    @cached_property
+    def _minimiser(self) -> BatchMinimiser:
         """With the first Hessian of a step that goes on, which serves a run's first steps too."""
         scheme = self.integrate.scheme_of(self.time_step, schemes.WHOLE_MEMORY)
         inertia, drag, stiffness, viscosity = self._factors(scheme)
         factors = inertia + drag, 1.0 + stiffness + viscosity
-        self._inverse = FirstHessian(
+        inverse = FirstHessian(
             self.cells, self.problems, factors, self.first_hessian, self._storage
         )
         pairs = zip(self.tolerances, self.problems, strict=True)
         half = 0.5 if self.loads.follow else 1.0  # the rest is for loads, see `settle`
         sizes = np.array([half * tolerance * p.cell_size / scheme.gain for tolerance, p in pairs])
-        self._minimiser = BatchMinimiser(
-            self.objective, self._inverse, self.cells.tensor(sizes), self._most
-        )
+        return BatchMinimiser(self.objective, inverse, self.cells.tensor(sizes), self._most)
 
     def solve_adjoint(
         self, y: Tensor, b: Tensor, which: Tensor, tolerance: float
@@ -469,10 +455,7 @@ class BatchStepper:
 
         For the scenes where ``which`` (B,) holds; b (B, U, 3) counts on free components.
         """
-        assert self._inverse is not None
-        assert self._minimiser is not None
-        self._inverse.turn(y)
-        self._minimiser.forget()
+        self._minimiser.forget(y)
         solver = self._minimiser.linear_solver
         b = torch.where(by_scene(which), b * self.objective.free, 0.0)
         y = torch.where(by_scene(which), y, self.cells.rest)
@@ -481,22 +464,3 @@ class BatchStepper:
             max_steps=_ADJOINT_STEPS,
         )  # fmt: skip
         return solver
-
-    @property
-    def inverse_bytes(self) -> int:
-        """Memory of the inverses; 0 before the first step."""
-        return 0 if self._inverse is None else self._inverse.bytes
-
-    @property
-    def expected_bytes(self) -> int:
-        """Expected peak memory on the device, see `pdcorrect.batch.states.expected_bytes`.
-
-        Also before the first step, in which it is taken.
-        """
-        distinct = Sharing(self.problems, torch.device("cpu")).distinct
-        sizes, kinds = self.cells.sizes, len(distinct)
-        if self.first_hessian != "multigrid":
-            return expected_bytes(sizes, kinds, 3 if self.first_hessian == "rest" else 1)
-        coarse = max(len(p.mesh.coarse_nodes) for p in distinct)
-        alike = all(map(alike_cells, distinct))
-        return expected_bytes(sizes, kinds, 3, coarse, 0 if alike else kinds * sizes.cells)

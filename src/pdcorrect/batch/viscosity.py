@@ -6,7 +6,7 @@ rate's factor times the viscosity times mu and omega and the points' volumes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -20,26 +20,14 @@ _FULL = (0, 3, 4, 3, 1, 5, 4, 5, 2)
 _UPPER = (0, 4, 8, 1, 2, 5)
 
 
-class Frames(NamedTuple):
-    """The signed SVD of F at the points: U (9, B C, Q), s (3, B C, Q), V (9, B C, Q)."""
-
-    U: Tensor
-    s: Tensor
-    V: Tensor
-
-
-class ViscousTangent(NamedTuple):
-    """What the second derivative is made of."""
-
-    frames: Frames
-    stress: Tensor
-    weights: Tensor
+Frames = tuple[Tensor, Tensor, Tensor]
+"""The signed SVD of F at the points: U (9, B C, Q), s (3, B C, Q), V (9, B C, Q)."""
 
 
 def stretches(cells: CellBatch, y: Tensor) -> tuple[Tensor, Frames]:
     """S (6, B C, Q) and its frames at configurations (B, U, 3)."""
     S, U, s, V = computed(_stretch, [cells.gradients(y - cells.rest)], (6, 9, 3, 9))
-    return S, Frames(U, s, V)
+    return S, (U, s, V)
 
 
 def stress(change: Tensor, weights: Tensor) -> Tensor:
@@ -66,10 +54,12 @@ def rates(cells: CellBatch, frames: Frames, x: Tensor) -> Tensor:
     return out
 
 
-def apply(cells: CellBatch, tangent: ViscousTangent, x: Tensor) -> Tensor:
-    """The second derivative of the viscous potential times x, both (B, U, 3)."""
-    known = [*tangent.frames, tangent.stress, tangent.weights, cells.gradients(x)]
-    (P,) = computed(_change, known, (9,), cell_by_cell=True)
+def apply(cells: CellBatch, tangent: Sequence[Tensor], x: Tensor) -> Tensor:
+    """The second derivative of the viscous potential times x, both (B, U, 3).
+
+    ``tangent`` has the frames, the stress and the weights.
+    """
+    (P,) = computed(_change, [*tangent, cells.gradients(x)], (9,), cell_by_cell=True)
     return cells.gathered(P)
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -71,7 +72,7 @@ def check_models(models: Sequence[str], gate: bool) -> None:
         raise InputError("--no-gate without --model: expected --model NAME beside it.")
 
 
-def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -> Any:
+def progress_bars(unit: str = "", *, hidden: bool = False, apart: bool = False) -> Any:
     """A `rich.progress.Progress`, which counts in ``unit``; ``apart``: on standard error."""
     from rich.console import Console
     from rich.progress import (
@@ -83,12 +84,21 @@ def progress_bar(unit: str = "", *, hidden: bool = False, apart: bool = False) -
         TimeRemainingColumn,
     )
 
-    counted = (TextColumn(unit),) if unit else ()
     return Progress(
-        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), *counted,
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), disable=hidden,
-        console=Console(stderr=apart),
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+        TextColumn(unit), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+        disable=hidden, console=Console(stderr=apart),
     )  # fmt: skip
+
+
+@contextlib.contextmanager
+def progress_bar(
+    title: str, total: int, done: int = 0, **options: Any
+) -> Iterator[Callable[..., None]]:
+    """One bar; gives what to call, with anything, at each step.  Options as of `progress_bars`."""
+    with progress_bars(**{"hidden": done >= total, **options}) as progress:
+        task = progress.add_task(title, total=total, completed=done)
+        yield lambda *_: progress.advance(task)
 
 
 class FileLines:

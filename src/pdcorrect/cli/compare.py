@@ -8,13 +8,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli.common import FAILED, Frames, SceneFile, check_models, say, tell_of_compiling
+from pdcorrect.cli.common import (
+    FAILED,
+    Frames,
+    SceneFile,
+    check_models,
+    progress_bar,
+    progress_bars,
+    say,
+    tell_of_compiling,
+)
 from pdcorrect.errors import ConvergenceError, require_extra
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pdcorrect.evaluation.compare import Case, Comparison
+    from pdcorrect.evaluation.compare import Comparison
+    from pdcorrect.evaluation.comparison_cases import Case
     from pdcorrect.scene import Scene
     from pdcorrect.state import StepResult
     from pdcorrect.trajectory import Trajectory
@@ -86,8 +96,8 @@ def compare(
     """
     from pdcorrect._files import make_folder
     from pdcorrect.evaluation import report
-    from pdcorrect.evaluation.compare import cases_for
-    from pdcorrect.evaluation.comparison_cases import HEX27
+    from pdcorrect.evaluation.comparison_cases import HEX27, cases_for
+    from pdcorrect.evaluation.report_notes import notes
     from pdcorrect.scene import Scene
 
     if figures:
@@ -108,7 +118,7 @@ def compare(
     finer = _finer(loaded, count) if estimate_error else None
     comparison = _run(loaded, count, cases, truth, finer)
     _print_table(comparison)
-    for note in report.notes(comparison):
+    for note in notes(comparison):
         say("- " + note)
     say("drawing the figures ..." if figures else "")
     say(f"report: {report.write_report(comparison, output, draw=figures)}")
@@ -124,10 +134,9 @@ def compare(
 
 def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
     """The converged motion, with a bar for each run that is not on disk."""
-    from pdcorrect.cli.common import progress_bar
     from pdcorrect.evaluation import converged
 
-    with progress_bar() as progress:
+    with progress_bars() as progress:
         tasks: dict[str, Any] = {}
 
         def on_step(name: str, frame: int, total: int) -> None:
@@ -140,13 +149,11 @@ def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
 
 def _finer(scene: Scene, count: int) -> Trajectory | None:
     """What estimates errors, with a bar; None, and why, if it fails."""
-    from pdcorrect.cli.common import progress_bar
     from pdcorrect.evaluation.error_estimate import finer_run
 
-    with progress_bar() as progress:
-        task = progress.add_task("estimate of errors", total=count)
+    with progress_bar("estimate of errors", count) as advance:
         try:
-            return finer_run(scene, count, on_step=lambda *_: progress.advance(task))
+            return finer_run(scene, count, on_step=advance)
         except ConvergenceError as error:
             say(f"no estimate of errors: {error}")
             return None
@@ -160,19 +167,14 @@ def _run(
     finer: Trajectory | None,
 ) -> Comparison:
     """The comparison, with a bar for each case."""
-    from pdcorrect.cli.common import progress_bar
     from pdcorrect.evaluation import compare as evaluate
 
-    with progress_bar() as progress:
-        tasks = {c.label: progress.add_task(c.label, total=count, start=False) for c in cases[::-1]}
-        begun: list[str] = []
+    with progress_bars() as progress:
+        tasks: dict[str, Any] = {}
 
         def on_step(label: str, frame: int, result: StepResult) -> None:
-            if frame == 1:
-                for earlier in begun[-1:]:  # which may have failed
-                    progress.stop_task(tasks[earlier])
-                begun.append(label)
-                progress.start_task(tasks[label])
+            if label not in tasks:
+                tasks[label] = progress.add_task(label, total=count)
             progress.update(tasks[label], completed=frame)
 
         return evaluate.compare(scene, count, cases, on_step, converged=converged, finer=finer)
@@ -188,17 +190,16 @@ def _print_table(comparison: Comparison) -> None:
     console = Console(markup=False)
     if not console.is_terminal:  # a file or a pipe, which has no width
         console = Console(width=_WIDE, markup=False)
+    rows = report.table(comparison)
     table = Table(
         title=comparison.scene.name, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False
     )
-    headings = report.headings(comparison)
-    for heading in headings:
+    widths = [2 + max(map(len, [heading, *(row[heading] for row in rows)])) for heading in rows[0]]
+    for heading in rows[0]:
         table.add_column(heading, justify="right", no_wrap=True)
     names = table.columns[0]
     names.justify, names.no_wrap, names.overflow = "left", False, "fold"
-    rows = report.table(comparison)
-    columns = [*zip(headings, *rows, strict=True)][1:]
-    room = console.width - sum(max(map(len, column)) + 2 for column in columns)
-    for name, *cells in rows:
+    room = console.width - sum(widths[1:])
+    for name, *cells in (row.values() for row in rows):
         table.add_row("\n".join(wrap(name, max(room, _NARROW))), *cells)
     console.print(table)

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import Annotated, Optional
 
 import typer
 
-from pdcorrect._files import INTERRUPTED, Terminated
+from pdcorrect._files import INTERRUPTED, Terminated, make_folder, write_text
+from pdcorrect.cli.common import FAILED, FileLines, progress_bar
 from pdcorrect.errors import InputError
-
-if TYPE_CHECKING:
-    from pdcorrect.cli.common import FileLines
 
 app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
 
 Folder = Annotated[Path, typer.Argument(help="Folder of the data set.", show_default=False)]
-
-_UNFIT = 1
-"""Exit status of `check` if it finds errors."""
 
 
 class Layout(StrEnum):
@@ -68,7 +63,7 @@ def generate(
         )  # fmt: skip
     typer.echo(f"{output}: {found}")
     if not found:
-        raise typer.Exit(_UNFIT)
+        raise typer.Exit(FAILED)
 
 
 @app.command()
@@ -89,14 +84,14 @@ def check(
     from pdcorrect.data.folder import all_shards
 
     count = len(all_shards(folder))
-    with _progress("checking", count) as advance:
+    with progress_bar("checking", count, unit="files", apart=True) as advance:
         findings = check_dataset(folder, advance, repeat)
     for finding in findings:
         typer.echo(str(finding))
     errors = sum(finding.severity == "error" for finding in findings)
     typer.echo(f"{count} files, {errors} errors, {len(findings) - errors} warnings")
     if errors:
-        raise typer.Exit(_UNFIT)
+        raise typer.Exit(FAILED)
 
 
 @app.command()
@@ -114,14 +109,16 @@ def info(
 
     from pdcorrect.data.summary import dataset_files, dataset_info
 
-    with _progress("reading", len(dataset_files(folder))) as advance:
+    with progress_bar("reading", len(dataset_files(folder)), unit="files", apart=True) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
     console = Console(width=None if sys.stdout.isatty() else 200, markup=False)
     console.print(found.tables())
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:
-        _write(json, found.to_json() + "\n")
+        make_folder(json.parent)
+        write_text(json, found.to_json() + "\n")
+        typer.echo(f"wrote {json}")
 
 
 @app.command("export")
@@ -146,7 +143,7 @@ def export(
         typer.Option(help="vtu: run beside the reference; repeatable; plain, if there is one."),
     ] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Delete the files of an earlier export first.")
+        bool, typer.Option("--overwrite", help="Replace files of the same names.")
     ] = False,
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
@@ -229,8 +226,6 @@ def import_(
 @contextlib.contextmanager
 def _simulations() -> Iterator[FileLines]:
     """A line for each file; an interruption ends the program, and says what is there."""
-    from pdcorrect.cli.common import FileLines
-
     shown = FileLines()
     try:
         yield shown
@@ -240,21 +235,3 @@ def _simulations() -> Iterator[FileLines]:
     except Terminated:
         typer.echo(shown.interrupted(), err=True)
         raise
-
-
-def _write(path: Path, text: str) -> None:
-    from pdcorrect._files import make_folder, write_text
-
-    make_folder(path.parent)
-    write_text(path, text)
-    typer.echo(f"wrote {path}")
-
-
-@contextlib.contextmanager
-def _progress(title: str, count: int) -> Iterator[Callable[[Path], None]]:
-    """A bar on the terminal, if there are files; gives what to call after each of ``count``."""
-    from pdcorrect.cli.common import progress_bar
-
-    with progress_bar("files", apart=True, hidden=not count) as progress:
-        task = progress.add_task(title, total=count)
-        yield lambda path: progress.advance(task)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect.cli.common import tell_of_compiling
+from pdcorrect.errors import require_extra
 
 if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
@@ -59,8 +60,6 @@ def evaluate(
 
     *models, folder = paths
     if output and figures:
-        from pdcorrect.errors import require_extra
-
         require_extra("matplotlib", "view")
     refuses = DEFAULT_GATE if gate else None
     saved = saved_candidates(models, device, gate=refuses)
@@ -83,34 +82,25 @@ def evaluate(
 
 def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
-    from pdcorrect.evaluation.report import grouped, refused_corrections
+    from pdcorrect.evaluation.report_notes import refused_corrections
 
     notes = [f"left out: {text}" for text in found.damaged.values()]
     if found.missing:
         count = len(found.missing) + len(found.shards) + len(found.damaged)
-        notes.append(
-            f"{len(found.missing)} of {count} files of the split are missing: all figures are of "
-            "the others."
-        )
-    told: list[tuple[str, str]] = []
+        notes.append(f"{len(found.missing)} of {count} files of the split are missing.")
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
-        rollouts = found.runs[one.candidate.name].trajectories
-        reasons = [reason for rollout in rollouts for reason in rollout.reasons]
-        told.append((one.candidate.name, refused_corrections(reasons, runs=len(rollouts))))
     for name, run in found.runs.items():
-        count = len(run.trajectories)
-        lacking = ", ".join(f"{n} no {measure}" for measure, n in run.gaps().items())
-        told.append((name, f"of {count} trajectories {lacking}: left out there." * bool(lacking)))
         failures = run.failures()
         if failures:
             first = failures[0]
-            told.append((
-                name,
-                f"failed in {len(failures)} of {count} trajectories, first on mesh {first.mesh}, "
-                f"simulation {first.simulation}, step {first.failed}: held from there on.",
-            ))  # fmt: skip
-    notes += grouped((name, text) for name, text in told if text)
+            notes.append(
+                f"{name}: failed in {len(failures)} of {len(run.trajectories)} trajectories, first "
+                f"on mesh {first.mesh}, simulation {first.simulation}, step {first.failed}: held "
+                "from there on."
+            )
+        refused = refused_corrections(run.reasons)
+        notes += [f"{name}: {refused}"] if refused else []
     return notes
 
 
@@ -144,12 +134,15 @@ def _record(
 ) -> dict[str, Any]:
     import datetime
 
+    import torch
+
     from pdcorrect._environment import code_digest, environment
 
+    card = f", {torch.cuda.get_device_name(device)}" if device.startswith("cuda") else ""
     return {
         "date": datetime.date.today().isoformat(),
         "command": " ".join(["pdcorrect", *sys.argv[1:]]),
-        "environment": {**environment(), "device": _device(device)},
+        "environment": {**environment(), "device": device + card},
         "code_digest": code_digest(),
         "folder": folder,
         "batch": batch,
@@ -157,13 +150,6 @@ def _record(
         "models": {one.candidate.name: one.record() for one in saved},
         "notes": notes,
     }
-
-
-def _device(device: str) -> str:
-    import torch
-
-    kind = torch.device(device).type
-    return f"{device}, {torch.cuda.get_device_name(device)}" if kind == "cuda" else device
 
 
 def _draw(found: Evaluation, folder: Path) -> list[Path]:
@@ -176,10 +162,9 @@ def _draw(found: Evaluation, folder: Path) -> list[Path]:
     drawn = []
     errors = mean_errors(found)
     if errors:
-        frames = min(map(len, errors.values()))
+        frames = len(next(iter(errors.values())))
         times = np.linspace(0.0, found.time_step * (frames - 1), frames)
-        shortened = {name: values[:frames] for name, values in errors.items()}
-        drawn.append(plot_error_over_time(shortened, times, folder / "errors.png"))
+        drawn.append(plot_error_over_time(errors, times, folder / "errors.png"))
     omegas = {name: run.values("omega")[0] for name, run in found.runs.items()}
     shown = {n: x for n, x in omegas.items() if x and n not in (PLAIN, REFERENCE)}
     if shown:

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
-from pdcorrect.cli.common import Frames, SceneFile, check_models, say, tell_of_compiling
+from pdcorrect.cli.common import (
+    Frames,
+    SceneFile,
+    check_models,
+    progress_bar,
+    say,
+    tell_of_compiling,
+)
 from pdcorrect.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,23 +76,27 @@ def simulate(
     if resume and overwrite:
         raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
     check_models([] if model is None else [model], gate)
-    if model is not None:
-        _check_corrected(model, solver, refine)
+    if model is not None and (learned or refine != 1 or solver is not SolverName.pd):
+        raise InputError(
+            f"--model {model} with --refine {refine} --solver {solver}{' --learned' * learned}: a "
+            "corrector is for projective dynamics on the coarse mesh and model that it was trained "
+            "on: expected --refine 1, --solver pd and no --learned."
+        )
     loaded = Scene.load(scene)
-    if learned:
-        loaded = _learned(loaded, model)
     if vtu:
         make_folder(vtu)
     tell_of_compiling()
-    stepper = _make_stepper(loaded, solver, refine, model, gate)
-    say(_told_of_model(stepper))
+    stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
+    origin = getattr(stepper, "origin", None)
+    if origin:
+        say("model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
+            .format(**origin))  # fmt: skip
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     log = _run(stepper, count, output, earlier, overwrite)
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
-        _corrections(log.arrays(), getattr(stepper, "trained_step", ""))
         say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
@@ -98,63 +109,19 @@ def simulate(
         say(_estimated(load_trajectory(output)))
 
 
-def _estimated(run: Trajectory) -> str:
-    """The estimated error of a run, over all nodes and frames."""
-    import numpy as np
-
-    from pdcorrect.cli.common import progress_bar
-    from pdcorrect.evaluation.error_estimate import error_estimate
-    from pdcorrect.metrics import rms_error
-
-    with progress_bar() as progress:
-        task = progress.add_task("finer run", total=len(run))
-        found = error_estimate(run, on_step=lambda *_: progress.advance(task))
-    rest = np.broadcast_to(run.points, run.positions.shape)
-    error, size = 1e3 * np.sqrt((found[1:] ** 2).mean()), 1e3 * rms_error(run, rest)
-    return f"estimated error {error:.3g} mm of {size:.3g} mm (RMS over nodes and frames)"
-
-
-def _learned(scene: Scene, model: str | None) -> Scene:
-    from pdcorrect.evaluation.comparison_cases import with_learned
-
-    if model is not None:
-        raise InputError(
-            f"--learned with --model {model}: expected one of them; a corrector is for the coarse "
-            "model that it was trained on."
-        )
-    return with_learned(scene)
-
-
-def _check_corrected(model: str, solver: SolverName, refine: int) -> None:
-    """Refuse what a corrector is not for."""
-    if refine != 1 or solver is not SolverName.pd:
-        raise InputError(
-            f"--model {model} with --refine {refine} --solver {solver}: a corrector is for "
-            "projective dynamics on the coarse mesh: expected --refine 1 and --solver pd."
-        )
-
-
 def _make_stepper(
-    scene: Scene, solver: SolverName, refine: int, model: str | None, gate: bool
+    scene: Scene, solver: SolverName, refine: int, learned: bool, model: str | None, gate: bool
 ) -> Stepper:
     if model is not None:
         from pdcorrect.corrector.hybrid import hybrid_of
 
         return hybrid_of(scene, model, gate=gate).prepare()
     from pdcorrect.evaluation.compare import make_stepper
+    from pdcorrect.evaluation.comparison_cases import with_learned
+    from pdcorrect.fem.problem import discretise
 
-    return make_stepper(scene, solver.value, refine)
-
-
-def _told_of_model(stepper: Stepper) -> str:
-    """Which model corrects; empty without one."""
-    about = getattr(stepper, "origin", None)
-    if not about:
-        return ""
-    return (
-        f"model {about['model']} on the base {about['base']}, trained on {about['dataset']} with "
-        f"{about['trained_integrator']}"
-    )
+    problem = discretise(with_learned(scene) if learned else scene, refine=refine)
+    return make_stepper(problem, solver.value)
 
 
 def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | None:
@@ -180,7 +147,6 @@ def _run(
     stepper: Stepper, count: int, output: Path, earlier: Trajectory | None, overwrite: bool
 ) -> StepLog:
     """Step to frame ``count`` and write each frame; an interruption ends the program."""
-    from pdcorrect.cli.common import progress_bar
     from pdcorrect.io.trajectory import TrajectoryWriter
     from pdcorrect.solvers.rollout import StepLog, continue_from, march, run_attributes
 
@@ -194,13 +160,12 @@ def _run(
     else:
         state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
         writer = TrajectoryWriter.resume(output, earlier)
-    with writer, progress_bar(hidden=done >= count) as progress:
-        task = progress.add_task(problem.scene.name, total=count, completed=done)
+    with writer, progress_bar(problem.scene.name, count, done) as advance:
         try:
             for result, elapsed in march(stepper, max(0, count - done), state=state):
                 writer.append(result, elapsed)
                 log.add(result, elapsed)
-                progress.advance(task)
+                advance()
         except (KeyboardInterrupt, Terminated) as stop:
             typer.echo(
                 f"stopped: {writer.steps} of {count} frames are in {output}; --resume continues",
@@ -212,59 +177,57 @@ def _run(
 
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
-    """Frames, time, iterations, residual, energy, inverted cells, and what solved them."""
-    from pdcorrect.evaluation.report import gained_energy, inverted_frames, three_digits
+    """Frames, time, iterations, energy, and what is unusual about a run."""
+    from pdcorrect.evaluation.report import three_digits
+    from pdcorrect.evaluation.report_notes import (
+        gained_energy,
+        inverted_frames,
+        refused_corrections,
+    )
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
+    element, correction = problem.element, problem.correction
+    if correction is not None and not correction.learned.all():
+        element += f", {int(correction.learned.sum())} of them learned"
     say(
         f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
-        f"and {len(problem.cells)} cells ({problem.element}, {problem.mass_rule} mass) in "
+        f"and {len(problem.cells)} cells ({element}, {problem.mass_rule} mass) in "
         f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
     )
-    say(", ".join(f"{k}: {v}" for k, v in _described(stepper).items()))
     say(
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
         f"{stats['iterations'].max()}; frames: {ends}"
     )
-    say(
-        f"worst residual {stats['residual'].max():.2g} N, worst estimated distance from the step's "
-        f"solution {stats['error_estimate'].max():.2g} m"
-    )
+    others = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
+    work = {"external_work": "work of the loads"}
+    work |= {name: text for name, text in others.items() if stats[name].any()}
     say(
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
-        f"{stats['kinetic_energy'][-1]:.4g} J; work of the loads "
-        f"over the run {stats['external_work'].sum():.4g} J{_other_work(stats)}"
+        f"{stats['kinetic_energy'][-1]:.4g} J; over the run "
+        + ", ".join(f"{text} {stats[name].sum():.4g} J" for name, text in work.items())
     )
     say(inverted_frames(stats, problem.scene.time.step))
     if problem.scene.time.integrator != "quasi-static":
         say(gained_energy(stats))
+    if "gate" in stats:
+        if not stats["refused"].all():
+            largest = 1e3 * stats["correction"].max()
+            say(f"corrections: at most {largest:.3g} mm of a node in a frame")
+        say(refused_corrections(stats["gate"]))
 
 
-def _described(stepper: Stepper) -> dict[str, str]:
-    """What a stepper says of itself, but for the model, which is told before the run."""
-    elsewhere = {*getattr(stepper, "origin", {}), "trained_step", "time_step_excess"}
-    told = {name: text for name, text in stepper.describe().items() if name not in elsewhere}
-    if told.get("gate", "none") != "none":
-        told["gate"] = "default"  # the program has no other
-    return told
+def _estimated(run: Trajectory) -> str:
+    """The estimated error of a run, over all nodes and frames."""
+    import numpy as np
 
+    from pdcorrect.evaluation.error_estimate import error_estimate
+    from pdcorrect.metrics import rms_error
 
-def _corrections(stats: dict[str, Any], trained_step: str) -> None:
-    """How large the corrections of a hybrid were, and which were refused and why."""
-    from pdcorrect.evaluation.report import refused_corrections
-
-    if "gate" not in stats:
-        return
-    if not stats["refused"].all():
-        say(f"corrections: at most {1e3 * stats['correction'].max():.3g} mm of a node in a frame")
-    say(refused_corrections(stats["gate"], trained_step))
-
-
-def _other_work(stats: dict[str, Any]) -> str:
-    """Work of moving clamps and loss to damping over a run, where there is any."""
-    named = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
-    sums = {text: stats[name].sum() for name, text in named.items() if stats[name].any()}
-    return "".join(f", {text} {total:.4g} J" for text, total in sums.items())
+    with progress_bar("finer run", len(run)) as advance:
+        found = error_estimate(run, on_step=advance)
+    rest = np.broadcast_to(run.points, run.positions.shape)
+    error, size = 1e3 * np.sqrt((found[1:] ** 2).mean()), 1e3 * rms_error(run, rest)
+    return f"estimated error {error:.3g} mm of {size:.3g} mm (RMS over nodes and frames)"

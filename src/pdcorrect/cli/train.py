@@ -148,7 +148,7 @@ def tune_element(
 ) -> None:
     """Tune the learned element to the body of one scene, in a minute (extra 'learn').
 
-    The scene then has the element hex8-learned and the file as weights, both in [solver].
+    The scene then has the element hex8-learned and the file as weights, both in its table solver.
     """
     from pdcorrect.elements.tuning import tune
     from pdcorrect.fem.problem import discretise
@@ -160,11 +160,14 @@ def tune_element(
     tell_of_compiling()
     problem = discretise(learned_coarse(loaded))
     found = tune(problem, output, iterations=iterations, seed=seed, report=typer.echo)
-    for name in ("displacements", "frequencies"):
+    names = "displacements", "frequencies"
+    for name in names:
         without, before, after = (100.0 * errors[name] for errors in found)
         typer.echo(
             f"{name}: {without:.2f} % off without learning, {before:.2f} % before, "
             f"{after:.2f} % now"
         )
+    if all(found.after[name] >= found.before[name] for name in names):
+        typer.echo("neither has fallen: compare both weights with the converged motion", err=True)
     told = os.path.relpath(output, scene.parent)  # as the scene's paths are
     typer.echo(f'wrote {output}; [solver] element = "hex8-learned", weights = "{told}"')

@@ -23,7 +23,7 @@ from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrected_step import corrected_step
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import FeatureView
-from pdcorrect.corrector.gate import PAUSE, Gate, GateMeasures, check_gate, steps_left
+from pdcorrect.corrector.gate import Gate, GateMeasures, check_gate
 from pdcorrect.corrector.graph_replay import (
     UNRECORDABLE,
     RecordedCorrector,
@@ -223,15 +223,12 @@ class BatchHybridResult:
         loads where they count.  Steps that converged to inverted cells are corrected like others.
     reasons : (B,) int64 tensor
         Numbers of `Reason`: why the plain coarse answer was kept; 0 where it was not.
-    factors : (B,) tensor
-        On the network's correction, less than 1 where a gate limited it.
     """
 
     state: BatchState
     correction: Tensor
     coarse: BatchResult
     reasons: Tensor
-    factors: Tensor
 
     @property
     def refused(self) -> Tensor:
@@ -278,12 +275,12 @@ class BatchHybrid(WithNodes):
     ) -> None:
         self._hybrid = BatchParts(stepper, corrector, velocity, recorded)
         self.stepper, self.corrector, self.gate = stepper, corrector, gate
-        check_gate(gate, corrector)
+        check_gate(gate)
         self._recorded: RecordedCorrector | None = None
         if recorded:
             if not recordable(corrector):
                 raise InputError(UNRECORDABLE)
-            self._recorded = RecordedCorrector(corrector, None if gate is None else gate.margin)
+            self._recorded = RecordedCorrector(corrector)
 
     @torch.no_grad()
     def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
@@ -292,7 +289,6 @@ class BatchHybrid(WithNodes):
         Parameters
         ----------
         state : BatchState
-            Its memory, too, is what the result's was: a gate that is shut keeps its count there.
         previous : (n, 3) tensor, optional
             Correction of the step before, m, for networks that ask for it; zero by default.
 
@@ -302,25 +298,11 @@ class BatchHybrid(WithNodes):
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
         check_state(self.stepper.cells, state)
-        left = steps_left(self.gate, state.memory)
         with self.stepper.alone():
-            step = BatchCoarseStep(self._hybrid, _open(state), previous)
+            step = BatchCoarseStep(self._hybrid, state, previous)
             answers = self.corrector if self._recorded is None else self._recorded
-            answer, coarse, decision = corrected_step(step, answers, self.gate, left)
-        after = answer.state
-        if self.gate is not None:
-            after = self._shut(after, self.gate.steps_shut(decision.reasons, left))
-        return BatchHybridResult(
-            after, decision.correction, coarse, decision.reasons, decision.factors
-        )
-
-    def _shut(self, state: BatchState, steps: Tensor) -> BatchState:
-        """The state with what it has to remember if the gate stays shut for steps (B,)."""
-        if not steps.any():
-            return state
-        own = self.stepper.node_mask[..., None].expand_as(state.positions)
-        kept = own * steps[:, None, None].to(state.positions.dtype)
-        return replace(state, memory={**state.memory, PAUSE: kept})
+            answer, coarse, decision = corrected_step(step, answers, self.gate)
+        return BatchHybridResult(answer.state, decision.correction, coarse, decision.reasons)
 
 
 class HybridLayer(WithNodes, nn.Module):
@@ -499,10 +481,3 @@ def _without_derivatives(x: Tensor | None, where: Tensor) -> None:
     """Make a tensor of a graph that exists already pass no derivatives back in some places."""
     if x is not None and x.requires_grad:
         x.register_hook(lambda grad: torch.where(where, 0.0, grad))  # type: ignore[no-untyped-call]
-
-
-def _open(state: BatchState) -> BatchState:
-    """The state without what it remembers of a gate, of which coarse steppers know nothing."""
-    if PAUSE not in state.memory:
-        return state
-    return replace(state, memory={name: x for name, x in state.memory.items() if name != PAUSE})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,34 +21,7 @@ from pdcorrect.corrector.frames import (
 from pdcorrect.corrector.shapes import shape_measures
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import mesh_edges, node_means
-from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
 from pdcorrect.fem.problem import Problem
-
-
-def corner_jacobians(positions: Tensor, cells: Tensor) -> Tensor:
-    """`pdcorrect.fem.hexahedron.corner_jacobians` of tensors: (c, 8), m3."""
-    corners = positions.index_select(0, cells.reshape(-1)).reshape(*cells.shape, 3)
-    slopes = _slopes(positions.dtype, positions.device) @ corners
-    a, b, c = slopes.reshape(len(cells), 3, -1, 3).unbind(dim=1)
-    return (a * torch.linalg.cross(b, c)).sum(dim=2)
-
-
-@cache
-def _slopes(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Shape functions' derivatives at the corners, (24, 8)."""
-    with torch.inference_mode(False):
-        derivatives = shape_derivatives(VTK_CORNERS.astype(float)).reshape(-1, len(VTK_CORNERS))
-        return torch.as_tensor(derivatives, dtype=dtype, device=device)
-
-
-def least_by_body(ratios: Tensor, cells: Tensor, graph: Tensor, bodies: int) -> Tensor:
-    """The least of values (c, 8) of each body's cells, (B,); infinite without any.
-
-    What is not a number stays so.
-    """
-    owner = graph.index_select(0, cells[:, 0])
-    least = ratios.amin(dim=1)
-    return least.new_full((bodies,), torch.inf).scatter_reduce(0, owner, least, "amin")
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,20 +173,6 @@ class BodyGraph:
             found = shape_measures(*(part.detach().cpu().numpy() for part in exact))
             return torch.as_tensor(found).to(self.rest)
 
-    @cached_property
-    def rest_corners(self) -> Tensor:
-        """Determinants of the cells' trilinear maps at their corners at rest, (c, 8), m3."""
-        with torch.inference_mode(False):
-            return corner_jacobians(self.rest, self.cells)
-
-    def least_corners(self, positions: Tensor) -> Tensor:
-        """Least det F at the corners of each body's cells at positions (n, 3), m: (B,).
-
-        See `pdcorrect.fem.elastic_body.ElasticBody.corner_volume_ratios`.
-        """
-        ratios = corner_jacobians(positions, self.cells) / self.rest_corners
-        return least_by_body(ratios, self.cells, self.graph, self.bodies)
-
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""
         return values.index_select(0, self.graph)
@@ -253,7 +212,7 @@ class BodyGraph:
             self, mass=mass.to(self.rest), young=mean(young), poisson=mean(poisson),
             density=mean(density),
         )  # fmt: skip
-        known = {name: vars(self)[name] for name in (*KNOWN, *KNOWN_TO_GATES) if name in vars(self)}
+        known = {name: vars(self)[name] for name in (*KNOWN, "shapes") if name in vars(self)}
         vars(found).update(known)
         return found
 
@@ -273,9 +232,6 @@ REST_OF_EDGES = ("rest_edges", "rest_turns")
 REST_OF_CELLS = ("rest_inverses",)
 KNOWN = (*REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS, "node_counts")
 """What a graph computes of its bodies at rest once for a network, when first asked for."""
-
-KNOWN_TO_GATES = ("shapes", "rest_corners")
-"""The same for a gate."""
 
 _NODAL = ("rest", "free", "mass", "young", "poisson", "density")
 

@@ -23,7 +23,6 @@ from pdcorrect.corrector.compiled_features import (
     KNOWN_OF_EDGES,
     KNOWN_OF_NODES,
     CompiledFeatures,
-    largest_excess,
 )
 from pdcorrect.corrector.compiled_network import CompiledNetwork, Groups
 from pdcorrect.corrector.corrector import Corrector, without_momentum
@@ -128,7 +127,6 @@ class CompiledCorrector:
             corrector, self._bodies, self._groups, self.network.x, self.network.e
         )
         self._output_scale = float(corrector.normaliser.output_scale)
-        self._beyond = corrector.time_step_excess(self._bodies)
         self._view: FeatureView | None = None
 
     def of_view(self, view: FeatureView) -> Tensor:
@@ -141,43 +139,22 @@ class CompiledCorrector:
         found = torch.from_numpy(answer)
         return without_momentum(view, found) if self.config.momentum_neutral else found
 
-    def outside(self, view: FeatureView, margin: float) -> Array:
-        """See `Corrector.outside`."""
-        excess = self._known(view).excess
-        beyond = len(excess) - np.count_nonzero(excess <= margin)
-        return np.array([beyond / len(excess)])
+    def rest_score(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.rest_score`."""
+        return self._corrector.rest_score(bodies)
 
-    def unlike(self, view: FeatureView) -> Array:
-        """See `Corrector.unlike`."""
-        return np.array([self._known(view).strangeness()])
-
-    def least_corners(self, view: FeatureView) -> Array:
-        """See `Corrector.least_corners`."""
-        found: Array = self._corrector.least_corners(view).detach().numpy()
-        return found
-
-    def shape_excess(self, bodies: BodyGraph) -> Array:
-        """See `Corrector.shape_excess`."""
-        normaliser = self._corrector.normaliser
-        low, high = normaliser.shape_low.numpy(), normaliser.shape_high.numpy()
-        return np.array([largest_excess(bodies.shapes.numpy()[0], low, high)])
-
-    def time_step_excess(self, bodies: BodyGraph) -> Array:
-        """See `Corrector.time_step_excess`."""
-        self._follow()
-        same = bodies is self._bodies
-        found: Array = (self._beyond if same else self._corrector.time_step_excess(bodies)).numpy()
-        return found.copy()
+    def score(self, view: FeatureView) -> Tensor:
+        """See `Corrector.score`."""
+        if view is not self._view:
+            self._follow()
+        features = self._seen(view)
+        averages = torch.from_numpy(features.averages)[None]
+        excess = torch.from_numpy(features.excess)
+        return self._corrector.envelope.score(self._bodies, excess, averages)
 
     def _follow(self) -> None:
         if self._contents.changed:
             self.refresh()
-
-    def _known(self, view: FeatureView) -> CompiledFeatures:
-        """The features of a view; if it is not the last one by the corrector as it is now."""
-        if view is not self._view:
-            self._follow()
-        return self._seen(view)
 
     def _seen(self, view: FeatureView) -> CompiledFeatures:
         """The features of a view, computed when it is first seen."""

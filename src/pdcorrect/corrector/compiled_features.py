@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from numba import njit, prange
 from numpy.typing import NDArray
-from torch import Tensor
 
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled_network import GROUP, Groups
@@ -27,7 +26,6 @@ from pdcorrect.corrector.features import (
     Snapshot,
 )
 from pdcorrect.corrector.frames import EDGE_MEANS, rotations
-from pdcorrect.corrector.normaliser import EXTREME
 from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.kernels import PARALLEL
 
@@ -90,14 +88,6 @@ class CompiledFeatures:
         self._turns = np.zeros((n, 3, 3))
         self._strain, self._squares = np.zeros((n, 3, 3)), np.zeros(n)
         self._still = np.zeros((n, 3))
-        normaliser = corrector.normaliser
-        self._averages = tuple(
-            part.numpy().copy()
-            for part in (
-                normaliser.average_mean, normaliser.average_deviation, normaliser.average_low,
-                normaliser.average_high,
-            )
-        )  # fmt: skip
         self._clip = math.inf if corrector.config.clip is None else corrector.config.clip
         still = FeatureView(bodies, Snapshot(*[torch.zeros_like(bodies.rest)] * 4))
         config = corrector.config
@@ -138,9 +128,11 @@ class CompiledFeatures:
             self.excess,
         )  # fmt: skip
 
-    def strangeness(self) -> float:
-        """See `Normaliser.strangeness`: the largest of the body's mean inputs."""
-        return float(_strangeness(self._x, len(self.excess), *self._averages))
+    @property
+    def averages(self) -> Array:
+        """Means (a,) over the nodes of what the network sees of them."""
+        found: Array = self._x[: len(self.excess)].mean(axis=0, dtype=np.float64)
+        return found
 
 
 def _columns(
@@ -148,17 +140,19 @@ def _columns(
 ) -> tuple[Array, Array]:
     """Of the components that change: number among all and column, and a row for each of them.
 
-    The rows (k, 6) are those of `Scale`.
+    The rows (k, 6) are mean, deviation, range and the units of what is below and above it.
     """
-    places, rows, column = [], [np.zeros((0, 6))], 0
+    scales = corrector.normaliser.rows(names)
+    rows = torch.stack([*scales, *corrector.envelope.limits(names, *scales)], dim=1).numpy()
+    table, column = {**NODE_FEATURES, **EDGE_FEATURES}, 0
+    places: list[tuple[int, int]] = []
     for name in names:
-        scale = corrector.normaliser.scale(name)
-        width = len(scale.mean)
+        width = table[name][0]
         if name in parts:
             places += [(parts[name] + k, column + k) for k in range(width)]
-            rows.append(np.stack([part.numpy() for part in scale], axis=1))
         column += width
-    return np.array(places, dtype=np.int64).reshape(-1, 2), np.concatenate(rows)
+    found = np.array(places, dtype=np.int64).reshape(-1, 2)
+    return found, rows[found[:, 1]]
 
 
 def _at_rest(
@@ -173,14 +167,10 @@ def _at_rest(
             columns = np.arange(column, column + width)
             normalised = corrector.normaliser.joined(values, corrector.config.clip)
             found.append((columns, normalised.numpy()))
-            excess = torch.maximum(excess, _largest(corrector.normaliser.excess(values)))
+            excess = torch.maximum(excess, corrector.excess(values))
         column += width
     rows = view.bodies.edge_index.shape[1] if table is EDGE_FEATURES else len(view.bodies.rest)
     return found, excess.expand(rows).numpy().astype(float)
-
-
-def _largest(excess: Tensor) -> Tensor:
-    return torch.where(excess.isnan(), math.inf, excess).amax(dim=1)
 
 
 @njit(**PARALLEL)
@@ -268,35 +258,6 @@ def _features(  # type: ignore[no-untyped-def]
                     of_edge[6 + j] = (0.5 * turn - rest_turns[edge, j]) / scale
                 worst = max(worst, _write(of_edge, edge_places, edge_scales, clip, e[edge]))
             excess[n] = worst
-
-
-@njit(**OPTIONS)
-def _strangeness(x, count, mean, deviation, low, high):  # type: ignore[no-untyped-def]
-    """`Normaliser.strangeness` of the means over ``count`` rows of x, the largest."""
-    means, worst = np.zeros(x.shape[1]), 0.0
-    for n in range(count):
-        for k in range(len(means)):
-            means[k] += x[n, k]
-    for k in range(len(means)):
-        average = means[k] / count
-        farthest = mean[k] - low[k] if average < mean[k] else high[k] - mean[k]
-        farthest /= EXTREME
-        unit = deviation[k] if deviation[k] > farthest else farthest
-        found = abs(average - mean[k]) / unit
-        if not found <= worst:
-            worst = found if found == found else np.inf
-    return worst
-
-
-@njit(**OPTIONS)
-def largest_excess(values, low, high):  # type: ignore[no-untyped-def]
-    """How far numbers (k,) lie outside a range at most; infinite where one is not a number."""
-    worst = 0.0
-    for k in range(len(values)):
-        for outside in (low[k] - values[k], values[k] - high[k]):
-            if not outside <= worst:
-                worst = outside if outside == outside else np.inf
-    return worst
 
 
 @njit(inline="always", **OPTIONS)

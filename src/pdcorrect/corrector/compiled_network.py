@@ -13,11 +13,14 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pdcorrect.corrector.matrix_products import EPSILON, ROWS, filled_up, normalise, product, strips
+from pdcorrect.corrector.matrix_products import ROWS, filled_up, product, strips
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.fem.kernels import PARALLEL, REDUCE
 
 Array = NDArray[Any]
+
+_EPSILON = 1e-5
+"""LayerNorm's, as torch has it by default."""
 
 GROUP = 16
 """Nodes that one thread takes at a time; a multiple of `ROWS`."""
@@ -168,9 +171,6 @@ def _normalise(x, width, norm):  # type: ignore[no-untyped-def]
     kind = x.dtype.type
     if not norm.shape[0]:
         return
-    if width == x.shape[1]:
-        normalise(x, norm)
-        return
     for row in range(x.shape[0]):
         line = x[row]
         mean, variance = kind(0.0), kind(0.0)
@@ -179,7 +179,7 @@ def _normalise(x, width, norm):  # type: ignore[no-untyped-def]
         mean = kind(mean / width)
         for k in range(width):
             variance += (line[k] - mean) * (line[k] - mean)
-        scale = kind(1.0 / np.sqrt(variance / width + EPSILON))
+        scale = kind(1.0 / np.sqrt(variance / width + _EPSILON))
         for k in range(width):
             line[k] = (line[k] - mean) * scale * norm[0, k] + norm[1, k]
 

@@ -16,19 +16,12 @@ from pdcorrect.corrector.features import FeatureView
 from pdcorrect.corrector.gate import Gate, GateMeasures, Reason
 from pdcorrect.corrector.placements import Values, filled, where
 
-_HALVINGS = 6
-"""How often a limited correction is halved before it is refused."""
-
 Answer = TypeVar("Answer")
 """A coarse solver's result of a step of B scenes."""
 
 
 class Bodies(Protocol):
     """What a decision asks about B bodies with n nodes in all."""
-
-    @property
-    def cell_size(self) -> Values:
-        """(B,), m."""
 
     def by_node(self, values: Values) -> Values:
         """Values (B,) of bodies at their nodes: (n,), or (1,) of one body."""
@@ -77,144 +70,94 @@ class CoarseStep(Protocol[Answer]):
 
 @dataclass(frozen=True, eq=False)
 class Decision:
-    """A network's corrections of B bodies with n nodes in all, and what became of them.
+    """A network's corrections of B bodies with n nodes in all, and which of them count.
 
     Attributes
     ----------
     bodies : Bodies
-    asked : (n, 3)
-        What the network gave, m; zero where that is not finite, or the body, its time step or
-        its inputs are unknown.
+    correction : (n, 3)
+        As applied, m; zero where it was refused.
     reasons : (B,) int64
         Numbers of `Reason`.
-    factors : (B,)
-        On what it gave, below 1 where a gate limited it.
     """
 
     bodies: Bodies
-    asked: Values
+    correction: Values
     reasons: Values
-    factors: Values
 
     @classmethod
     def of(
         cls, step: CoarseStep[Answer], view: FeatureView, corrector: Answers, gate: Gate | None
     ) -> Decision:
         """Ask the network, if a gate lets it see one of the scenes."""
-        bodies, factors = step.bodies, filled(step.bodies.cell_size, 1.0)
-        foreign: Values = int(Reason.NONE)
-        if gate is not None:
-            foreign = step.own(gate.foreign(corrector, view.bodies))
-            if foreign.all():
+        bound = None if gate is None else gate.outside
+        if bound is not None:
+            outside = step.own(corrector.rest_score(view.bodies) > bound)
+            if outside.all():
                 nothing = filled(step.own(view.snapshot.proposed), 0.0)
-                return cls(bodies, nothing, foreign, factors)
+                return cls(step.bodies, nothing, where(outside, int(Reason.OUTSIDE), 0))
         asked = step.own(corrector.of_view(view))
-        reasons = where(bodies.sound(asked), int(Reason.NONE), int(Reason.NOT_FINITE))
-        if gate is not None:
-            unknown = step.own(gate.unknown(corrector, view)) & (reasons == 0)
-            reasons = where(unknown, int(Reason.FEATURES), reasons)
-            folded = step.own(gate.folded(corrector, view)) & (reasons == 0)
-            reasons = where(folded, int(Reason.FOLDED), reasons)
-            reasons = where(foreign > 0, foreign, reasons)
-        asked = where(bodies.by_node(reasons == 0)[:, None], asked, 0.0)
-        return cls(bodies, asked, reasons, factors)
+        reasons = where(step.bodies.sound(asked), int(Reason.NONE), int(Reason.NOT_FINITE))
+        if bound is not None:
+            outside = step.own(corrector.score(view) > bound)
+            reasons = where(outside, int(Reason.OUTSIDE), reasons)
+        return cls(step.bodies, asked, reasons)._without_refused()
 
     @cached_property
     def counts(self) -> Values:
         """Whether a body's correction is applied and not zero, (B,): else nothing changes."""
-        return (self.reasons == 0) & self.bodies.some(self.asked != 0.0)
-
-    @property
-    def correction(self) -> Values:
-        """As applied, (n, 3), m; zero where it was refused."""
-        return self.scaled(where(self.reasons == 0, self.factors, 0.0))
-
-    def scaled(self, factors: Values) -> Values:
-        """What the network gave times (B,)."""
-        return self.asked * self.bodies.by_node(factors)[:, None]
+        return self.bodies.some(self.correction != 0.0)
 
     def refused(self, reasons: Values) -> Decision:
         """With reasons (B,) that were found for corrections that count."""
-        return replace(self, reasons=where(self.counts, reasons, self.reasons))
+        found = where(self.counts, reasons, self.reasons)
+        return replace(self, reasons=found)._without_refused()
 
-    def paused(self, left: Values | None) -> Decision:
-        """With those refused that would pass while the gate is shut, for (B,) steps more."""
-        if left is None:
-            return self
-        shut = (left > 0) & (self.reasons == 0)
-        return replace(self, reasons=where(shut, int(Reason.PAUSE), self.reasons))
-
-    def failed_in_pause(self, ok: Values) -> Decision:
-        """With the solver's reason where a step (B,) failed while the gate was shut."""
-        failed = (self.reasons == Reason.PAUSE) & ~ok
-        return replace(self, reasons=where(failed, int(Reason.SOLVER), self.reasons))
-
-    def judged(
-        self, gate: Gate, step: CoarseStep[Answer], coarse: Answer
-    ) -> tuple[Decision, Answer]:
-        """Refused, or limited, by what corrected answers are beside the coarse one.
-
-        Second: the answer with all corrections that are left, and others that do not count.
-        """
-        factors, beside = self.factors, step.measured(coarse)
-        moved = step.moved(coarse, self.scaled(factors))
-        reasons = gate.reasons(step.measured(moved), beside, gate.energy)
-        for _ in range(_HALVINGS if gate.limit else 0):
-            failed = self.counts & (reasons > 0)
-            if not failed.any():
-                break
-            factors = where(failed, 0.5 * factors, factors)
-            moved = step.moved(coarse, self.scaled(factors))
-            reasons = gate.reasons(step.measured(moved), beside, gate.energy)
-        return replace(self.refused(reasons), factors=factors), moved
+    def _without_refused(self) -> Decision:
+        passed = self.bodies.by_node(self.reasons == Reason.NONE)[:, None]
+        return replace(self, correction=where(passed, self.correction, 0.0))
 
 
 def corrected_step(
-    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None, left: Values | None = None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     """The answer of a corrected step, the coarse solver's, and the decision.
-
-    ``left`` (B,) is for how many steps more the gate is shut; None where it is open.
 
     Scenes whose correction is zero or refused have the plain coarse answer bit for bit.  With
     placement "state" the coarse solver's is always that; else it is the answer itself.
     """
-    if corrector.config.placement == "state":
-        return _state(step, corrector, gate, left)
+    placement = corrector.config.placement
+    if placement == "state":
+        return _state(step, corrector, gate)
     view = step.view(None)
     decision = Decision.of(step, view, corrector, gate)
-    if corrector.config.placement == "guess":
-        decision = decision.paused(left)
     if not decision.counts.any():
-        answer, decision = step.solved(), decision.paused(left)
-    elif corrector.config.placement == "force":
-        answer, decision = _force(step, decision, gate, left)
+        answer = step.solved()
+    elif placement == "force":
+        answer, decision = _force(step, decision, gate)
     else:
         answer, decision = _guess(step, decision, step.own(view.snapshot.proposed))
-    if left is not None:
-        decision = decision.failed_in_pause(step.ok(answer))
     return answer, answer, decision
 
 
 def _state(
-    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None, left: Values | None
+    step: CoarseStep[Answer], corrector: Answers, gate: Gate | None
 ) -> tuple[Answer, Answer, Decision]:
     coarse = step.solved()
     decision = Decision.of(step, step.view(coarse), corrector, gate)
-    reasons = where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
-    decision = replace(decision, reasons=reasons)
+    failed = where(step.ok(coarse), decision.reasons, int(Reason.SOLVER))
+    decision = replace(decision, reasons=failed)._without_refused()
     if not decision.counts.any():
-        return coarse, coarse, decision.paused(left)
+        return coarse, coarse, decision
+    moved = step.moved(coarse, decision.correction)
     if gate is not None and gate.judges:
-        decision, moved = decision.judged(gate, step, coarse)
-    else:
-        moved = step.moved(coarse, decision.correction)
-    decision = decision.paused(left)
+        found = gate.reasons(step.measured(moved), step.measured(coarse), gate.energy)
+        decision = decision.refused(found)
     return step.chosen(decision.counts, moved, coarse), coarse, decision
 
 
 def _force(
-    step: CoarseStep[Answer], decision: Decision, gate: Gate | None, left: Values | None
+    step: CoarseStep[Answer], decision: Decision, gate: Gate | None
 ) -> tuple[Answer, Decision]:
     forced = step.solved(added=decision.correction)
     ok, measured = step.ok(forced), None
@@ -225,15 +168,14 @@ def _force(
         found = filled(reasons, int(Reason.ENERGY))
         found = found if before is None else gate.reasons(measured, before, rise)
         reasons = where(ok, found, reasons)
-    unused = reasons > 0 if left is None else (reasons > 0) | (left > 0)
-    if not (decision.counts & unused).any():
-        return forced, decision.paused(left)
+    if not (decision.counts & (reasons > 0)).any():
+        return forced, decision
     plain = step.solved()
     if gate is not None and measured is not None:
         found = gate.reasons(measured, step.measured(plain), gate.energy)
         found = where(step.ok(plain), found, int(Reason.SOLVER))
         reasons = where(ok & (reasons > 0), found, reasons)
-    decision = decision.refused(reasons).paused(left)
+    decision = decision.refused(reasons)
     return step.chosen(decision.counts, forced, plain), decision
 
 
@@ -241,10 +183,9 @@ def _guess(
     step: CoarseStep[Answer], decision: Decision, proposed: Values
 ) -> tuple[Answer, Decision]:
     at_nodes = decision.bodies.by_node(decision.counts)[:, None]
-    guess = where(at_nodes, proposed + decision.correction, math.nan)
-    guessed = step.solved(guess=guess)
-    failed = decision.counts & ~step.ok(guessed)
-    if not failed.any():
+    guessed = step.solved(guess=where(at_nodes, proposed + decision.correction, math.nan))
+    ok = step.ok(guessed)
+    if not (decision.counts & ~ok).any():
         return guessed, decision
-    decision = decision.refused(where(failed, int(Reason.SOLVER), int(Reason.NONE)))
+    decision = decision.refused(where(ok, int(Reason.NONE), int(Reason.SOLVER)))
     return step.chosen(decision.counts, guessed, step.solved()), decision

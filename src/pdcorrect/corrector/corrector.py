@@ -11,17 +11,11 @@ from torch import Tensor, nn
 from pdcorrect.corrector import features
 from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.features import (
-    EDGE_FEATURES,
-    NODE_FEATURES,
-    Feature,
-    FeatureView,
-    Snapshot,
-)
+from pdcorrect.corrector.envelope import Envelope
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.normaliser import Normaliser
-from pdcorrect.corrector.placements import Values
 
 
 class Answers(Protocol):
@@ -34,20 +28,11 @@ class Answers(Protocol):
     def of_view(self, view: FeatureView) -> Tensor:
         """Corrections (n, 3), m."""
 
-    def outside(self, view: FeatureView, margin: float) -> Values:
-        """Share of each body's nodes with inputs beyond a margin, (B,)."""
+    def rest_score(self, bodies: BodyGraph) -> Tensor:
+        """See `pdcorrect.corrector.envelope.Envelope.rest_score`, (B,)."""
 
-    def unlike(self, view: FeatureView) -> Values:
-        """How far each body's mean inputs are from those of training bodies, (B,)."""
-
-    def least_corners(self, view: FeatureView) -> Values:
-        """Least det F at corners of each body's cells after the step, (B,)."""
-
-    def shape_excess(self, bodies: BodyGraph) -> Values:
-        """How far measures of each body at rest lie outside their range in training, (B,)."""
-
-    def time_step_excess(self, bodies: BodyGraph) -> Values:
-        """How far each time step over cell size lies outside its range in training, (B,)."""
+    def score(self, view: FeatureView) -> Tensor:
+        """Out-of-distribution score of a step of each body, (B,)."""
 
 
 class Corrector(nn.Module):
@@ -63,7 +48,8 @@ class Corrector(nn.Module):
     Attributes
     ----------
     normaliser : Normaliser
-        To be fitted before the first call; see `pdcorrect.training.fitting`.
+    envelope : Envelope
+        Both to be fitted before the first call; see `pdcorrect.training.fitting`.
     network : MeshGraphNetwork
     """
 
@@ -72,7 +58,7 @@ class Corrector(nn.Module):
         self.config = config
         nodes = {name: NODE_FEATURES[name][0] for name in config.node_features}
         edges = {name: EDGE_FEATURES[name][0] for name in config.edge_features}
-        self.normaliser = Normaliser(nodes, edges)
+        self.normaliser, self.envelope = Normaliser(nodes, edges), Envelope(nodes, edges)
         self.network = MeshGraphNetwork(
             sum(nodes.values()), sum(edges.values()), layers=config.layers, width=config.width,
             mlp_layers=config.mlp_layers, norm=config.norm, shared=config.shared,
@@ -99,50 +85,25 @@ class Corrector(nn.Module):
         joined = self.normaliser.joined
         return joined(nodes, config.clip), joined(edges, config.clip)
 
-    def outside(self, view: FeatureView, margin: float) -> Tensor:
-        """Share of each body's nodes with inputs, or an edge with inputs, beyond a margin, (B,).
+    def rest_score(self, bodies: BodyGraph) -> Tensor:
+        """Out-of-distribution score of bodies at rest and their time steps, (B,)."""
+        return self.envelope.rest_score(bodies)
 
-        The margin is in the unit of `Normaliser.excess`, outside the range of the training data.
-        """
-        bodies, config = view.bodies, self.config
+    def score(self, view: FeatureView) -> Tensor:
+        """Out-of-distribution score of a step of each body, (B,), see `Envelope`."""
+        config, bodies = self.config, view.bodies
+        found = features.values(EDGE_FEATURES, config.edge_features, view)
+        edges, receiver = self.excess(found), view.receiver
+        found = features.values(NODE_FEATURES, config.node_features, view)
+        excess = self.excess(found).scatter_reduce(0, receiver, edges, "amax")
+        averages = bodies.body_means(self.normaliser.joined(found, config.clip))
+        return self.envelope.score(bodies, excess, averages)
 
-        def beyond(table: dict[str, Feature], names: tuple[str, ...]) -> Tensor:
-            excess = self.normaliser.excess(features.values(table, names, view))
-            return ~(excess <= margin).all(dim=1)
-
-        nodes = beyond(NODE_FEATURES, config.node_features)
-        edges = beyond(EDGE_FEATURES, config.edge_features)
-        counts = torch.zeros_like(bodies.mass).index_add(0, view.receiver, edges.to(bodies.mass))
-        nodes |= counts > 0.0
-        return bodies.body_means(nodes.to(bodies.mass))
-
-    def unlike(self, view: FeatureView) -> Tensor:
-        """How far the mean inputs of each body's nodes are from those of training bodies, (B,).
-
-        The largest of all components, see `Normaliser.strangeness`.
-        """
-        config = self.config
-        nodes = features.values(NODE_FEATURES, config.node_features, view)
-        averages = view.bodies.body_means(self.normaliser.joined(nodes, config.clip))
-        return self.normaliser.strangeness(averages).amax(dim=1)
-
-    def least_corners(self, view: FeatureView) -> Tensor:
-        """Least det F at corners of each body's cells after the step, (B,)."""
-        return view.bodies.least_corners(view.snapshot.proposed)
-
-    def shape_excess(self, bodies: BodyGraph) -> Tensor:
-        """How far measures of each body at rest lie outside their range in training, (B,).
-
-        The largest of all, dimensionless, see `shape_measures`; most are logarithms.
-        """
-        return self.normaliser.shape_excess(bodies.shapes).amax(dim=1)
-
-    def time_step_excess(self, bodies: BodyGraph) -> Tensor:
-        """How far each time step over cell size lies outside its range in training, (B,).
-
-        Of its logarithm, dimensionless, see `Normaliser.time_step_excess`.
-        """
-        return self.normaliser.time_step_excess(bodies.time_steps)
+    def excess(self, found: dict[str, Tensor]) -> Tensor:
+        """How far some features (m, k) are outside, (m,): the largest of `Envelope.excess`."""
+        x, names = torch.cat(list(found.values()), dim=1), tuple(found)
+        scales = (row.to(x) for row in self.normaliser.rows(names))
+        return self.envelope.excess(names, x, *scales).amax(dim=1)
 
     def in_metres(self, view: FeatureView, x: Tensor) -> Tensor:
         """The network's output (n, 3) as a correction."""

@@ -21,7 +21,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from pdcorrect.batch.gpu import as_kernel
+from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
@@ -80,8 +80,7 @@ def product(A: Tensor, B: Tensor) -> Tensor:
     Libraries treat such matrices on a GPU as if they were large: see `unrolled_products`.
     """
     if A.is_cuda and _unrolled.get():
-        quick: Tensor = as_kernel(_product, True)(A.contiguous(), B.contiguous())
-        return quick
+        return _product(A.contiguous(), B.contiguous())
     return A @ B
 
 
@@ -102,6 +101,7 @@ def unrolled_products() -> Iterator[None]:
 _unrolled: ContextVar[bool] = ContextVar("unrolled", default=False)
 
 
+@one_kernel
 def _product(A: Tensor, B: Tensor) -> Tensor:
     first, second, third = (A[:, :, i, None] * B[:, i, None] for i in range(3))
     return first + second + third

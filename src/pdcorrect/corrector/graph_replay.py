@@ -55,8 +55,6 @@ class RecordedCorrector:
     ----------
     corrector : Corrector
         One that `recordable` accepts.
-    margin : float or None
-        Of `outside`; others are computed apart.
 
     Attributes
     ----------
@@ -69,9 +67,8 @@ class RecordedCorrector:
 
     config: CorrectorConfig
 
-    def __init__(self, corrector: Corrector, margin: float | None) -> None:
-        self._corrector, self._margin = corrector, margin
-        self.config = corrector.config
+    def __init__(self, corrector: Corrector) -> None:
+        self._corrector, self.config = corrector, corrector.config
         self._forget()
 
     def _forget(self) -> None:
@@ -80,7 +77,7 @@ class RecordedCorrector:
         self._replay: Callable[[], None] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"_corrector": self._corrector, "_margin": self._margin, "config": self.config}
+        return {"_corrector": self._corrector, "config": self.config}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -100,31 +97,14 @@ class RecordedCorrector:
         return self._answer.clone()
 
     @torch.no_grad()
-    def outside(self, view: FeatureView, margin: float) -> Tensor:
-        """See `Corrector.outside`."""
-        if view is not self._view or margin != self._margin:
-            return self._corrector.outside(view, margin)
-        return self._outside.clone()
+    def rest_score(self, bodies: BodyGraph) -> Tensor:
+        """See `Corrector.rest_score`."""
+        return self._corrector.rest_score(bodies)
 
     @torch.no_grad()
-    def unlike(self, view: FeatureView) -> Tensor:
-        """See `Corrector.unlike`."""
-        return self._unlike.clone() if view is self._view else self._corrector.unlike(view)
-
-    @torch.no_grad()
-    def least_corners(self, view: FeatureView) -> Tensor:
-        """See `Corrector.least_corners`."""
-        return self._corrector.least_corners(view)
-
-    @torch.no_grad()
-    def shape_excess(self, bodies: BodyGraph) -> Tensor:
-        """See `Corrector.shape_excess`."""
-        return self._corrector.shape_excess(bodies)
-
-    @torch.no_grad()
-    def time_step_excess(self, bodies: BodyGraph) -> Tensor:
-        """See `Corrector.time_step_excess`."""
-        return self._corrector.time_step_excess(bodies)
+    def score(self, view: FeatureView) -> Tensor:
+        """See `Corrector.score`."""
+        return self._score.clone() if view is self._view else self._corrector.score(view)
 
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""
@@ -136,11 +116,12 @@ class RecordedCorrector:
             self.config, self._contents = corrector.config, Contents(corrector)
             self._snapshot = Snapshot(*(rest.clone() for _ in fields(Snapshot)))
             self._answer = torch.zeros_like(rest)
-            self._outside, self._unlike = (torch.zeros_like(bodies.cell_size) for _ in range(2))
+            self._score = torch.zeros_like(bodies.cell_size)
             self._network: Callable[..., Tensor] = corrector.network
             if rest.is_cuda:
                 self._network = torch.compile(corrector.network, dynamic=True)
             self._recorded = bodies
+            corrector.rest_score(bodies)  # which measures bodies on the CPU, once
             self._replay = Recorder(rest.device)(self._compute)
         self._bodies = bodies
 
@@ -148,9 +129,7 @@ class RecordedCorrector:
         corrector, view = self._corrector, FeatureView(self._recorded, self._snapshot)
         with unrolled_products():
             self._answer.copy_(corrector.of_view(view, self._network))
-            if self._margin is not None:
-                self._outside.copy_(corrector.outside(view, self._margin))
-            self._unlike.copy_(corrector.unlike(view))
+            self._score.copy_(corrector.score(view))
 
 
 class RecordedMeasures:

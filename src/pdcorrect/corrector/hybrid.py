@@ -12,19 +12,19 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.batch.checks import one_thread
+from pdcorrect.batch.gpu import one_thread
 from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
 from pdcorrect.corrector.corrected_step import Decision, corrected_step
 from pdcorrect.corrector.corrector import Answers, Corrector
-from pdcorrect.corrector.gate import PAUSE, Gate, check_gate, steps_left
+from pdcorrect.corrector.gate import Gate, check_gate
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.corrector.placements import Velocity, check_velocity
 from pdcorrect.corrector.single_step import SingleCoarseStep
@@ -37,11 +37,9 @@ from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
+Known = TypeVar("Known", State, Trajectory)
 MEMORY = "previous_correction"
 """In `State.memory`, m, where the network asks for the correction of the step before."""
-
-_OWN = (MEMORY, PAUSE)
-"""What a coarse stepper has no use for in `State.memory`."""
 
 
 class HybridStepper:
@@ -83,12 +81,11 @@ class HybridStepper:
     Notes
     -----
     ``stats`` of a result are the coarse step's, energies and volume ratio being those of the
-    corrected state, and besides: ``correction``, its largest node norm, m; ``correction_factor``,
-    below 1 where the gate limited it; ``refused``, 0 or 1; ``gate``, the number of the `Reason`
-    (`pdcorrect.corrector.gate.refusals` counts them); ``network_seconds``, wall clock of
-    all but the coarse solver.  Residual and estimated error are those of the coarse
-    solver's equation.  ``external_work`` is that of the scene's loads and the caller's, not
-    that of the forces of corrections.
+    corrected state, and besides: ``correction``, its largest node norm, m; ``refused``, 0 or 1;
+    ``gate``, the number of the `Reason` (`pdcorrect.corrector.gate.refusals` counts them);
+    ``network_seconds``, wall clock of all but the coarse solver.  Residual and estimated error
+    are those of the coarse solver's equation.  ``external_work`` is that of the scene's loads and
+    the caller's, not that of the forces of corrections.
 
     A coarse step that ended with inverted cells counts as converged and is corrected like
     others; the status then says whether the corrected state has some.  One that converged only
@@ -118,7 +115,7 @@ class HybridStepper:
             raise InputError(f"time.substeps = {substeps}: expected 1, frames are corrected whole.")
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
-        check_gate(gate, corrector)
+        check_gate(gate)
         self.velocity, self.gate, self.origin = velocity, gate, dict(origin or {})
         self.placement = corrector.config.placement
         h = coarse_stepper.time_step
@@ -154,29 +151,19 @@ class HybridStepper:
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
             "trained_step": self.trained_step,
-            "time_step_excess": f"{self.time_step_excess():.6g}",
             **self.origin,
         }
-
-    def time_step_excess(self) -> float:
-        """How far the time step over the cell size lies outside its range in training, at least 0.
-
-        Of its logarithm, dimensionless; infinite if it is not known.  A gate refuses all steps if
-        it is more than its bound `Gate.time_step`.
-        """
-        return float(self.corrector.time_step_excess(self.bodies))
 
     @property
     def trained_step(self) -> str:
         """The time step of the training for cells of this body's size, or its range, s."""
-        return self.corrector.normaliser.trained_step(float(self.bodies.cell_size))
+        return self.corrector.envelope.trained_step(float(self.bodies.cell_size))
 
     def restore(self, run: Trajectory) -> None:
         """Tell the coarse stepper about the frames so far."""
         restore = getattr(self.coarse, "restore", None)
         if restore is not None:
-            memory = {name: x for name, x in run.memory.items() if name not in _OWN}
-            restore(replace(run, memory=memory))
+            restore(_without(run))
 
     def __call__(self, state: State, forces: Array | None = None) -> StepResult:
         """Advance ``state`` by one step, with extra nodal forces (N, 3), N.
@@ -187,24 +174,18 @@ class HybridStepper:
             If shapes are wrong or a number is not finite.
         """
         before, _ = self.coarse.accepted(_without(state), forces, None)
-        left = steps_left(self.gate, state.memory)
         step = self._step(before, forces, self._previous(state))
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):
-            result, _, decision = corrected_step(step, self._answers, self.gate, left)
+            result, _, decision = corrected_step(step, self._answers, self.gate)
         correction: Array = decision.correction
         reason = float(decision.reasons.item())
-        after, own = result.state, {}
+        after = result.state
         if self.remembers:
-            own[MEMORY] = correction
-        if self.gate is not None and (shut := self.gate.steps_shut(decision.reasons, left).item()):
-            own[PAUSE] = np.full_like(correction, shut)
-        if own:
-            after = replace(after, memory={**after.memory, **own})
+            after = replace(after, memory={**after.memory, MEMORY: correction})
         stats = {
             **result.stats,
             "correction": float(np.sqrt(np.square(correction).sum(axis=1).max())),
-            "correction_factor": float(decision.factors.item()),
             "refused": float(reason > 0.0),
             "gate": reason,
             "network_seconds": time.perf_counter() - started - step.seconds,
@@ -230,12 +211,12 @@ def digest(corrector: Corrector) -> str:
     return found.hexdigest()[:16]
 
 
-def _without(state: State) -> State:
-    """The state without what a hybrid remembers."""
-    if not isinstance(state, State) or not any(name in state.memory for name in _OWN):
-        return state
-    memory = {name: x for name, x in state.memory.items() if name not in _OWN}
-    return replace(state, memory=memory)
+def _without(known: Known) -> Known:
+    """A state or run without what a hybrid remembers."""
+    if MEMORY not in getattr(known, "memory", {}):
+        return known
+    memory = {name: x for name, x in known.memory.items() if name != MEMORY}
+    return replace(known, memory=memory)
 
 
 def hybrid_of(

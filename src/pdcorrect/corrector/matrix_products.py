@@ -1,4 +1,4 @@
-"""Products of tall and narrow matrices, and LayerNorm of their rows, by vectors of 16 numbers.
+"""Products of tall and narrow matrices by vectors of 16 numbers.
 
 What BLAS does, for callers that are in a parallel loop already, where OpenBLAS may not be
 asked: sums stay in registers.  A factor is stored in strips of 16 columns.
@@ -26,8 +26,6 @@ STRIP = 16
 """Columns whose sums are in registers together: one of AVX-512 in single precision."""
 ROWS = 8
 """Rows of them: enough sums under way to hide how long a fused multiply-add takes."""
-EPSILON = 1e-5
-"""LayerNorm's, as torch has it by default."""
 
 
 def filled_up(count: int, to: int = STRIP) -> int:
@@ -58,21 +56,6 @@ def product(x, factor, bias, least, out):  # type: ignore[no-untyped-def]
     for strip in range(factor.shape[0]):
         for row in range(0, x.shape[0], ROWS):
             _tile(x, row, factor, strip, bias, least, out)  # type: ignore[call-arg]
-
-
-@njit(**OPTIONS)
-def normalise(x, norm):  # type: ignore[no-untyped-def]
-    """LayerNorm of rows in place.
-
-    Parameters
-    ----------
-    x : (m, w)
-        w is a multiple of 16.
-    norm : (2, w)
-        Weight and bias.
-    """
-    for row in range(x.shape[0]):
-        _normalise(x, row, norm, EPSILON)  # type: ignore[call-arg]
 
 
 class _Vectors:
@@ -131,71 +114,12 @@ class _Vectors:
         same = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
         return self._builder.shuffle_vector(one, nothing, same)
 
-    def total(self, vector: Any) -> Any:
-        """The sum of 16 numbers, of halves at a time."""
-        width = STRIP
-        while width > 1:
-            width //= 2
-            low, high = (
-                self._builder.shuffle_vector(
-                    vector, vector,
-                    ir.Constant(ir.VectorType(ir.IntType(32), width), [*range(k, k + width)]),
-                )
-                for k in (0, width)
-            )  # fmt: skip
-            vector = self._builder.fadd(low, high)
-        return self._builder.extract_element(vector, ir.Constant(ir.IntType(32), 0))
-
 
 def _check_arrays(*arrays: Any) -> None:
     """Refuse types of arrays that would be misread: vectors know pointers and one type alone."""
     kinds = {(getattr(a, "layout", None), getattr(a, "dtype", None)) for a in arrays}
     if len(kinds) > 1 or kinds.pop()[0] != "C":
         raise TypingError(f"{arrays}: expected C-contiguous arrays of one type of numbers.")
-
-
-@intrinsic  # type: ignore[misc]
-def _normalise(typing, x, row, norm, epsilon):  # type: ignore[no-untyped-def]
-    """One row of `normalise`."""
-    _check_arrays(x, norm)
-
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        v = _Vectors(context, builder, signature, args, x.dtype)
-        (xs, (_, width)), (norms, _) = v.array(0), v.array(2)
-        start = builder.mul(v.integer(1), width)
-        strips_of_row = builder.udiv(width, v.count(STRIP))
-        zero = ir.Constant(v.kind, None)
-        inverse = builder.fdiv(
-            ir.Constant(v.kind.element, 1.0), builder.sitofp(width, v.kind.element)
-        )
-
-        def mean_of(function: Any) -> Any:
-            total = parts.alloca_once_value(builder, zero)
-            with parts.for_range(builder, strips_of_row, intp=width.type) as loop:
-                at = builder.add(start, builder.mul(loop.index, v.count(STRIP)))
-                builder.store(builder.fadd(builder.load(total), function(v.load(xs, at))), total)
-            return builder.fmul(v.total(builder.load(total)), inverse)
-
-        mean = v.spread(mean_of(lambda line: line))
-
-        def squares(line: Any) -> Any:
-            away = builder.fsub(line, mean)
-            return builder.fmul(away, away)
-
-        variance = builder.fadd(mean_of(squares), v.scalar(3))
-        root = builder.module.declare_intrinsic("llvm.sqrt", [v.kind.element])
-        scale = builder.fdiv(ir.Constant(v.kind.element, 1.0), builder.call(root, [variance]))
-        scale = v.spread(scale)
-        with parts.for_range(builder, strips_of_row, intp=width.type) as loop:
-            column = builder.mul(loop.index, v.count(STRIP))
-            at = builder.add(start, column)
-            line = builder.fmul(builder.fsub(v.load(xs, at), mean), scale)
-            line = builder.fmul(line, v.load(norms, column), flags=("contract",))
-            bias = v.load(norms, builder.add(width, column))
-            v.store(builder.fadd(line, bias, flags=("contract",)), xs, at)
-        return context.get_dummy_value()
-
-    return types.void(x, row, norm, epsilon), generate
 
 
 @intrinsic  # type: ignore[misc]

@@ -1,11 +1,11 @@
 """Models on disk: a folder with ``weights.safetensors`` and ``model.json``.
 
-``weights.safetensors`` holds the network's weights (float32) and the normaliser's buffers
-(float64).  ``model.json`` says what they belong to: architecture, normalisation, data set,
-code, training and metrics, the SHA-256 of the weights' file, and under ``checksum`` that of
-all its own other content.  It is replaced last.  If a program is ended between the two
-replacements, an old ``model.json`` lies beside new weights; that, like any other damage, is
-refused.  Nothing is ever unpickled.
+``weights.safetensors`` holds the network's weights (float32) and the buffers of normaliser and
+envelope (float64), all under the normaliser's name.  ``model.json`` says what they belong to:
+architecture, normalisation, data set, code, training and metrics, the SHA-256 of the weights'
+file, and under ``checksum`` that of all its own other content.  It is replaced last.  If a
+program is ended between the two replacements, an old ``model.json`` lies beside new weights;
+that, like any other damage, is refused.  Nothing is ever unpickled.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ BACKWARD_EULER = "backward-euler"
 JOINT = "+"
 """Between the names of data sets that a model was trained on, together or one after another."""
 
-_NORMALISER = "normaliser."
+_NORMALISER, _ENVELOPE = "normaliser.", "envelope."
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,10 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
         If it cannot be written.
     """
     folder = Path(folder)
-    state = {name: t.detach().to("cpu").contiguous() for name, t in corrector.state_dict().items()}
+    state = {
+        _filed(name): tensor.detach().to("cpu").contiguous()
+        for name, tensor in corrector.state_dict().items()
+    }
     _check_layout(f"model for {folder}", corrector, state)
     _check_values(f"model for {folder}", state, InputError)
     weights = safetensors.save(state)
@@ -239,7 +242,7 @@ def _check_layout(where: str, corrector: Corrector, state: dict[str, Tensor]) ->
     """Refuse a network that could not be loaded again, for the configuration tells of another."""
     with torch.device("meta"):
         wanted = Corrector(corrector.config).state_dict()
-    if {n: x.shape for n, x in state.items()} != {n: x.shape for n, x in wanted.items()}:
+    if {n: x.shape for n, x in state.items()} != {_filed(n): x.shape for n, x in wanted.items()}:
         raise InputError(
             f"{where}: its network is a {type(corrector.network).__name__} with other weights than "
             "its configuration describes, and could not be loaded: expected the configuration's "
@@ -247,8 +250,13 @@ def _check_layout(where: str, corrector: Corrector, state: dict[str, Tensor]) ->
         )
 
 
+def _filed(name: str) -> str:
+    """A tensor's name in files, where ranges count as the normaliser's."""
+    return name.replace(_ENVELOPE, _NORMALISER, 1) if name.startswith(_ENVELOPE) else name
+
+
 def _normalisation(state: dict[str, Tensor]) -> dict[str, Any]:
-    """The normaliser's buffers as numbers."""
+    """Buffers of normaliser and envelope as numbers."""
     return {
         name.removeprefix(_NORMALISER): tensor.tolist()
         for name, tensor in sorted(state.items())
@@ -283,13 +291,15 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     found = read_description(folder)
     state = read_weights(folder, found)
     corrector = _empty(path, found.architecture, state)
-    _check_tensors(path, state, corrector.state_dict())
+    own = corrector.state_dict()
+    _check_tensors(path, state, {_filed(name): tensor for name, tensor in own.items()})
     _check_values(str(path), state, FileFormatError)
     if found.normalisation != _normalisation(state):
         raise FileFormatError(
             f"{folder / DESCRIPTION}: its normalisation is not that of {WEIGHTS}: damaged."
         )
-    corrector.load_state_dict(_moved(state, device), assign=True)
+    moved = _moved(state, device)
+    corrector.load_state_dict({name: moved[_filed(name)] for name in own}, assign=True)
     return LoadedModel(corrector.eval(), found.record)
 
 

@@ -8,12 +8,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from pdcorrect.errors import require_extra
-
-require_extra("torch_geometric", "learn")
-
-from torch_geometric.nn import MessagePassing  # noqa: E402
-
 Normalisation = Literal["hidden", "all", "none"]
 
 
@@ -31,7 +25,7 @@ class MLP(nn.Sequential):
         super().__init__(*parts)
 
 
-class MessageLayer(MessagePassing):  # type: ignore[misc]
+class MessageLayer(nn.Module):
     """One round: edges from their ends, then nodes from the sums of their edges; residual.
 
     The first linear map of the edges' network is applied to nodes and edges apart and
@@ -40,7 +34,7 @@ class MessageLayer(MessagePassing):  # type: ignore[misc]
     """
 
     def __init__(self, width: int, layers: int, norm: bool) -> None:
-        super().__init__(aggr="sum", flow="target_to_source")
+        super().__init__()
         self.of_edge = nn.Linear(width, width)
         self.of_receiver = nn.Linear(width, width, bias=False)
         self.of_sender = nn.Linear(width, width, bias=False)
@@ -53,19 +47,13 @@ class MessageLayer(MessagePassing):  # type: ignore[misc]
 
     def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         """New values of nodes (n, w) and edges (E, w)."""
-        e = e + self.edge_updater(
-            edge_index, e=self.of_edge(e), to=self.of_receiver(x), start=self.of_sender(x)
+        receiver, sender = edge_index
+        to, start = self.of_receiver(x), self.of_sender(x)
+        e = e + self.edge_rest(
+            self.of_edge(e) + to.index_select(0, receiver) + start.index_select(0, sender)
         )
-        summed = self.propagate(edge_index, e=e, size=(len(x), len(x)))
+        summed = torch.zeros_like(x).index_add(0, receiver, e)
         return x + self.node(torch.cat([x, summed], dim=1)), e
-
-    def edge_update(self, e: Tensor, to_i: Tensor, start_j: Tensor) -> Tensor:
-        """Change of the edges."""
-        return self.edge_rest(e + to_i + start_j)
-
-    def message(self, e: Tensor) -> Tensor:
-        """What a node receives along an edge."""
-        return e
 
 
 class MeshGraphNetwork(nn.Module):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -20,17 +20,8 @@ from pdcorrect.state import State, Status, StepResult
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
 class OneBody:
-    """What a `Decision` asks about one body, in arrays.
-
-    Attributes
-    ----------
-    cell_size : (1,)
-        m.
-    """
-
-    cell_size: Array
+    """What a `Decision` asks about one body, in arrays."""
 
     def by_node(self, values: Values) -> Values:
         """Values (1,), which are those of all nodes."""
@@ -87,7 +78,7 @@ class SingleCoarseStep:
     @property
     def bodies(self) -> OneBody:
         """See `CoarseStep`."""
-        return OneBody(self._graph.cell_size.numpy())
+        return OneBody()
 
     def own(self, values: Values) -> Values:
         """See `CoarseStep`."""

@@ -15,7 +15,7 @@ from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.data.engines import MOST_ITERATIONS, Job, Steps
 from pdcorrect.fem.problem import Problem
-from pdcorrect.state import State, Status
+from pdcorrect.state import State
 
 
 class Batched:
@@ -126,30 +126,17 @@ class _BatchLog:
         self._estimates = np.maximum(self._estimates, result.error_estimates)
         ratios = result.smallest_volume_ratios
         self._ratios = np.fmin(self._ratios, ratios)
-        for i, status in enumerate(result.statuses):
-            self._judge(i, status, float(ratios[i]))
-
-    def _judge(self, i: int, status: Status, ratio: float) -> None:
-        if self.failures[i]:
-            return
-        frame = len(self._frames) + 1
-        if not status.ok:
-            self.failures[i] = f"step {frame}: {status.value}"
-        elif ratio <= 0.0:
-            self.failures[i] = f"step {frame}: a cell is inverted"
+        for i, (status, ratio) in enumerate(zip(result.statuses, ratios.tolist(), strict=True)):
+            if not self.failures[i] and not (status.ok and ratio > 0.0):
+                what = "a cell is inverted" if status.ok else status.value
+                self.failures[i] = f"step {len(self._frames) + 1}: {what}"
 
     def without_failed(self, state: BatchState, rest: BatchState) -> BatchState:
         """The state with scenes that failed put back to rest, where they cost little."""
         if not any(self.failures):
             return state
         failed = torch.tensor([bool(f) for f in self.failures], device=state.positions.device)
-        failed = failed[:, None, None]
-        return BatchState(
-            torch.where(failed, rest.positions, state.positions),
-            torch.where(failed, rest.velocities, state.velocities),
-            state.times,
-            {name: torch.where(failed, 0.0, x) for name, x in state.memory.items()},
-        )
+        return state.where(~failed, rest)
 
     def frame(self, state: BatchState) -> None:
         """The end of a frame."""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.check_file import cell_size, file_faults, plan_faults
-from pdcorrect.data.check_motion import step_faults
+from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, step_faults
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
@@ -25,7 +25,7 @@ from pdcorrect.data.schema import (
     Shard,
     Simulation,
 )
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.shard_reader import read_header, read_shard
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
@@ -126,9 +126,9 @@ def check_dataset(
     if not folder.is_dir():
         raise InputError(f"{folder}: not a folder: expected that of a data set.")
     check = _Check(folder, repeat)
-    check.load_config()
-    check.load_manifest()
     paths = all_shards(folder)
+    check.load_config(paths)
+    check.load_manifest()
     check.files(paths)
     for path in paths:
         check.shard(path)
@@ -176,12 +176,12 @@ class _Check:
         """Note a warning."""
         self.findings.append(Finding(path, "warning", message))
 
-    def load_config(self) -> None:
-        """Read the configuration and derive the files that it asks for."""
+    def load_config(self, paths: Sequence[Path]) -> None:
+        """Read the configuration and derive the files that it asks for; imports have none."""
         path = self.folder / CONFIG
-        if not path.exists() and self._imported():
-            return
         try:
+            if not path.exists() and self._imported(paths):
+                return
             self.config = DatasetConfig.load(path)
             plans = make_plan(self.config)
         except InputError as error:
@@ -189,13 +189,12 @@ class _Check:
             return
         self.plans = {self.folder / f"{plan.name}{SUFFIX}": plan for plan in plans}
 
-    def _imported(self) -> bool:
-        """Whether the first file that can be read says that other solvers made the data."""
-        for path in all_shards(self.folder):
-            try:
-                return not stored_hashes(path)[0]
-            except InputError:
-                continue
+    @staticmethod
+    def _imported(paths: Sequence[Path]) -> bool:
+        """Whether the first file that can be read was imported."""
+        for path in paths:
+            with suppress(InputError):
+                return not read_header(path).config_hash
         return False
 
     def load_manifest(self) -> None:
@@ -209,15 +208,11 @@ class _Check:
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             self.error(path, "cannot be read: expected the hashes of all files, as JSON")
             return
-        if self.config is not None:
-            for key, value in manifest_content(self.config, self.hashes).items():
-                if content.get(key) != value:
-                    self.error(path, f"its {key} is not that of {CONFIG} and of the files it lists")
+        if self.config is not None and content != manifest_content(self.config, self.hashes):
+            self.error(path, f"is not that of {CONFIG} and of the files it lists")
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""
-        if self.plans is None:
-            self._gaps(paths)
         for path in sorted(set(self.plans or ()) - set(paths)):
             self.error(path, "missing: config.toml asks for it")
         for path in sorted(path for path in self.folder.rglob("*") if path.is_file()):
@@ -230,13 +225,6 @@ class _Check:
         if whole and not (self.folder / MANIFEST).exists():
             self.warn(self.folder, f"no {MANIFEST}: start generate again to write it")
 
-    def _gaps(self, paths: list[Path]) -> None:
-        """Numbers left out in a split, where no configuration tells how many there are."""
-        for split in sorted({path.parent for path in paths}):
-            numbers = {shard_number(path) for path in paths if path.parent == split}
-            for number in sorted(set(range(max(numbers))) - numbers):
-                self.error(split / f"mesh-{number:04d}{SUFFIX}", "missing: later numbers are there")
-
     def shard(self, path: Path) -> None:
         """Check one file, alone and against those before it."""
         try:
@@ -244,9 +232,8 @@ class _Check:
         except InputError as error:
             self.error(path, _reason(path, error))
             return
-        found = shard.attributes["config_hash"]
-        if self.config is not None and found != self.config.hash():
-            wanted = self.config.hash()
+        found, wanted = shard.attributes["config_hash"], self.config and self.config.hash()
+        if wanted is not None and found != wanted:
             self.error(
                 path, f"of another data set: its config_hash is {found!r}: expected {wanted!r}"
             )
@@ -256,30 +243,19 @@ class _Check:
         except MeshError as error:
             self.error(path, f"its mesh cannot be used: {str(error).removesuffix('.')}")
             return
-        for message in file_faults(shard):
-            self.error(path, message)
-        for message in self._config_faults(path, shard):
+        for message in (*file_faults(shard), *self._config_faults(path, shard)):
             self.error(path, message)
         self._origin(path, shard)
         self._repetitions(path, shard)
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
         """Where a file is not what the configuration asks for."""
-        wanted = {"split": path.parent.name, "number": shard_number(path)}
-        plan = self.plans.get(path) if self.plans is not None else None
-        if self.config is not None:
-            wanted |= {
-                "dataset": self.config.name,
-                "setting": self.config.setting,
-                "tolerance": self.config.tolerance,
-            }
-        if plan is not None:
-            wanted["time_step"] = plan.step
-        for name, value in wanted.items():
+        for name, value in {"split": path.parent.name, "number": shard_number(path)}.items():
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
+        plan = self.plans.get(path) if self.plans is not None else None
         name = self._short(path).removesuffix(SUFFIX)
-        if self.hashes is not None and self.hashes.get(name) != stored_hashes(path)[1]:
+        if self.hashes is not None and self.hashes.get(name) != shard.content_hash:
             yield f"its content is not that of which {MANIFEST} has the hash"
         if self.plans is not None and plan is None:
             yield "config.toml does not ask for it"

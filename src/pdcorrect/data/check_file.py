@@ -1,25 +1,41 @@
-"""What is wrong within one file of a data set: its numbers, its runs, and against its plan."""
+"""What is wrong within one file of a data set: its numbers, its runs, and against its plan.
+
+What a file says of its own steps is not proof of them.  Forces are computed again from the
+scenes, and some steps of the coarse models are taken again from the stored states; the reference
+is held against them, too, since predictions start from it.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdcorrect.data.check_motion import load_faults, model_faults, volume_faults
 from pdcorrect.data.configuration import DatasetConfig
+from pdcorrect.data.engines import MOST_ITERATIONS, step_forces
+from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.plan import MeshPlan, draw_scene
 from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
-from pdcorrect.data.simulate import lacking
-from pdcorrect.errors import SceneError
-from pdcorrect.fem.hexahedron import gauss_points, jacobians
-from pdcorrect.fem.problem import discretise
+from pdcorrect.data.simulate import lacking, rebuilt_problems, unlike_arrays, unlike_loads
+from pdcorrect.errors import InputError, SceneError
+from pdcorrect.fem.hexahedron import gauss_points, jacobians, shape_derivatives
+from pdcorrect.fem.problem import BASES, Problem, discretise
 from pdcorrect.scene import Scene
+from pdcorrect.solvers.projective import ProjectiveDynamics
+from pdcorrect.state import State
 
+_CENTRE = np.full((1, 3), 0.5)
+_STEP_ERROR = 10.0
+"""Largest distance from a step that is taken again, in tolerances of the data set."""
+_ROUNDINGS = 16.0
+"""The same for rounding, in spacings of the largest coordinate: a step starts from two frames."""
 _SLACK = 1e-6
 """Relative, for tolerances of numbers that are stored as float32."""
+_LOADS_COMPARED = 8
+"""Steps of each simulation, the first and the last among them."""
 _LAST_DIGITS = 1e-14
 """Relative: by so much exponentials differ between processors, and with them what is drawn."""
 
@@ -33,7 +49,6 @@ def file_faults(shard: Shard) -> Iterator[str]:
     for k, simulation in enumerate(shard.simulations):
         for message in _simulation_faults(shard, simulation, cell):
             yield f"simulation {k:04d}: {message}"
-    yield from _unlike_runs(shard)
 
 
 def cell_size(shard: Shard) -> float:
@@ -47,11 +62,6 @@ def _simulation_faults(shard: Shard, simulation: Simulation, cell: float) -> Ite
     if reference is None or reference.positions is None:
         yield f"there is no rollout {REFERENCE!r}"
     yield from volume_faults(shard, simulation)
-    if len(simulation.rejected) != simulation.attempt:
-        yield (
-            f"attempt is {simulation.attempt}, with {len(simulation.rejected)} reasons of "
-            "rejected draws: expected as many"
-        )
     for name, run in simulation.runs.items():
         for message in _run_faults(shard, run, cell):
             yield f"{name}: {message}"
@@ -100,53 +110,33 @@ def _rounding(values: Array, points: Array, cell: float) -> float:
     return float(4 * np.finfo(values.dtype).eps * np.abs(points).max() + 1e-9 * cell)
 
 
-def _unlike_runs(shard: Shard) -> Iterator[str]:
-    """Simulations that lack runs; the first one of a mesh may have some more."""
-    first = set(shard.simulations[0].runs)
-    names = [set(simulation.runs) for simulation in shard.simulations]
-    common = set.union(*names[1:]) if len(names) > 1 else first
-    for k, own in enumerate(names):
-        missing = sorted(common - own)
-        if missing:
-            yield f"simulation {k:04d} has no run {missing[0]!r}, unlike others"
-
-
 def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator[str]:
     """Where a file is not the mesh, the material, the loads and the runs that it should be."""
     if len(shard.simulations) != plan.simulations:
         yield f"{len(shard.simulations)} simulations: expected {plan.simulations}"
     problem = discretise(draw_scene(config, plan, 0))
-    arrays: tuple[tuple[str, Array], ...] = (
-        ("points", problem.positions),
-        ("cells", problem.cells),
-        ("free", problem.free),
-        ("mass", problem.mass),
-        ("young", problem.materials.young),
-        ("poisson", problem.materials.poisson),
-        ("density", problem.materials.density),
-    )
-    alike = True
-    for name, wanted in arrays:
-        found = getattr(shard, name)
-        if found.shape != wanted.shape or not np.allclose(found, wanted, rtol=1e-12, atol=1e-12):
-            alike = False
-            yield f"its {name} is not what config.toml draws"
+    unlike = unlike_arrays(problem, shard)
+    for name in unlike:
+        yield f"its {name} is not what config.toml draws"
     for k, simulation in enumerate(shard.simulations):
         if simulation.steps != plan.frames:
             yield f"simulation {k:04d} has {simulation.steps} frames: expected {plan.frames}"
         scene = draw_scene(config, plan, k, simulation.attempt)
         if not same_scene(simulation.scene_toml, scene):
             yield f"simulation {k:04d}: its scene is not the one that config.toml draws"
-        if alike and simulation.steps == plan.frames:
-            for message in load_faults(problem.with_loads(scene.loads), shard, simulation):
-                yield f"simulation {k:04d}: {message}"
+        if not unlike and simulation.steps == plan.frames:
+            step = unlike_loads(problem.with_loads(scene.loads), simulation, _LOADS_COMPARED)
+            if step is not None:
+                yield (
+                    f"simulation {k:04d}: its forces in step {step + 1} are not what config.toml "
+                    "draws"
+                )
         single = {n for n, run in simulation.runs.items() if run.predictions is not None}
         for what in lacking(config, plan, k, simulation.runs, single)[:1]:
             yield f"simulation {k:04d} has no {what}"
         reference = simulation.runs.get(REFERENCE)
         if config.setting == "converged" and reference and reference.velocities is None:
             yield f"simulation {k:04d} has no velocities of run {REFERENCE!r}"
-    yield from model_faults(config, plan, shard)
 
 
 def same_scene(found: str, wanted: Scene) -> bool:
@@ -170,3 +160,110 @@ def _same(found: Any, wanted: Any) -> bool:
     if isinstance(wanted, float):
         return math.isclose(found, wanted, rel_tol=_LAST_DIGITS)
     return bool(found == wanted)
+
+
+def volume_faults(shard: Shard, simulation: Simulation) -> Iterator[str]:
+    """Cells that a run turns inside out: by its statistics, and by det F at their centres.
+
+    The latter on the coarse nodes, of what is stored; det F at quadrature points, and on the
+    mesh of the reference, is in the statistics alone.
+    """
+    cells = shard.cells.astype(np.int64)
+    for name, run in simulation.runs.items():
+        ratios = run.statistics.get("smallest_volume_ratios")
+        if ratios is not None and ratios.min() <= 0:
+            yield f"{name}: det F is {ratios.min():.3g} after step {ratios.argmin() + 1}"
+        for what, values in (("positions", run.positions), ("predictions", run.predictions)):
+            if values is None:
+                continue
+            inverted = np.array([_central(frame, cells).min() <= 0 for frame in values])
+            if inverted.any():
+                first = inverted.argmax()
+                yield f"{name}: a cell is inside out in its {what}, first in row {first}"
+
+
+def _central(positions: Array, cells: Array) -> Array:
+    """Determinants of the trilinear map at the cells' centres, (C,), m3."""
+    slopes = shape_derivatives(_CENTRE)[:, 0]  # (3, 8)
+    a, b, c = np.matmul(slopes, positions[cells]).transpose(1, 0, 2)
+    found: Array = np.einsum("ni,ni->n", a, np.cross(b, c))
+    return found
+
+
+def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:
+    """Steps of the coarse models that come out otherwise when they are taken again.
+
+    Parameters
+    ----------
+    path : Path
+        Of the shard's file, for messages.
+    shard : Shard
+        Generated, not imported.
+    count : int
+        Single steps and steps of rollouts of each simulation and model.
+    tolerance : float
+        The solver's, m.
+    """
+    for name in BASES:
+        if all(name in simulation.runs for simulation in shard.simulations):
+            try:
+                problems = rebuilt_problems(shard, path, name)
+            except InputError as error:
+                yield str(error).removeprefix(f"{path}: ").removesuffix(".")
+                return
+            yield from _repeated(shard, name, problems, count, tolerance)
+
+
+def _repeated(
+    shard: Shard, name: str, problems: list[Problem], count: int, tolerance: float
+) -> Iterator[str]:
+    stepper = ProjectiveDynamics(
+        problems[0].with_loads([]), float(shard.attributes["tolerance"]),
+        max_iterations=MOST_ITERATIONS, recover=False,
+    )  # fmt: skip
+    for k, (simulation, problem) in enumerate(zip(shard.simulations, problems, strict=True)):
+        run, reference = simulation.runs[name], simulation.runs.get(REFERENCE)
+        pairs = {"positions": (run.positions, run.positions)}
+        if reference is not None:
+            pairs["predictions"] = (reference.positions, run.predictions)
+        for what, (starts, ends) in pairs.items():
+            if starts is None or ends is None:
+                continue
+            spacing = np.finfo(starts.dtype).eps * np.abs(starts).max()
+            limit = float(_STEP_ERROR * tolerance + _ROUNDINGS * spacing)
+            for row, away, times in _again(stepper, problem, starts, ends, k, count):
+                if not away <= times * limit:
+                    yield (
+                        f"simulation {k:04d}: {name}: step {row + 1} of its {what} is {away:.3g} m "
+                        f"off when it is taken again: expected at most {times * limit:.3g} m"
+                    )
+                    break
+
+
+def _again(
+    stepper: ProjectiveDynamics, problem: Problem, starts: Array, ends: Array, k: int, count: int
+) -> Iterator[tuple[int, float, int]]:
+    """Steps of simulation k that are taken again: row, distance (m), and how often errors add up.
+
+    Steps of backward Euler from rows of ``starts``, spread over the simulation; of others the
+    first ones in a row, since they remember more than two frames tell.
+    """
+    after = ends[-(len(starts) - 1) :]  # of a rollout all frames but the first
+    state = problem.initial_state()
+    for i in range(min(count, len(after))):
+        row, times = i, i + 1
+        if stepper.integrator == INTEGRATOR:
+            row, times = (31 * k + i * len(after) // count) % len(after), 1
+            state = _start(problem, starts, row)
+        state = stepper(state, step_forces(stepper, problem, state)).state
+        yield row, float(np.abs(state.positions - after[row]).max()), times
+
+
+def _start(problem: Problem, frames: Array, row: int) -> State:
+    """A frame with the velocities of backward Euler."""
+    if row == 0:
+        return problem.initial_state()
+    h, rest = problem.time_step, problem.positions
+    frame, before = (frames[k].astype(np.float64) for k in (row, row - 1))
+    frame, before = (np.where(problem.free, x, rest) for x in (frame, before))
+    return State(frame, (frame - before) / h, row * h)

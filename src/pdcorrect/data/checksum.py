@@ -14,13 +14,9 @@ which some damage makes crash, sees any of it.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import re
-import stat
-from collections.abc import Iterator
-from pathlib import Path
 from typing import IO
 
 from pdcorrect.errors import FileFormatError, FileVersionError
@@ -34,102 +30,43 @@ _TEXT = re.compile(
     rb"(?P<lead>pdcorrect-dataset (?P<version>\d{1,9})\nbytes (?P<size>\d{1,18})\n)"
     rb"sha256 (?P<sum>[0-9a-f]{64})\n\0*"
 )
-_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def seal(image: memoryview) -> None:
     """Write the user block of a file that is whole but for it, in place."""
     lead = f"{FORMAT} {VERSION}\nbytes {len(image)}\n".encode()
-    text = lead + f"sha256 {_checksum(lead, image[USER_BLOCK:])}\n".encode()
-    image[:USER_BLOCK] = text.ljust(USER_BLOCK, b"\0")
-
-
-def check_seal(path: Path) -> None:
-    """Compare a file's size and version with its seal.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, is something else, truncated, or newer than this code.
-    """
-    with _opened(path) as file:
-        _check_version(path, _parsed(path, file))
-
-
-def read_sealed(path: Path) -> bytes:
-    """All bytes of a file, after comparing each of them with its seal.
-
-    Raises
-    ------
-    FileFormatError
-        As `check_seal`, and if any byte has changed.
-    """
-    with _opened(path) as file:
-        found = _parsed(path, file)
-        file.seek(0)
-        data = file.read()
-    if _checksum(found["lead"], memoryview(data)[USER_BLOCK:]) != found["sum"].decode():
-        raise FileFormatError(
-            f"{path}: damaged: its checksum (SHA-256) is not the one noted in its first "
-            f"{USER_BLOCK} bytes; copy or generate it again."
-        )
-    _check_version(path, found)
-    return data
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
-    """A regular file opened for reading; what the system refuses becomes one sentence."""
-    try:
-        regular = stat.S_ISREG(path.stat().st_mode)
-        if regular:
-            with path.open("rb") as file:
-                yield file
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
-    if not regular:
-        raise FileFormatError(f"{path}: not a regular file: expected a file of a data set.")
-
-
-def _checksum(lead: bytes, rest: memoryview) -> str:
     digest = hashlib.sha256(lead)
-    digest.update(rest)
-    return digest.hexdigest()
+    digest.update(image[USER_BLOCK:])
+    image[:USER_BLOCK] = lead.ljust(USER_BLOCK, b"\0")
+    text = lead + f"sha256 {digest.hexdigest()}\n".encode()
+    image[: len(text)] = text
 
 
-def _parsed(path: Path, file: IO[bytes]) -> dict[str, bytes]:
-    """Lines of the user block of a file that has the size they say."""
+def check_seal(file: IO[bytes], verify: bool) -> None:
+    """Compare an open file's size and version with its seal, and with ``verify`` all its bytes.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is something else, damaged, truncated, or of another version.
+    """
     block = file.read(USER_BLOCK)
     size = os.fstat(file.fileno()).st_size
     found = _TEXT.fullmatch(block) if len(block) == USER_BLOCK else None
     if found is None:
-        raise FileFormatError(f"{path}: {_strange(block)}.")
+        cut = 0 < size < USER_BLOCK and block.startswith(FORMAT.encode()[:size])
+        what = "truncated" if cut else "no file of a data set, or damaged at its beginning"
+        raise FileFormatError(f"{what}: expected {FORMAT!r} and a checksum in front")
     if int(found["size"]) != size:
         what = "truncated" if size < int(found["size"]) else "damaged"
-        raise FileFormatError(f"{path}: {what}: expected {int(found['size'])} bytes, got {size}.")
-    return found.groupdict()
-
-
-def _strange(block: bytes) -> str:
-    """Why a user block is not one of this format."""
-    if not block:
-        return "the file is empty: expected a file of a data set"
-    if block.startswith(_HDF5):
-        return "an HDF5 file, but not one of a data set: it lacks the checksum in front"
-    first = f"{FORMAT} ".encode()
-    if not block.startswith(first[: len(block)]):
-        return f"not a file of a data set: it does not begin with {FORMAT!r}"
-    if len(block) < USER_BLOCK:
-        return f"truncated: expected at least {USER_BLOCK} bytes, got {len(block)}"
-    return f"damaged: its first {USER_BLOCK} bytes are not the size and the checksum of the rest"
-
-
-def _check_version(path: Path, found: dict[str, bytes]) -> None:
-    version = int(found["version"])
-    if version > VERSION:
+        raise FileFormatError(f"{what}: expected {int(found['size'])} bytes, got {size}")
+    if verify:
+        digest = hashlib.file_digest(file, lambda: hashlib.sha256(found["lead"]))  # type: ignore[arg-type]
+        if digest.hexdigest() != found["sum"].decode():
+            raise FileFormatError(
+                "damaged: its checksum (SHA-256) is not the one in front; copy or generate it again"
+            )
+    if int(found["version"]) != VERSION:
         raise FileVersionError(
-            f"{path}: written by a newer pdcorrect, in format version {version}; this one reads "
-            f"version {VERSION}: update pdcorrect."
+            f"format version {int(found['version'])}: this pdcorrect reads version {VERSION}"
         )
-    if version < VERSION:
-        raise FileVersionError(f"{path}: format version {version}: expected {VERSION}.")

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pdcorrect._config import (
     Count,
@@ -25,12 +24,6 @@ FamilyName = Literal["beam", "cross", "weight"]
 MotionName = Literal["torsion", "impulse", "stretch", "body-force"]
 
 
-def _pair(ends: Any) -> Any:
-    if not isinstance(ends, (list, tuple)) or len(ends) != 2:
-        raise ValueError("expected [low, high]")
-    return ends
-
-
 def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
     if ends[0] > ends[1]:
         raise ValueError("expected [low, high] with low <= high")
@@ -43,11 +36,11 @@ def _plain(name: str) -> str:
     return name
 
 
-_PAIR, _ORDERED = BeforeValidator(_pair), AfterValidator(_ordered)
-Range = Annotated[tuple[Positive, Positive], _PAIR, _ORDERED]
-Span = Annotated[tuple[NonNegative, NonNegative], _PAIR, _ORDERED]
-PoissonRange = Annotated[tuple[Poisson, Poisson], _PAIR, _ORDERED]
-NodeCounts = Annotated[tuple[PositiveCount, PositiveCount], _PAIR, _ORDERED]
+_ORDERED = AfterValidator(_ordered)
+Range = Annotated[tuple[Positive, Positive], _ORDERED]
+Span = Annotated[tuple[NonNegative, NonNegative], _ORDERED]
+PoissonRange = Annotated[tuple[Poisson, Poisson], _ORDERED]
+NodeCounts = Annotated[tuple[PositiveCount, PositiveCount], _ORDERED]
 Share = Annotated[float, Field(strict=True, ge=0, lt=1)]
 Name = Annotated[str, Field(max_length=80), AfterValidator(_plain)]
 
@@ -249,32 +242,9 @@ class DatasetConfig(TomlConfig):
             taken.add(split.name)
         return self
 
-    def differences(self, other: DatasetConfig) -> list[str]:
-        """Keys whose values differ, with the other's value and this one's, for messages."""
-        here, there = (dict(_leaves(each.model_dump(mode="json"))) for each in (self, other))
-        return [
-            f"{key}: {there.get(key, _NOTHING)} there, {here.get(key, _NOTHING)} here"
-            for key in dict.fromkeys([*there, *here])
-            if there.get(key) != here.get(key)
-        ]
-
     def hash(self) -> str:
         """SHA-256 of the configuration's content."""
         content: Any = self.model_dump(mode="json")
         if self.mixed is None:  # as before there was such a key
             del content["mixed"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-_NOTHING = "nothing"
-
-
-def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
-    """Dotted keys that are set, and their values as in TOML; tables in a list by number."""
-    if isinstance(value, list) and value and isinstance(value[0], dict):
-        value = dict(enumerate(value))
-    if isinstance(value, dict):
-        for name, own in value.items():
-            yield from _leaves(own, f"{key}.{name}" if key else str(name))
-    elif value not in (None, []):
-        yield key, as_toml(value)

@@ -6,9 +6,8 @@ rollout or single steps from given states, on chosen nodes only.
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -97,41 +96,26 @@ class OneByOne:
 
     def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
         """See `Engine`."""
-        out = []
-        steppers: dict[int, Any] = {}
-        for job in jobs:
-            log = _Log(job.nodes)
-            with log.timed():
-                stepper = self._stepper(steppers, job.problem, divisor)
-            state = job.problem.initial_state()
-            for _ in range(steps):
-                worst = log.begin()
-                with log.timed():
-                    for _ in range(divisor):
-                        result = stepper(state, step_forces(stepper, job.problem, state))
-                        worst = worst.with_result(result)
-                        state = result.state
-                log.add(worst, state)
-                if log.failure:
-                    break
-            out.append(log.steps())
-        return out
+        return self._run(jobs, [[None] * steps for _ in jobs], divisor)
 
     def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
         """See `Engine`."""
-        out = []
+        return self._run(jobs, states, 1)
+
+    def _run(
+        self, jobs: Sequence[Job], starts: Sequence[Sequence[State | None]], divisor: int
+    ) -> list[Steps]:
+        """Frames of each problem, from given states or, where None, from the one before."""
         steppers: dict[int, Any] = {}
-        for job, starts in zip(jobs, states, strict=True):
-            log = _Log(job.nodes)
-            with log.timed():
-                stepper = self._stepper(steppers, job.problem, 1)
-            for state in starts:
-                with log.timed():
-                    result = stepper(state, step_forces(stepper, job.problem, state))
-                log.add(log.begin().with_result(result), result.state)
-                if log.failure:
-                    break
-            out.append(log.steps())
+        out = []
+        for job, states in zip(jobs, starts, strict=True):
+            began = time.perf_counter()
+            stepper = self._stepper(steppers, job.problem, divisor)
+            frames, failure = _frames(stepper, job, states, divisor)
+            columns = [np.stack(column) for column in zip(*frames, strict=True)]
+            positions, velocities, iterations, errors, ratios = columns
+            seconds = time.perf_counter() - began
+            out.append(Steps(positions, velocities, iterations, errors, ratios, failure, seconds))
         return out
 
     def describe(self) -> dict[str, str]:
@@ -161,65 +145,26 @@ def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Arr
     return problem.external_forces(first, last, state.positions)
 
 
-@dataclass(frozen=True)
-class _Worst:
-    """Of the steps inside a frame."""
-
-    iterations: int = 0
-    error_estimate: float = 0.0
-    volume_ratio: float = np.inf
-    failure: str = ""
-
-    def with_result(self, result: StepResult) -> _Worst:
-        ratio = min(self.volume_ratio, result.stats["smallest_volume_ratio"])
-        failure = self.failure
-        if not failure and not result.status.ok:
-            failure = result.status.value
-        if not failure and ratio <= 0.0:
-            failure = "a cell is inverted"
-        return _Worst(
-            self.iterations + result.iterations,
-            max(self.error_estimate, result.error_estimate),
-            ratio,
-            failure,
-        )
-
-
-class _Log:
-    """Rows of a `Steps` in the making."""
-
-    def __init__(self, nodes: NDArray[np.int64]) -> None:
-        self._nodes = nodes
-        self._states: list[tuple[Array, Array]] = []
-        self._rows: list[_Worst] = []
-        self._seconds = 0.0
-        self.failure = ""
-
-    @staticmethod
-    def begin() -> _Worst:
-        return _Worst()
-
-    @contextlib.contextmanager
-    def timed(self) -> Iterator[None]:
-        """Charge what is done within, setting up included."""
-        started = time.perf_counter()
-        yield
-        self._seconds += time.perf_counter() - started
-
-    def add(self, row: _Worst, state: State) -> None:
-        self._rows.append(row)
-        self._states.append((state.positions[self._nodes], state.velocities[self._nodes]))
-        if row.failure and not self.failure:
-            self.failure = f"step {len(self._rows)}: {row.failure}"
-
-    def steps(self) -> Steps:
-        positions, velocities = (np.stack(arrays) for arrays in zip(*self._states, strict=True))
-        return Steps(
-            positions,
-            velocities,
-            np.array([row.iterations for row in self._rows]),
-            np.array([row.error_estimate for row in self._rows]),
-            np.array([row.volume_ratio for row in self._rows]),
-            self.failure,
-            self._seconds,
-        )
+def _frames(
+    stepper: ImplicitStepper, job: Job, starts: Sequence[State | None], divisor: int
+) -> tuple[list[tuple[Any, ...]], str]:
+    """The columns of `Steps` frame by frame, up to the first failure, and that one."""
+    frames: list[tuple[Any, ...]] = []
+    state, failure = job.problem.initial_state(), ""
+    for start in starts:
+        state = state if start is None else start
+        iterations, error, ratio = 0, 0.0, np.inf
+        for _ in range(divisor):
+            result: StepResult = stepper(state, step_forces(stepper, job.problem, state))
+            state = result.state
+            iterations += result.iterations
+            error = max(error, result.error_estimate)
+            ratio = min(ratio, result.stats["smallest_volume_ratio"])
+            if not failure and not (result.status.ok and ratio > 0.0):
+                what = "a cell is inverted" if result.status.ok else result.status.value
+                failure = f"step {len(frames) + 1}: {what}"
+        positions, velocities = state.positions[job.nodes], state.velocities[job.nodes]
+        frames.append((positions, velocities, iterations, error, ratio))
+        if failure:
+            break
+    return frames, failure

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +13,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import make_folder, replacing, write_text
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths, splits_of
 from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
@@ -27,74 +26,45 @@ from pdcorrect.trajectory import Trajectory
 SIMULATOR = "pdcorrect"
 """In ``meta.json``."""
 
-_SERIES = re.compile(r".+-\d{4,}-\d+-.+(\.pvd|_\d{4,}\.vtu)")
-"""Names of the files of `export_vtu`."""
-
-_STAGING = "export.part"
-"""Folder in the target of what is not whole yet."""
-
 
 @contextlib.contextmanager
-def staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
-    """A new folder in ``target`` to write to, which is gone in the end.
+def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder in ``target`` to write to, whose files are moved there in the end.
 
-    If that fails, ``target`` is as it was before.
+    If writing fails, ``target`` is as it was before.
+
+    Raises
+    ------
+    OutputError
+        If files are there already, or, whatever ``overwrite``, others that would be taken for
+        parts of the same export, or if some cannot be moved.
     """
-    earlier = _exported(target)
-    if earlier and not overwrite:
-        raise OutputError(
-            f"{target}: holds files of an export already, as {earlier[0].name}; choose another "
-            "folder, or delete them with --overwrite (overwrite=True)."
-        )
     existed = target.is_dir()
-    staging = target / _STAGING
+    staging = target / "export.part"
     shutil.rmtree(staging, ignore_errors=True)
     make_folder(staging)
     try:
         yield staging
+        names = sorted(path.name for path in staging.iterdir())
+        there = [name for name in names if (target / name).exists()]
+        if there and not overwrite:
+            raise OutputError(
+                f"{target / there[0]}: exists already; choose another folder, or replace it with "
+                "--overwrite (overwrite=True)."
+            )
+        others = [path for path in sorted(target.glob("*.h5")) if path.name not in names]
+        if "meta.json" in names and others:
+            raise OutputError(f"{others[0]}: is of another export: expected an empty folder.")
+        try:
+            for name in names:
+                (staging / name).replace(target / name)
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written ({error.strerror}).") from None
     finally:
         shutil.rmtree(staging, ignore_errors=True)
         if not existed:
             with contextlib.suppress(OSError):  # not empty: it was filled
                 target.rmdir()
-
-
-def placed(written: Sequence[Path], target: Path) -> list[Path]:
-    """Move all files of the staging folder to ``target``, instead of an earlier export's."""
-    try:
-        earlier, new = _exported(target), sorted((target / _STAGING).iterdir())
-        for place in (target / path.name for path in new):
-            if place.exists() and place not in earlier:
-                raise OutputError(f"{place}: exists already, not from an export; move it first.")
-        for path in earlier:
-            path.unlink()
-        for path in new:
-            path.replace(target / path.name)
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written ({error.strerror or error}).") from None
-    return [target / path.name for path in written]
-
-
-def _exported(target: Path) -> list[Path]:
-    """Files of earlier exports in a folder; their content or name tells."""
-    if not target.is_dir():
-        return []
-    return [path for path in sorted(target.iterdir()) if path.is_file() and _is_exported(path)]
-
-
-def _is_exported(path: Path) -> bool:
-    if path.suffix == ".json":
-        with contextlib.suppress(OSError, ValueError, RecursionError):
-            meta = json.loads(path.read_text(encoding="utf-8"))
-            return isinstance(meta, dict) and meta.get("simulator") == SIMULATOR
-        return False
-    if path.suffix == ".h5":
-        with contextlib.suppress(OSError, RuntimeError), h5py.File(path, "r") as file:
-            return "0/world_pos" in file and "0/mesh_pos" in file
-        return False
-    return _SERIES.fullmatch(path.name) is not None
 
 
 NORMAL, HANDLE = 0, 3
@@ -144,7 +114,7 @@ def export_meshgraphnet(
     split : str, optional
         The only one to write; all by default.
     overwrite : bool
-        Delete the files of an earlier export in ``target``.
+        Replace files of the same names in ``target``.
 
     Returns
     -------
@@ -157,16 +127,12 @@ def export_meshgraphnet(
         If there is no data set or no such split, the base model's predictions are missing, or
         a split has trajectories of different lengths.
     OutputError
-        If ``target`` cannot be written, or holds files of an export already.
+        If ``target`` cannot be written, or holds a file of the same name.
     """
-    splits = sorted(splits_of(folder), key=lambda name: (name not in _SPLITS, name))
-    if TRAINING in splits:
-        splits.insert(0, splits.pop(splits.index(TRAINING)))
-    if split is not None:
-        shard_paths(folder, split)
-        splits = [split]
-    with staging_folder(Path(target), overwrite) as staging:
-        return placed(_write_splits(staging, folder, splits, base), Path(target))
+    splits = splits_of(folder) if split is None else [split]
+    with _staging_folder(Path(target), overwrite) as staging:
+        written = _write_splits(staging, folder, splits, base)
+    return [Path(target) / path.name for path in written]
 
 
 def _write_splits(target: Path, folder: str | Path, splits: Sequence[str], base: str) -> list[Path]:
@@ -211,7 +177,7 @@ def export_vtu(
     runs : sequence of str, optional
         With rollouts; "plain" by default, if it has one.
     overwrite : bool
-        Delete the files of an earlier export in ``target``.
+        Replace files of the same names in ``target``.
 
     Returns
     -------
@@ -224,41 +190,41 @@ def export_vtu(
     InputError
         If there is no such simulation or run.
     OutputError
-        If ``target`` cannot be written, or holds files of an export already.
+        If ``target`` cannot be written, or holds a file of the same name.
     """
-    shard = read_shard(_shard_path(folder, split, mesh))
+    paths = {path.stem: path for path in shard_paths(folder, split)}
+    stem = f"mesh-{mesh:04d}"
+    if stem not in paths:
+        raise InputError(f"{folder}: {split} has no {stem}{SUFFIX}: expected {', '.join(paths)}.")
+    shard = read_shard(paths[stem])
     if not 0 <= simulation < len(shard.simulations):
         raise InputError(
             f"simulation = {simulation}: mesh {mesh} of {split} has {len(shard.simulations)}: "
             f"expected 0 to {len(shard.simulations) - 1}."
         )
     found = shard.simulations[simulation]
-    names = [REFERENCE, *(name for name in _chosen(found, runs) if name != REFERENCE)]
+    if runs is None:
+        plain = found.runs.get(PLAIN)
+        runs = () if plain is None or plain.positions is None else (PLAIN,)
+    names = [REFERENCE, *(name for name in runs if name != REFERENCE)]
     for name in names:
         _positions(found, name)
     series = f"{split}-{mesh:04d}-{simulation}"
-    with staging_folder(Path(target), overwrite) as staging:
+    with _staging_folder(Path(target), overwrite) as staging:
         written = [_write_series(shard, found, name, staging, series) for name in names]
-        return placed(written, Path(target))
-
-
-def _chosen(simulation: Simulation, runs: Sequence[str] | None) -> Sequence[str]:
-    """Runs to write beside the reference."""
-    if runs is not None:
-        return runs
-    plain = simulation.runs.get(PLAIN)
-    return () if plain is None or plain.positions is None else (PLAIN,)
+    return [Path(target) / path.name for path in written]
 
 
 def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
     """One file of the MeshGraphNet layout; returns its description."""
-    metas: list[dict[str, Any]] = []
+    first: dict[str, Any] = {}
     try:
-        with replacing(path) as part, h5py.File(part, "w") as file:
+        with h5py.File(path, "w") as file:
             for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
                 fields = _fields(where, shard, simulation, base)
-                metas.append(_meta(fields, float(shard.attributes["time_step"])))
-                if metas[-1] != metas[0]:
+                meta = _meta(fields, float(shard.attributes["time_step"]))
+                first = first or meta
+                if meta != first:
                     raise InputError(
                         f"{where}: {simulation.steps} steps of {shard.attributes['time_step']} s, "
                         f"unlike the first simulation of {split}: expected the same in a split."
@@ -266,7 +232,7 @@ def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[
                 _write_group(file.create_group(str(number)), fields, simulation.steps + 1)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
-    return metas[0]
+    return first
 
 
 def _simulations(folder: str | Path, split: str) -> Iterator[tuple[str, Shard, Simulation]]:
@@ -329,14 +295,6 @@ def _write_group(group: h5py.Group, fields: dict[str, Array], frames: int) -> No
         group.create_dataset(
             name, data=every, chunks=(1, *every.shape[1:]), compression="gzip", shuffle=True
         )
-
-
-def _shard_path(folder: str | Path, split: str, mesh: int) -> Path:
-    paths = {path.stem: path for path in shard_paths(folder, split)}
-    name = f"mesh-{mesh:04d}"
-    if name not in paths:
-        raise InputError(f"{folder}: {split} has no {name}{SUFFIX}: expected {', '.join(paths)}.")
-    return paths[name]
 
 
 def _positions(simulation: Simulation, name: str) -> Array:

@@ -117,21 +117,6 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
     return tuple(tuple(levels[count]) for count in sorted(levels))
 
 
-def count_bodies(family: FamilyName, nodes: tuple[int, int]) -> int:
-    """Different bodies, by `Design.key`, that a family has in a range of nodes."""
-    return sum(_places(family, size) for level in node_levels(family, nodes) for size in level)
-
-
-def _places(family: FamilyName, size: Size) -> int:
-    """Different bodies of one size: places of the branches, or of the pendulum and its weight."""
-    if family == "beam":
-        return 1
-    if family == "cross":
-        return size[0] - 3
-    support, _, pendulum, _, high = size
-    return (support - 2) // 2 * (pendulum - high)
-
-
 def _beam_sizes() -> Iterator[Size]:
     """Length."""
     return ((length,) for length in range(4, 57))
@@ -172,23 +157,23 @@ def _place(family: FamilyName, sizes: tuple[Size, ...], rng: np.random.Generator
 
 
 def _beam(size: Size, rng: np.random.Generator) -> Design:
-    (length,) = size
-    shape = {"shape": "beam", "cells": [length, 2, 2]}
-    tip: Box = ((length - 2.0, 0.0, 0.0), (float(length), 2.0, 2.0))
-    clamp: Box = ((0.0, 0.0, 0.0), (0.0, 2.0, 2.0))
-    return Design(shape, (clamp,), tip, (1.0, 0.0, 0.0), _count("beam", size, 1))
+    return _straight("beam", size, {})
 
 
 def _cross(size: Size, rng: np.random.Generator) -> Design:
     length, arms, out = size
     start = int(rng.integers(1, length - 2))
-    shape = {
-        "shape": "cross", "cells": [length, 2, 2], "arms": arms, "arm_start": start,
-        "arm_width": 2, "arm_length": out,
-    }  # fmt: skip
+    branches = {"arms": arms, "arm_start": start, "arm_width": 2, "arm_length": out}
+    return _straight("cross", size, branches)
+
+
+def _straight(family: FamilyName, size: Size, branches: Shape) -> Design:
+    """Held at x = 0 and loaded on its last two cells."""
+    length = size[0]
     tip: Box = ((length - 2.0, 0.0, 0.0), (float(length), 2.0, 2.0))
     clamp: Box = ((0.0, 0.0, 0.0), (0.0, 2.0, 2.0))
-    return Design(shape, (clamp,), tip, (1.0, 0.0, 0.0), _count("cross", size, 1))
+    shape = {"shape": family, "cells": [length, 2, 2], **branches}
+    return Design(shape, (clamp,), tip, (1.0, 0.0, 0.0), _count(family, size, 1))
 
 
 def _weight(size: Size, rng: np.random.Generator) -> Design:

@@ -6,20 +6,17 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION, DatasetConfig
 from pdcorrect.data.plan import make_plan
 from pdcorrect.data.schema import CONFIG, SUFFIX
-from pdcorrect.data.shard_reader import stored_hashes
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
-_NAME = re.compile(rf"mesh-(\d+){re.escape(SUFFIX)}")
+_NAME = re.compile(rf"mesh-\d+{re.escape(SUFFIX)}")
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
-
-
 Folders = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 """Of one data set, or of several."""
 
@@ -81,10 +78,8 @@ def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -
     Raises
     ------
     InputError
-        If there are none, or none are left; if ``without`` is one name in place of several.
+        If there are none, or none are left.
     """
-    if isinstance(without, str):
-        raise InputError(f"without = {without!r}: expected a list of names, such as [{without!r}].")
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
         names = ", ".join(splits_of(folder))
@@ -110,41 +105,40 @@ def _rank(split: str) -> tuple[int, str]:
 
 Damage = dict[Path, str]
 """Damaged files and what is wrong with them."""
+Found = TypeVar("Found")
 
 
-def whole_files(paths: Sequence[Path], damaged: Damage | None) -> list[Path]:
-    """The files that are to be read.
+def read_files(
+    paths: Sequence[Path], read: Callable[[Path], Found], damaged: Damage | None
+) -> list[Found]:
+    """What ``read`` makes of each file.
 
     Parameters
     ----------
     paths : sequence of Path
+    read : callable
     damaged : dict or None
-        Where given, each file is compared with its checksum, which reads all of it; those
-        that are damaged are noted here and left out.
+        Where given, files that are damaged are noted here and left out.
 
     Raises
     ------
     FileFormatError
-        If all files are damaged.
+        If a file is damaged; with ``damaged`` if all are.
     FileVersionError
         If one is of another version, which is no damage.
     """
-    if damaged is None:
-        return list(paths)
-    whole = []
+    found = []
     for path in paths:
         try:
-            stored_hashes(path)
-        except FileVersionError:
-            raise
+            found.append(read(path))
         except FileFormatError as error:
+            if damaged is None or isinstance(error, FileVersionError):
+                raise
             damaged[path] = str(error)
-        else:
-            whole.append(path)
-    if paths and not whole:
+    if damaged and not found:
         first = damaged[paths[0]]
         raise FileFormatError(f"all {len(paths)} files are damaged, the first one so: {first}")
-    return whole
+    return found
 
 
 def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
@@ -180,32 +174,13 @@ def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
         If some are, with the first one's name, or as of `missing_files`.
     """
     for split in splits:
-        accepted_gaps(folder, split, incomplete=False)
-
-
-def accepted_gaps(folder: str | Path, split: str, *, incomplete: bool) -> list[Path]:
-    """Files of a split that are missing, which only ``incomplete`` permits.
-
-    It permits a configuration that cannot be used, too: none are known to be missing then.
-
-    Raises
-    ------
-    InputError
-        Without ``incomplete``, as of `check_whole`.
-    """
-    try:
         missing = missing_files(folder, split)
-    except InputError:
-        if not incomplete:
-            raise
-        return []
-    if missing and not incomplete:
-        raise InputError(
-            f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
-            f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
-            "generate' goes on), or --incomplete for those that are there."
-        )
-    return missing
+        if missing:
+            raise InputError(
+                f"{folder}, {split}: {len(missing)} of the files that {CONFIG} asks for are "
+                f"missing, as {missing[0].name}: expected all of them ('pdcorrect dataset "
+                "generate' goes on), or --incomplete for those that are there."
+            )
 
 
 def manifest_content(config: DatasetConfig, hashes: Mapping[str, str | None]) -> dict[str, Any]:

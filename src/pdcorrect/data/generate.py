@@ -18,14 +18,10 @@ from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.shard_arrays import read_header
-from pdcorrect.data.shard_reader import stored_hashes
+from pdcorrect.data.shard_reader import read_header
 from pdcorrect.data.simulate import lacking, work_per_node
-from pdcorrect.data.workers import ONE_WORKER, Workers, check_device, computed, shard_path
+from pdcorrect.data.workers import ONE_WORKER, Workers, computed, shard_path
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
-
-_MOST_DIFFERENCES = 5
-"""Keys of another configuration that are told."""
 
 _LONGEST = 4
 """Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
@@ -57,22 +53,14 @@ class Generated:
     asked: tuple[str, ...]
 
     def __bool__(self) -> bool:
-        return not set(self.missing) & set(self.asked)
-
-    @property
-    def missing(self) -> list[str]:
-        """Splits of which something is missing."""
-        return [name for name, (there, total) in self.simulations.items() if there < total]
+        return all(self.simulations[name][0] == self.simulations[name][1] for name in self.asked)
 
     def __str__(self) -> str:
-        if not self:
-            there, total = (sum(self.simulations[name][k] for name in self.asked) for k in (0, 1))
-            return f"{there} of {total} simulations are there; the same command goes on"
-        if not self.missing:
+        counts = {name: f"{there} of {n}" for name, (there, n) in self.simulations.items()}
+        if all(there == total for there, total in self.simulations.values()):
             return "complete"
-        verb = "is" if len(self.missing) == 1 else "are"
-        complete = [name for name in self.simulations if name not in self.missing]
-        return f"{', '.join(complete)} complete; {', '.join(self.missing)} {verb} still missing"
+        told = ", ".join(f"{name} {count}" for name, count in counts.items())
+        return f"{told} simulations are there; the same command goes on"
 
 
 def generate(
@@ -91,9 +79,7 @@ def generate(
     ----------
     config : DatasetConfig
     folder : path
-        New, or of a generation of the same configuration that was interrupted.  One that was
-        begun with another configuration is taken over as long as it holds no file of a mesh
-        and its ``config.toml`` is as it was written.
+        New, or of a generation of the same configuration that was interrupted.
     workers : Workers
     splits : sequence of str, optional
         Only these.
@@ -119,9 +105,6 @@ def generate(
         If a file cannot be written.
     """
     folder = Path(folder)
-    check_device(workers.device)
-    if seconds is not None and not seconds >= 0:
-        raise InputError(f"seconds = {seconds}: expected 0 or more.")
     plans = make_plan(config)
     chosen = _chosen(plans, splits)
     _claim(config, folder)
@@ -142,13 +125,7 @@ def generate(
         if hashes.get(plan.name) is None:
             hashes[plan.name] = finished(config, folder, plan)
     if None not in hashes.values():
-        _write_manifest(config, folder, hashes)
-    return _generated(plans, chosen, hashes)
-
-
-def _generated(
-    plans: Sequence[MeshPlan], chosen: Sequence[MeshPlan], hashes: Mapping[str, str | None]
-) -> Generated:
+        write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")
     counts: dict[str, tuple[int, int]] = {}
     for plan in plans:
         there, total = counts.get(plan.split, (0, 0))
@@ -172,17 +149,16 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     if not path.exists():
         return None
     try:
-        config_hash, content_hash = stored_hashes(path)
-        header = read_header(path)
+        header = read_header(path, verify=True)
     except FileVersionError:
         raise
     except FileFormatError:
         return None
-    if config_hash != config.hash():
+    if header.config_hash != config.hash():
         raise InputError(f"{path} is of another data set: move it, or use another folder.")
     if any(lacking(config, plan, number, *has) for number, has in enumerate(header.runs)):
         return None
-    return content_hash
+    return header.content_hash
 
 
 def _claim(config: DatasetConfig, folder: Path) -> None:
@@ -190,41 +166,22 @@ def _claim(config: DatasetConfig, folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder}: not a folder: expected that of a data set, or a new one.")
     path = folder / CONFIG
-    if path.exists() and not _replaceable(config, path):
+    if path.exists():
+        if DatasetConfig.load(path).hash() != config.hash():
+            raise InputError(
+                f"{path} is another configuration: expected a new folder, or the one that this "
+                "data set was begun in."
+            )
         return
-    if not path.exists() and all_shards(folder):
+    if all_shards(folder):
         raise InputError(f"{folder} holds files of meshes but no {CONFIG}: use another folder.")
     make_folder(folder)
     write_text(path, config.to_toml())
 
 
-def _replaceable(config: DatasetConfig, path: Path) -> bool:
-    """Whether ``config.toml`` was written here for another configuration and never used.
-
-    Raises
-    ------
-    InputError
-        If it is another one and in use, or written by hand.
-    """
-    there = DatasetConfig.load(path)
-    if there.hash() == config.hash():
-        return False
-    if not all_shards(path.parent) and path.read_text(encoding="utf-8") == there.to_toml():
-        return True
-    found = config.differences(there)
-    told = "; ".join(found[:_MOST_DIFFERENCES])
-    more = len(found) - _MOST_DIFFERENCES
-    raise InputError(
-        f"{path} is another configuration ({told}{f'; {more} more' if more > 0 else ''}): expected "
-        "a new folder, or the one that this data set was begun in."
-    )
-
-
 def _chosen(plans: Sequence[MeshPlan], splits: Sequence[str] | None) -> list[MeshPlan]:
     if splits is None:
         return list(plans)
-    if isinstance(splits, str):
-        raise InputError(f"splits = {splits!r}: expected a list of names, such as [{splits!r}].")
     known = list(dict.fromkeys(plan.split for plan in plans))
     unknown = sorted(set(splits) - set(known))
     if unknown:
@@ -261,8 +218,3 @@ def _units(
 
 def _work(config: DatasetConfig, plan: MeshPlan) -> float:
     return plan.simulations * plan.design.nodes * work_per_node(config, plan)
-
-
-def _write_manifest(config: DatasetConfig, folder: Path, hashes: Mapping[str, str | None]) -> None:
-    """List the files' hashes."""
-    write_text(folder / MANIFEST, json.dumps(manifest_content(config, hashes), indent=1) + "\n")

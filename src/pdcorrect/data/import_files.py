@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ from numpy.typing import NDArray
 from pdcorrect.data.importing import INTEGRATOR, ImportedMotion, check_element, shard_from_arrays
 from pdcorrect.data.schema import CONFIG, SUFFIX, Shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.problem import discretise
 from pdcorrect.io.trajectory import load_trajectory
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
@@ -128,11 +125,7 @@ def import_trajectories(
             raise InputError(
                 f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
             )
-        if best:
-            raise InputError(
-                f"{files[0]}: has no scene: the best coarse model is computed of trajectories only."
-            )
-        shard = _shard_of_npz(files[0], name, split, number)
+        shard = _shard_of_npz(files[0], name, split, number, best)
     else:
         runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
         shard = shard_from_trajectories(
@@ -144,81 +137,44 @@ def import_trajectories(
 
 _NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
 _MOTION = ("reference", "forces", "coarse", "predictions")
-_NUMBERED = re.compile(rf"({'|'.join(_MOTION)})_(0|[1-9]\d*)")
 _BODY = ("body", "material", "materials", "clamps", "loads", "damping")
 """Sections of a scene in which a reference and its coarse run must agree."""
 
 
-def _shard_of_npz(path: Path, dataset: str, split: str, number: int) -> Shard:
-    arrays = _read_npz(path)
+def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool) -> Shard:
     try:
-        missing = [name for name in _NEEDED if name not in arrays]
-        if missing:
-            raise InputError(f"no array {missing[0]!r}: expected {', '.join(_NEEDED)}.")
-        motions = _motions(arrays)
-        return shard_from_arrays(
-            motions=motions, mass=arrays.get("mass"), dataset=dataset, split=split, number=number,
-            **{name: arrays[name] for name in _NEEDED},
-        )  # fmt: skip
-    except InputError as error:
-        raise type(error)(f"{path}: {error}") from None
-
-
-def _read_npz(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(len(_ARRAY))
-        if head == _ARRAY:
-            raise FileFormatError(
-                f"{path}: a single array, as .npy: expected an .npz of several, by numpy.savez."
-            )
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except FileFormatError:
-        raise
+            arrays = dict(file)
     except Exception as error:  # zip, zlib and NumPy raise nearly every type on damaged bytes
         reason = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise FileFormatError(
             f"{path}: cannot be read as .npz ({reason or type(error).__name__})."
         ) from None
+    motions: list[ImportedMotion] = []
+    while names := _names_of(len(motions), arrays):
+        motions.append(ImportedMotion(**{k: arrays.pop(n) for k, n in names.items()}))
+    mass = arrays.pop("mass", None)
+    if arrays.keys() != set(_NEEDED):
+        raise InputError(
+            f"{path}: has arrays {', '.join(map(repr, arrays))} besides those of {len(motions)} "
+            f"simulations: expected {', '.join(_NEEDED)}; for one simulation {', '.join(_MOTION)}, "
+            "for several 'reference_0', 'forces_0' and so on."
+        )
+    try:
+        return shard_from_arrays(
+            motions=motions, mass=mass, dataset=dataset, split=split, number=number, best=best,
+            **arrays,
+        )  # fmt: skip
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
 
 
-_ARRAY = b"\x93NUMPY"
-"""How an .npy file begins."""
-
-
-def _motions(arrays: dict[str, Any]) -> list[ImportedMotion]:
-    count = 0
-    while f"reference_{count}" in arrays:
-        count += 1
-    if "reference" in arrays and count:
-        raise InputError("arrays 'reference' and 'reference_0': expected one of them.")
-    if "reference" not in arrays and not count:
-        raise InputError("no array 'reference' or 'reference_0': expected one of them.")
-    names = (
-        [{name: f"{name}_{k}" for name in _MOTION} for k in range(count)]
-        if count
-        else [{name: name for name in _MOTION}]
-    )
-    known = {*_NEEDED, "mass", *(name for one in names for name in one.values())}
-    for name in arrays:
-        if name not in known:
-            raise InputError(f"array {name!r}: {_advice(name, count, known)}")
-    return [
-        ImportedMotion(**{k: arrays[n] for k, n in one.items() if n in arrays}) for one in names
-    ]
-
-
-def _advice(name: str, count: int, known: set[str]) -> str:
-    """What was expected instead of an array that is not known."""
-    if _NUMBERED.fullmatch(name) and count:
-        last = f"reference_{count - 1}"
-        return f"the references end with {last!r}: expected numbers 0, 1, 2, … without gaps."
-    if _NUMBERED.fullmatch(name) or name in _MOTION:
-        other = "with numbers, as 'reference_0'" if count else "without number, as 'reference'"
-        return f"expected it {other}."
-    close = get_close_matches(name, sorted(known), n=1)
-    return f"unknown; did you mean {close[0]!r}?" if close else "unknown: remove or rename it."
+def _names_of(number: int, arrays: Mapping[str, Array]) -> dict[str, str]:
+    """Arrays of a simulation by what they are; none where it has no reference."""
+    for end in (f"_{number}", "") if number == 0 else (f"_{number}",):
+        if f"reference{end}" in arrays:
+            return {name: f"{name}{end}" for name in _MOTION if f"{name}{end}" in arrays}
+    return {}
 
 
 def _shard_of_run(
@@ -232,10 +188,15 @@ def _shard_of_run(
     scene = _scene("the reference", run)
     if coarse is not None:
         scene = _scene_of_coarse(coarse, run, scene)
-    check_element(_coarse_model(coarse), scene)
+    check_element("the reference" if coarse is None else "the coarse run", scene)
     problem = discretise(scene)
     step = _uniform_step(run)
-    rollout = None if coarse is None else _on_coarse_mesh(coarse, problem)
+    if coarse is not None and len(coarse.points) != len(problem.positions):
+        raise InputError(
+            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
+            f"{len(problem.positions)}: expected a run with --refine 1."
+        )
+    rollout = None if coarse is None else restrict(coarse, problem).positions
     motion = ImportedMotion(restrict(run, problem).positions, coarse=rollout)
     materials = problem.materials
     return shard_from_arrays(
@@ -244,11 +205,6 @@ def _shard_of_run(
         poisson=materials.poisson, density=materials.density, time_step=step,
         dataset=dataset, split=split, number=number, scene=scene, best=best,
     )  # fmt: skip
-
-
-def _coarse_model(coarse: Trajectory | None) -> str:
-    """What says how the coarse model is discretised, for messages."""
-    return "the reference, without a coarse run" if coarse is None else "the coarse run"
 
 
 def _scene(name: str, run: Trajectory) -> Scene:
@@ -264,14 +220,12 @@ def _scene(name: str, run: Trajectory) -> Scene:
             "the scene's; for others use shard_from_arrays."
         )
     scene = Scene.from_toml(run.scene_toml)
-    integrator = run.attributes.get("integrator", scene.time.integrator)
-    if {integrator, scene.time.integrator} != {INTEGRATOR}:
-        other = scene.time.integrator if integrator == INTEGRATOR else integrator
-        raise InputError(
-            f"{name} has the integrator {other!r}: expected {INTEGRATOR!r}, for the velocities of "
-            "a data set are backward differences of its positions, and its predictions start "
-            "from them."
-        )
+    for found in (scene.time.integrator, run.attributes.get("integrator", INTEGRATOR)):
+        if found != INTEGRATOR:
+            raise InputError(
+                f"{name} has the integrator {found!r}: expected {INTEGRATOR!r}, for the velocities "
+                "of a data set are backward differences of its positions."
+            )
     if run.times[0] != 0 or run.velocities[0].any():
         raise InputError(
             f"{name} starts at {run.times[0]:g} s with velocities up to "
@@ -289,27 +243,14 @@ def _scene_of_coarse(coarse: Trajectory, run: Trajectory, reference: Scene) -> S
                 f"the scenes of the reference and the coarse run differ in {section}: expected "
                 f"equal {', '.join(_BODY)}."
             )
-    if len(coarse) != len(run):
+    if coarse.times.shape != run.times.shape or not np.allclose(
+        coarse.times, run.times, rtol=1e-6, atol=0
+    ):
         raise InputError(
-            f"the coarse run has {len(coarse)} steps, the reference {len(run)}: expected as many."
-        )
-    if not np.allclose(coarse.times, run.times, rtol=1e-6, atol=0):
-        frame = int(np.argmax(~np.isclose(coarse.times, run.times, rtol=1e-6, atol=0)))
-        raise InputError(
-            f"frame {frame} of the coarse run is at {coarse.times[frame]:g} s, that of the "
-            f"reference at {run.times[frame]:g} s: expected equal times."
+            f"the coarse run has {len(coarse)} steps up to {coarse.times[-1]:g} s, the reference "
+            f"{len(run)} up to {run.times[-1]:g} s: expected equal times."
         )
     return scene
-
-
-def _on_coarse_mesh(run: Trajectory, problem: Problem) -> Array:
-    """Positions of a run on the nodes of the coarse mesh, which must be its own, m."""
-    if len(run.points) != len(problem.positions):
-        raise InputError(
-            f"the coarse run has {len(run.points)} nodes, the coarse mesh of its scene "
-            f"{len(problem.positions)}: expected a run with --refine 1."
-        )
-    return restrict(run, problem).positions
 
 
 def _uniform_step(run: Trajectory) -> float:
@@ -328,9 +269,5 @@ def _check_same_body(k: int, shard: Shard, first: Shard) -> None:
                 f"simulations 0 and {k} differ in {name}: expected one mesh, material and clamps "
                 "in a file."
             )
-    steps = [float(each.attributes["time_step"]) for each in (first, shard)]
-    if not math.isclose(*steps, rel_tol=1e-6):
-        raise InputError(
-            f"simulations 0 and {k} have steps of {steps[0]:g} and {steps[1]:g} s: expected equal "
-            "ones in a file."
-        )
+    if not np.isclose(shard.attributes["time_step"], first.attributes["time_step"], rtol=1e-6):
+        raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")

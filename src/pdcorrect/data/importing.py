@@ -7,29 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
-from pdcorrect.data.import_checks import (
-    bool_array,
-    check_moduli,
-    check_volumes,
-    finite_array,
-    from_rest,
-    integer_array,
-    optional_array,
-    per_cell,
-    real_array,
-    with_held_nodes,
-)
 from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities
-from pdcorrect.fem.hexahedron import (
-    VTK_CORNERS,
-    gauss_points,
-    jacobians,
-)
+from pdcorrect.fem.hexahedron import gauss_points, jacobians, shortest_edges
 from pdcorrect.fem.mesh import HexMesh
+from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -70,6 +55,10 @@ SETTING = "imported"
 INTEGRATOR = "backward-euler"
 """The one that velocities and predictions of a data set suppose."""
 
+_AT_REST = 1e-6
+"""Of a cell's shortest edge: how far what rests may be from the rest shape."""
+_ROUNDING = 4 * float(np.finfo(np.float32).eps)
+"""Of the largest coordinate: the same, of positions that were stored as float32."""
 ELEMENTS = ("hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced")
 """Of coarse models: those whose nodes are the corners of the cells, as a data set's."""
 
@@ -158,40 +147,47 @@ def shard_from_arrays(
         cell or node.
     """
     motions = [motions] if isinstance(motions, ImportedMotion) else list(motions)
-    mesh = HexMesh.create(real_array("points", points), integer_array("cells", cells))
-    count, nodes = len(mesh.cells), len(mesh.positions)
-    moduli = {
-        name: per_cell(name, values, count)
-        for name, values in (("young", young), ("poisson", poisson), ("density", density))
-    }
-    time_step = float(finite_array("time_step", time_step, ()))
-    check_moduli(moduli, time_step)
     if not motions:
         raise InputError("no simulations: expected at least one.")
-    movable = bool_array("free", free, (nodes, 3))
-    stepper = None
+    mesh = HexMesh.create(
+        _array("points", points, (None, 3)), _array("cells", cells, (None, 8), np.int64)
+    )
+    count, nodes = len(mesh.cells), len(mesh.positions)
+    moduli = {
+        name: _array(name, values if np.ndim(values) else np.full(count, values), (count,))
+        for name, values in (("young", young), ("poisson", poisson), ("density", density))
+    }
+    time_step = float(_array("time_step", time_step, ()))
+    if (moduli["poisson"] < 0).any() or (moduli["poisson"] >= 0.5).any():
+        raise InputError("poisson: expected 0 or more and less than 0.5 in every cell.")
+    movable = _array("free", free, (nodes, 3), np.bool_)
+    model, better = None, None
     if scene is not None:
         scene, time_step = _in_step(scene, time_step)
-        stepper = _stepper(scene, mesh, {"free": movable, **moduli})
-    better = _best_stepper(scene) if best else None
+        model = _stepper(scene, mesh, {"free": movable, **moduli})
+    if best:
+        better = _best_stepper(scene)
     if mass is not None:
-        masses = finite_array("mass", mass, (nodes,))
+        masses = _array("mass", mass, (nodes,))
     else:
-        masses = _lumped(mesh, moduli["density"]) if stepper is None else stepper.problem.mass
-    if (masses <= 0).any():
-        raise InputError("mass: expected more than 0 kg at every node.")
+        masses = (
+            lumped(Space(mesh).mass(moduli["density"])) if model is None else model.problem.mass
+        )
+    for name, values in {**moduli, "mass": masses, "time_step": np.array(time_step)}.items():
+        if name != "poisson" and (values <= 0).any():
+            raise InputError(f"{name}: {values.min():g}: expected more than 0.")
+    body = _Body(mesh, movable, model, better, time_step)
     simulations = tuple(
-        _simulation(f"simulation {k}", motion, mesh, movable, stepper, time_step, better)
-        for k, motion in enumerate(motions)
+        _simulation(f"simulation {k}", motion, body) for k, motion in enumerate(motions)
     )
-    _check_alike(simulations)
     if scene is not None:
         text = portable(scene).to_toml()
         simulations = tuple(replace(one, scene_toml=text) for one in simulations)
     return Shard(
         attributes={
             "dataset": dataset, "split": split, "number": number, "setting": SETTING,
-            "config_hash": "", "time_step": time_step, "tolerance": _tolerance(scene),
+            "config_hash": "", "time_step": time_step,
+            "tolerance": 0.0 if scene is None else scene.solver.tolerance,
         },
         points=mesh.positions, cells=mesh.cells, free=movable, mass=masses,
         young=moduli["young"], poisson=moduli["poisson"], density=moduli["density"],
@@ -199,69 +195,118 @@ def shard_from_arrays(
     )  # fmt: skip
 
 
-def _simulation(
-    where: str,
-    motion: ImportedMotion,
-    mesh: HexMesh,
-    free: Array,
-    stepper: ProjectiveDynamics | None,
-    time_step: float,
-    better: ProjectiveDynamics | None,
-) -> Simulation:
-    if not isinstance(motion, ImportedMotion):
-        raise InputError(f"{where}: {type(motion).__name__}: expected ImportedMotion.")
-    nodes = len(mesh.positions)
-    frames = _frames(f"{where}, reference", motion.reference)
-    every, steps = (frames, nodes, 3), (frames - 1, nodes, 3)
-    reference = finite_array(f"{where}, reference", motion.reference, every)
-    reference = from_rest(f"{where}, reference", reference, mesh)
-    check_volumes(f"{where}, reference", reference, mesh)
-    reference = with_held_nodes(f"{where}, reference", reference, mesh, free)
-    coarse = optional_array(f"{where}, coarse", motion.coarse, every)
-    if coarse is not None:
-        coarse = from_rest(f"{where}, coarse", coarse, mesh)
-        coarse = with_held_nodes(f"{where}, coarse", coarse, mesh, free)
-    forces = optional_array(f"{where}, forces", motion.forces, steps)
-    predictions = optional_array(f"{where}, predictions", motion.predictions, steps)
-    if stepper is not None:
-        if predictions is None:
-            predictions = _predict(stepper, reference, time_step)
-        if forces is None:
-            forces = _loads(stepper.problem, reference, time_step)
-    if predictions is not None:
-        predictions = with_held_nodes(f"{where}, predictions", predictions, mesh, free)
-    runs = {REFERENCE: Run(reference, attributes={"solver": "imported", "time_step": time_step})}
-    if coarse is not None or predictions is not None:
-        runs[PLAIN] = Run(coarse, predictions, attributes={"time_step": time_step})
-    if better is not None:
-        rolled = _roll_out(better, where, frames - 1)
-        single = with_held_nodes(
-            f"{where}, best", _predict(better, reference, time_step), mesh, free
+def _array(
+    name: str, values: ArrayLike, shape: tuple[int | None, ...], dtype: DTypeLike = np.float64
+) -> Array:
+    """Values as a finite array of a shape, in which None is any length, and of a type."""
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: expected an array of shape {shape}.") from None
+    fits = given.ndim == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, given.shape, strict=True)
+    )
+    if given.dtype.kind not in "biuf" or not fits:
+        raise InputError(
+            f"{name}: {given.dtype} of shape {given.shape}: expected numbers of shape {shape}."
         )
-        runs[BEST] = Run(rolled, single, attributes={"time_step": time_step})
-    return Simulation(np.zeros(steps) if forces is None else forces, runs)
+    with np.errstate(invalid="ignore"):
+        found = np.asarray(given, dtype=dtype, order="C")
+    wrong = ~np.isfinite(given) | (found != given)
+    if wrong.any():
+        place = tuple(np.argwhere(wrong)[0].tolist())
+        raise InputError(
+            f"{name}: {given[place]} at {list(place)}: expected finite {np.dtype(dtype)}."
+        )
+    return found
 
 
-def _check_alike(simulations: Sequence[Simulation]) -> None:
-    """Refuse simulations of which one has a rollout or predictions and another has not."""
-    for name in ("positions", "predictions"):
-        given = [getattr(one.runs.get(PLAIN), name, None) is not None for one in simulations]
-        if any(given) and not all(given):
-            word = "coarse" if name == "positions" else name
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """What the simulations of a file share; the steppers are of coarse models, if any."""
+
+    mesh: HexMesh
+    free: Array
+    plain: ProjectiveDynamics | None
+    best: ProjectiveDynamics | None
+    time_step: float
+
+    @property
+    def tolerance(self) -> float:
+        """How far from the rest shape what rests may be, m."""
+        shortest = shortest_edges(self.mesh.positions, self.mesh.cells).min()
+        return float(_AT_REST * shortest + _ROUNDING * np.abs(self.mesh.positions).max())
+
+    def from_rest(self, where: str, positions: Array) -> Array:
+        """Positions (T+1, N, 3) with exactly the rest shape in frame 0; refuse another there."""
+        away = np.linalg.norm(positions[0] - self.mesh.positions, axis=1)
+        node = int(np.argmax(away))
+        if away[node] > self.tolerance:
             raise InputError(
-                f"simulation {given.index(False)} has no {word}, unlike simulation "
-                f"{given.index(True)}: expected {word} of all simulations of a mesh, or of none."
+                f"{where}: in frame 0 node {node} is {away[node]:.3g} m away from its rest "
+                "position: expected the rest shape."
             )
+        return np.concatenate([self.mesh.positions[None], positions[1:]])
+
+    def held(self, where: str, positions: Array) -> Array:
+        """Positions (T, N, 3) with held components exactly at rest; refuse those that move."""
+        away = np.where(self.free, 0.0, np.abs(positions - self.mesh.positions))
+        frame, node, axis = (int(i) for i in np.unravel_index(np.argmax(away), away.shape))
+        if away[frame, node, axis] > self.tolerance:
+            raise InputError(
+                f"{where}[{frame}]: node {node} is held in {'xyz'[axis]} and "
+                f"{away[frame, node, axis]:.3g} m away from its rest position: expected held "
+                "components to stay there; clamps that move are not supported."
+            )
+        return np.where(self.free, positions, self.mesh.positions)
+
+    def check_volumes(self, where: str, positions: Array) -> None:
+        """Refuse cells with det F <= 0 at a point of the 2 x 2 x 2 Gauss rule."""
+        points = gauss_points(2)
+        rest = jacobians(self.mesh.positions, self.mesh.cells, points)
+        for frame, now in enumerate(positions):
+            ratios = jacobians(now, self.mesh.cells, points) / rest
+            if ratios.min() <= 0:
+                cell = int(np.argmin(ratios.min(axis=1)))
+                raise InputError(
+                    f"{where}: in frame {frame} cell {cell} is inverted (det F = "
+                    f"{ratios[cell].min():.3g}): expected det F > 0."
+                )
 
 
-def _frames(name: str, positions: ArrayLike) -> int:
-    """T + 1, of positions (T+1, N, 3)."""
-    shape = real_array(name, positions).shape
-    if len(shape) != 3:
-        raise InputError(f"{name}: shape {shape}: expected (T + 1, N, 3).")
-    if shape[0] < 2:
-        raise InputError(f"{name}: {shape[0]} frames: expected 2 or more.")
-    return shape[0]
+def _simulation(where: str, motion: ImportedMotion, body: _Body) -> Simulation:
+    nodes, step = len(body.mesh.positions), {"time_step": body.time_step}
+    reference = _array(f"{where}, reference", motion.reference, (None, nodes, 3))
+    frames = len(reference)
+    if frames < 2:
+        raise InputError(f"{where}, reference: {frames} frames: expected 2 or more.")
+    reference = body.from_rest(f"{where}, reference", reference)
+    body.check_volumes(f"{where}, reference", reference)
+    reference = body.held(f"{where}, reference", reference)
+    coarse, predictions = None, None
+    if motion.coarse is not None:
+        coarse = _array(f"{where}, coarse", motion.coarse, (frames, nodes, 3))
+        coarse = body.held(f"{where}, coarse", body.from_rest(f"{where}, coarse", coarse))
+    if motion.predictions is not None:
+        shape = (frames - 1, nodes, 3)
+        predictions = _array(f"{where}, predictions", motion.predictions, shape)
+    elif body.plain is not None:
+        predictions = _predict(body.plain, reference, body.time_step)
+    if predictions is not None:
+        predictions = body.held(f"{where}, predictions", predictions)
+    if motion.forces is not None:
+        forces = _array(f"{where}, forces", motion.forces, (frames - 1, nodes, 3))
+    elif body.plain is not None:
+        forces = _loads(body.plain.problem, reference, body.time_step)
+    else:
+        forces = np.zeros((frames - 1, nodes, 3))
+    runs = {REFERENCE: Run(reference, attributes={"solver": "imported", **step})}
+    if coarse is not None or predictions is not None:
+        runs[PLAIN] = Run(coarse, predictions, attributes=step)
+    if body.best is not None:
+        single = body.held(f"{where}, best", _predict(body.best, reference, body.time_step))
+        runs[BEST] = Run(_roll_out(body.best, where, frames - 1), single, attributes=step)
+    return Simulation(forces, runs)
 
 
 def _in_step(scene: Scene, time_step: float) -> tuple[Scene, float]:
@@ -351,19 +396,3 @@ def _loads(problem: Problem, reference: Array, time_step: float) -> Array:
         problem.external_forces(t * time_step, (t + 1) * time_step, reference[t])
         for t in range(len(reference) - 1)
     ])  # fmt: skip
-
-
-def _tolerance(scene: Scene | None) -> float:
-    """Of the coarse model's steps, of the cell size; 0 where it is not known."""
-    return 0.0 if scene is None else float(scene.solver.tolerance)
-
-
-def _lumped(mesh: HexMesh, density: Array) -> NDArray[np.float64]:
-    """Density times the integral of each node's shape functions, (N,), kg."""
-    points = gauss_points(2)
-    factors = np.where(VTK_CORNERS == 1, points[:, None], 1 - points[:, None])
-    shapes = factors.prod(axis=-1)  # (8 points, 8 corners)
-    volumes = jacobians(mesh.positions, mesh.cells, points) / len(points)
-    shares = density[:, None] * (volumes @ shapes)
-    masses = np.bincount(mesh.cells.ravel(), shares.ravel(), minlength=len(mesh.positions))
-    return np.asarray(masses, dtype=np.float64)

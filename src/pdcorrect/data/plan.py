@@ -8,7 +8,7 @@ generated alone, in any order.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from pdcorrect.data.configuration import (
     MotionRange,
     Split,
 )
-from pdcorrect.data.families import PUBLISHED, Box, Design, count_bodies, draw, extreme
+from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
 
@@ -90,35 +90,12 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     known: set[str] = set()
     splits: list[tuple[str, Split]] = [(TRAINING, config.training), (EVALUATION, config.evaluation)]
     splits += [(extra.name, extra) for extra in config.extra]
-    _check_counts(config, splits)
     for number, (name, split) in enumerate(splits):
         found = list(_split(config, name, split, number, known))
         if name == TRAINING:
             found = _with_validation(found, config.validation_share)
         plans += found
     return plans
-
-
-def _check_counts(config: DatasetConfig, splits: Sequence[tuple[str, Split]]) -> None:
-    """Refuse to draw more bodies than there are."""
-    wanted: dict[FamilyName, dict[str, int]] = {}
-    for name, split in splits:
-        wanted.setdefault(_family(config, split), {})[name] = split.meshes
-    for family, meshes in wanted.items():
-        nodes = _nodes(config, family)
-        there, total = count_bodies(family, nodes), sum(meshes.values())
-        if there < total:
-            raise InputError(
-                f"{_too_few(family, nodes, there)}, the configuration asks for {total} meshes "
-                f"({', '.join(f'{name} {count}' for name, count in meshes.items())}). {_ADVICE}"
-            )
-
-
-_ADVICE = "Ask for fewer meshes or a wider range."
-
-
-def _too_few(family: FamilyName, nodes: tuple[int, int], there: int) -> str:
-    return f"coarse_nodes = {as_toml(nodes)}: family {family!r} has {there} bodies there"
 
 
 def _family(config: DatasetConfig, split: Split) -> FamilyName:
@@ -167,8 +144,8 @@ def _new_design(
             known.add(design.key())
             return design
     raise InputError(
-        f"{_too_few(family, nodes, count_bodies(family, nodes))}, and {_DRAWS} draws in a row gave "
-        f"one that another mesh has. {_ADVICE}"
+        f"coarse_nodes = {as_toml(nodes)}: {_DRAWS} bodies of family {family!r} were drawn "
+        f"that {len(known)} meshes have already. Ask for fewer meshes or a wider range."
     )
 
 
@@ -185,10 +162,7 @@ def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
     """The same with the last ``share`` of the training meshes as validation split."""
     count = round(share * len(meshes))
     kept = len(meshes) - count
-    moved = [
-        MeshPlan(**{**vars(mesh), "split": VALIDATION, "number": i})
-        for i, mesh in enumerate(meshes[kept:])
-    ]
+    moved = [replace(mesh, split=VALIDATION, number=i) for i, mesh in enumerate(meshes[kept:])]
     return meshes[:kept] + moved
 
 

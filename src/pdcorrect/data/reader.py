@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.folder import Damage, Folders, folders_of, shard_paths, whole_files
+from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
 from pdcorrect.data.samples import (
     DecodedShard,
     GraphSizes,
@@ -23,7 +25,8 @@ from pdcorrect.data.samples import (
     joined_fields,
     window_numbers,
 )
-from pdcorrect.data.shard_arrays import RecentlyUsed, ShardHeader, read_arrays, read_header
+from pdcorrect.data.schema import REFERENCE
+from pdcorrect.data.shard_reader import ShardHeader, read_header, read_shard
 from pdcorrect.errors import InputError, require_extra
 
 require_extra("torch_geometric", "learn")
@@ -62,7 +65,7 @@ class ShardShuffle(Sampler[int]):
     Raises
     ------
     InputError
-        If a number is out of range, or there are fewer windows than ranks.
+        If there is no such rank, or there are fewer windows than ranks.
     """
 
     def __init__(
@@ -74,12 +77,8 @@ class ShardShuffle(Sampler[int]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        if seed < 0:
-            raise InputError(f"seed = {seed}: expected 0 or more.")
         if not 0 <= rank < world_size:
             raise InputError(f"rank = {rank} of {world_size}: expected 0 to {world_size - 1}.")
-        if block is not None and block < 1:
-            raise InputError(f"block = {block}: expected 1 file or more.")
         self._owners = dataset.shard_numbers()
         if len(self._owners) < world_size:
             raise InputError(f"{len(self._owners)} windows for {world_size} ranks: expected more.")
@@ -242,15 +241,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         super().__init__()
         if not isinstance(window, (int, np.integer)) or window < 1:
             raise InputError(f"window = {window}: expected 1 step or more, a whole number.")
-        if isinstance(runs, str):
-            raise InputError(f"runs = {runs!r}: expected a list of names, such as [{runs!r}].")
         self.folders, self.split = folders_of(folder), split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
         self.damaged: Damage = {}
-        every = [path for each in self.folders for path in shard_paths(each, split, without)]
-        paths = whole_files(every, self.damaged if skip_damaged else None)
-        self.headers = [read_header(path) for path in paths]
+        paths = [path for each in self.folders for path in shard_paths(each, split, without)]
+        self.headers = read_files(
+            paths, partial(read_header, verify=skip_damaged), self.damaged if skip_damaged else None
+        )
         for header in self.headers:
             _check_runs(header, base, self.runs)
         counts = [max(0, steps - window + 1) for h in self.headers for steps in h.steps]
@@ -266,7 +264,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
                 f"{names}, {split}: no simulation has {window} steps, the longest {longest}: "
                 "expected a smaller window."
             )
-        self._shards = RecentlyUsed(self._load, decoded_bytes, cache_bytes)
+        self._shards = RecentlyUsed(self._load, cache_bytes)
 
     def len(self) -> int:
         """Number of windows."""
@@ -314,8 +312,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
-        for idx in numbers[(numbers < 0) | (numbers >= self.len())]:
-            raise self._no_window(int(idx))
+        if len(numbers) and not 0 <= numbers.min() <= numbers.max() < self.len():
+            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
         rows = np.searchsorted(self._starts, numbers, side="right") - 1
         files, simulations = self._owners[rows].T
         return files, simulations, numbers - self._starts[rows]
@@ -326,7 +324,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def forget(self) -> None:
         """Drop all decoded files from memory."""
-        self._shards = RecentlyUsed(self._load, decoded_bytes, self.cache_bytes)
+        self._shards = RecentlyUsed(self._load, self.cache_bytes)
 
     def shard_numbers(self) -> NDArray[np.int64]:
         """For each window the number of its file in the split, (len(self),)."""
@@ -344,7 +342,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def _place(self, idx: int) -> WindowPlace:
         if not 0 <= idx < self.len():
-            raise self._no_window(idx)
+            raise IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
         row = int(np.searchsorted(self._starts, idx, side="right")) - 1
         number, simulation = self._owners[row].tolist()
         shard = self._shards[number]
@@ -353,13 +351,46 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             idx - int(self._starts[row]),
         )  # fmt: skip
 
-    def _no_window(self, idx: int) -> IndexError:
-        return IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
-
     def _load(self, number: int) -> DecodedShard:
-        path = self.headers[number].path
-        mesh, motions = read_arrays(path, (self.base,) if self.base else (), self.runs)
-        return decode(mesh, motions, self.base, self.dtype)
+        wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))
+        if self.base is not None:
+            wanted[self.base] = (*wanted.get(self.base, ()), "predictions")
+        wanted[REFERENCE] = ("positions", "velocities")
+        shard = read_shard(self.headers[number].path, runs=wanted, verify=False)
+        return decode(shard, self.base, self.runs, self.dtype)
+
+
+class RecentlyUsed:
+    """Decoded files by number; the least recently used go first when they exceed ``limit`` bytes.
+
+    The one asked for last always stays, however large.  A pickled copy is empty.
+    """
+
+    def __init__(self, load: Callable[[int], DecodedShard], limit: int) -> None:
+        self.load, self.limit = load, limit
+        self.bytes = 0
+        self._files: OrderedDict[int, DecodedShard] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._files
+
+    def __getitem__(self, number: int) -> DecodedShard:
+        if number in self._files:
+            self._files.move_to_end(number)
+            return self._files[number]
+        found = self.load(number)
+        self._files[number] = found
+        self.bytes += decoded_bytes(found)
+        while self.bytes > self.limit and len(self._files) > 1:
+            _, oldest = self._files.popitem(last=False)
+            self.bytes -= decoded_bytes(oldest)
+        return found
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "bytes": 0, "_files": OrderedDict()}
 
 
 class TrajectoryLoader(DataLoader[Any]):
@@ -379,11 +410,6 @@ class TrajectoryLoader(DataLoader[Any]):
     **options
         Of ``torch.utils.data.DataLoader``, such as ``num_workers``, ``persistent_workers``,
         ``multiprocessing_context`` and ``pin_memory``.
-
-    Raises
-    ------
-    InputError
-        If ``shuffle`` is among them: a `ShardShuffle` does that.
     """
 
     def __init__(
@@ -396,11 +422,6 @@ class TrajectoryLoader(DataLoader[Any]):
         assemble: Callable[[Sequence[int]], Any] | None = None,
         **options: Any,
     ) -> None:
-        if options.pop("shuffle", False):
-            raise InputError(
-                "shuffle = True: expected a sampler that reads file by file, such as "
-                "TrajectoryLoader(dataset, batch_size, ShardShuffle(dataset))."
-            )
         self.shuffle, self.windows = sampler, batch_size
         order = SequentialSampler(dataset) if sampler is None else sampler
         self._position = 0 if sampler is None else sampler.position
@@ -464,15 +485,12 @@ def _unchanged(batch: Any) -> Any:
 def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> None:
     for k, (rollouts, predictions) in enumerate(header.runs):
         if base is not None and base not in predictions:
-            names = sorted(predictions)
-            found = f"expected one of {', '.join(names)}" if names else "it has none at all"
             raise InputError(
-                f"{header.path}: simulation {k} has no predictions of run {base!r}: {found} "
-                "(base=None leaves them out)."
+                f"{header.path}: simulation {k} has no predictions of run {base!r}: expected one "
+                f"of {', '.join(sorted(predictions)) or 'none'} (base=None leaves them out)."
             )
-        missing = sorted(set(runs) - rollouts)
-        if missing:
+        if not rollouts.issuperset(runs):
             raise InputError(
-                f"{header.path}: simulation {k} has no positions of run {missing[0]!r}: expected "
-                f"some of {', '.join(sorted(rollouts))}."
+                f"{header.path}: simulation {k} has no positions of run "
+                f"{min(set(runs) - rollouts)!r}: expected some of {', '.join(sorted(rollouts))}."
             )

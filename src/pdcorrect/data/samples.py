@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pdcorrect.data.shard_arrays import MeshArrays, MotionArrays, ShardHeader
+from pdcorrect.data.schema import REFERENCE, Shard, Simulation
+from pdcorrect.data.shard_reader import ShardHeader
 from pdcorrect.errors import require_extra
+from pdcorrect.fem.graph import mesh_edges, node_means, velocities
 
 require_extra("torch_geometric", "learn")
 
@@ -19,8 +20,9 @@ import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
 from torch_geometric.data import Batch, Data  # noqa: E402
 
-_MESH = ("rest", "free", "mass", "young", "poisson", "density")
-_CELLS = ("cell_young", "cell_poisson", "cell_density")
+_MODULI = ("young", "poisson", "density")
+_MESH = ("rest", "free", "mass", *_MODULI)
+_CELLS = tuple(f"cell_{name}" for name in _MODULI)
 _GRAPHS = ("file", "mesh", "simulation", "frame", "time", "time_step")
 _INDICES = ("cells", "edge_index")
 _ALIGNMENT = 64
@@ -90,32 +92,45 @@ class WindowPlace(NamedTuple):
     frame: int
 
 
-def decode(
-    mesh: MeshArrays, motions: Sequence[MotionArrays], base: str | None, dtype: torch.dtype
-) -> DecodedShard:
-    """A file's arrays as tensors, floats of ``dtype``, with the predictions of run ``base``."""
+def decode(shard: Shard, base: str | None, runs: Sequence[str], dtype: torch.dtype) -> DecodedShard:
+    """A file's arrays as tensors, floats of ``dtype``.
 
-    def tensor(values: NDArray[Any]) -> Tensor:
+    Parameters
+    ----------
+    shard : Shard
+    base : str or None
+        Run whose predictions are wanted.
+    runs : sequence of str
+        Runs whose rollouts are wanted.
+    dtype : torch.dtype
+    """
+
+    def tensor(values: Any) -> Tensor:
         found = torch.from_numpy(values)
         return found.to(dtype) if found.is_floating_point() else found
 
+    def motion(simulation: Simulation) -> DecodedMotion:
+        reference = simulation.runs[REFERENCE]
+        positions: Any = reference.positions
+        if reference.velocities is None:
+            speeds = velocities(positions[:-1], float(shard.attributes["time_step"]))
+        else:
+            speeds = reference.velocities[:-1]
+        steps = {"forces": tensor(simulation.forces)}
+        if base:
+            steps["predictions"] = tensor(simulation.runs[base].predictions)
+        rollouts = {f"run_{name}": tensor(simulation.runs[name].positions) for name in runs}
+        return DecodedMotion(tensor(positions), tensor(speeds), steps, rollouts)
+
+    cells = shard.cells.astype(np.int64)
+    means = {n: node_means(getattr(shard, n), cells, len(shard.points)) for n in _MODULI}
+    nodal = {"rest": shard.points, "free": shard.free, "mass": shard.mass, **means}
     return DecodedShard(
-        nodal={name: tensor(getattr(mesh, name)) for name in _MESH},
-        cellwise={name: tensor(getattr(mesh, name)) for name in _CELLS},
-        cells=tensor(mesh.cells),
-        edge_index=tensor(mesh.edge_index),
-        motions=[
-            DecodedMotion(
-                positions=tensor(motion.positions),
-                velocities=tensor(motion.velocities),
-                steps={
-                    "forces": tensor(motion.forces),
-                    **({"predictions": tensor(motion.predictions[base])} if base else {}),
-                },
-                rollouts={f"run_{name}": tensor(x) for name, x in motion.rollouts.items()},
-            )
-            for motion in motions
-        ],
+        nodal={name: tensor(values) for name, values in nodal.items()},
+        cellwise={f"cell_{name}": tensor(getattr(shard, name)) for name in _MODULI},
+        cells=tensor(cells),
+        edge_index=tensor(mesh_edges(cells)),
+        motions=[motion(simulation) for simulation in shard.simulations],
     )
 
 

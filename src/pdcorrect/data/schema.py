@@ -56,8 +56,6 @@ HASH = "content_hash"
 _UNHASHED = ("provenance", "cost")
 
 Array = NDArray[Any]
-Content = Mapping[str, Array | Mapping[str, Any]]
-"""Arrays of datasets and attributes of groups, by their places in a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +130,8 @@ class Shard:
         See the layout.
     simulations : tuple of Simulation
     provenance : mapping of str to str
+    content_hash : str
+        Of the file that it was read from, without provenance and cost; else empty.
     """
 
     attributes: Mapping[str, str | int | float]
@@ -144,9 +144,10 @@ class Shard:
     density: Array
     simulations: tuple[Simulation, ...]
     provenance: Mapping[str, str] = field(default_factory=dict)
+    content_hash: str = ""
 
 
-MESH = {
+MESH: Mapping[str, tuple[str, type, tuple[int | str, ...]]] = {
     "points": ("mesh/points", np.float64, ("N", 3)),
     "cells": ("mesh/cells", np.int32, ("C", 8)),
     "free": ("mesh/free", np.bool_, ("N", 3)),
@@ -156,11 +157,18 @@ MESH = {
     "density": ("material/density", np.float64, ("C",)),
 }
 """Arrays of a `Shard`: place, type and shape."""
+MOTION: Mapping[str, tuple[int | str, ...]] = {
+    "positions": ("T+1", "N", 3),
+    "velocities": ("T+1", "N", 3),
+    "predictions": ("T", "N", 3),
+}
+"""Arrays of a `Run`, m and m/s, and their shapes."""
 STATISTICS = {
     "iterations": np.int32,
     "error_estimates": np.float32,
     "smallest_volume_ratios": np.float32,
 }
+"""Of a run's steps, (T,): types."""
 ATTRIBUTES = {
     "dataset": str, "split": str, "number": int, "setting": str, "config_hash": str,
     "time_step": float, "tolerance": float,
@@ -200,7 +208,7 @@ def write_shard(
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK) as file:
         _fill(file, shard, np.dtype(dtype))
-        found = content_hash(content_of(file))
+        found = content_hash(file)
         file.attrs[HASH] = found
     seal(image.getbuffer())
     try:
@@ -216,7 +224,6 @@ def write_shard(
 
 def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-    file.attrs.update(dict(shard.attributes))
     for name, wanted in ATTRIBUTES.items():
         file.attrs[name] = wanted(shard.attributes[name])
     for name, (place, kind, _) in MESH.items():
@@ -236,7 +243,7 @@ def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
 
 def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
     group.attrs.update(dict(run.attributes))
-    for name in ("positions", "velocities", "predictions"):
+    for name in MOTION:
         if getattr(run, name) is not None:
             _array(group, name, getattr(run, name), dtype)
     for name, values in run.statistics.items():
@@ -251,29 +258,22 @@ def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) ->
     )  # fmt: skip
 
 
-def content_hash(content: Content) -> str:
-    """SHA-256 of a file's content; see `content_of`."""
+def content_hash(file: h5py.File) -> str:
+    """SHA-256 of a file's arrays and of its groups' attributes: all but provenance and cost."""
+    items: dict[str, h5py.Group | h5py.Dataset] = {"": file}
+    file.visititems(items.__setitem__)
     digest = hashlib.sha256()
-    for name in sorted(content, key=lambda place: place.split("/")):
-        item = content[name]
-        digest.update(f"{name}\n".encode())
-        if isinstance(item, np.ndarray):
-            digest.update(f"{item.dtype.str}{item.shape}\n".encode())
-            digest.update(np.ascontiguousarray(item).data)
+    for name in sorted(items, key=lambda place: place.split("/")):
+        if name.split("/")[0] in _UNHASHED:
             continue
-        for key in sorted(item):
+        item = items[name]
+        digest.update(f"{name}\n".encode())
+        if isinstance(item, h5py.Dataset):
+            values = item[()]
+            digest.update(f"{values.dtype.str}{values.shape}\n".encode())
+            digest.update(np.ascontiguousarray(values).data)
+            continue
+        for key in sorted(item.attrs):
             if key != HASH:
-                digest.update(f"{key}={np.asarray(item[key]).tolist()!r}\n".encode())
+                digest.update(f"{key}={np.asarray(item.attrs[key]).tolist()!r}\n".encode())
     return digest.hexdigest()
-
-
-def content_of(file: h5py.File) -> Content:
-    """Datasets, and attributes of groups, by place: all but provenance and cost."""
-    found: dict[str, Array | dict[str, Any]] = {"": dict(file.attrs)}
-
-    def note(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if name.split("/")[0] not in _UNHASHED:
-            found[name] = item[()] if isinstance(item, h5py.Dataset) else dict(item.attrs)
-
-    file.visititems(note)
-    return found

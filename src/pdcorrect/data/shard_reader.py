@@ -1,64 +1,105 @@
-"""Reading the files of a data set; every fault becomes one sentence that names the file."""
+"""Reading the files of a data set; every fault becomes one sentence that names the file.
+
+Files are opened, read and closed at once: nothing here keeps a handle.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import io
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from pdcorrect.data.checksum import FORMAT, VERSION, check_seal, read_sealed
-from pdcorrect.data.hdf5_checks import (
-    RefusalError,
-    Value,
-    attributes_of,
-    check_inside,
-    check_links,
-    check_types,
-    members_of,
-    symbols,
-    texts,
-    type_name,
-    values_of,
-    words,
-)
+from pdcorrect.data.checksum import check_seal
 from pdcorrect.data.schema import (
     ATTRIBUTES,
     HASH,
     MESH,
+    MOTION,
     STATISTICS,
     Array,
     Run,
     Shard,
     Simulation,
-    content_hash,
 )
 from pdcorrect.errors import FileFormatError
 
-_GROUPS = frozenset({"mesh", "material", "simulations", "provenance", "cost"})
-_PARTS = frozenset({"forces", "runs"})
-_RESERVED = frozenset({"format", "version", HASH})
-"""Attributes of the file that are not the shard's."""
-_FLOATS = (np.dtype("<f4"), np.dtype("<f8"))
-_RUN = {
-    "positions": (_FLOATS, ("T+1", "N", 3)),
-    "velocities": (_FLOATS, ("T+1", "N", 3)),
-    "predictions": (_FLOATS, ("T", "N", 3)),
-    **{name: ((np.dtype(kind),), ("T",)) for name, kind in STATISTICS.items()},
-}
-"""Datasets of a run: types and shape."""
+Lengths = dict[int | str, int]
+"""Of the axes that were met so far: N, C, and of a simulation T and T+1."""
+
+
+@dataclass(frozen=True)
+class ShardHeader:
+    """What a file holds, found without reading its arrays.
+
+    Attributes
+    ----------
+    path : Path
+    number : int
+        Of the mesh in its split.
+    nodes, cells : int
+    steps : tuple of int
+        T of each simulation.
+    runs : tuple of (names of runs with positions, names of runs with predictions)
+        For each simulation.
+    time_step : float
+        s.
+    config_hash, content_hash : str
+    """
+
+    path: Path
+    number: int
+    nodes: int
+    cells: int
+    steps: tuple[int, ...]
+    runs: tuple[tuple[frozenset[str], frozenset[str]], ...]
+    time_step: float
+    config_hash: str
+    content_hash: str
+
+
+def read_header(path: str | Path, *, verify: bool = False) -> ShardHeader:
+    """Sizes and names of a file of a data set.
+
+    Parameters
+    ----------
+    path : path
+    verify : bool
+        Compare the file with its checksum, which reads all of it.
+
+    Raises
+    ------
+    FileFormatError
+        If it is damaged or something else.
+    """
+    with _opened(Path(path), verify) as file:
+        groups = [file["simulations"][key] for key in sorted(file["simulations"])]
+        return ShardHeader(
+            path=Path(path),
+            number=int(file.attrs["number"]),
+            nodes=len(file[MESH["points"][0]]),
+            cells=len(file[MESH["cells"][0]]),
+            steps=tuple(len(group["forces"]) for group in groups),
+            runs=tuple((_with(g, "positions"), _with(g, "predictions")) for g in groups),
+            time_step=float(file.attrs["time_step"]),
+            config_hash=str(file.attrs["config_hash"]),
+            content_hash=str(file.attrs[HASH]),
+        )
+
+
+def _with(simulation: h5py.Group, name: str) -> frozenset[str]:
+    return frozenset(run for run, group in simulation["runs"].items() if name in group)
 
 
 def read_shard(
     path: str | Path,
     *,
     simulations: Collection[int] | None = None,
-    runs: Collection[str] | None = None,
+    runs: Collection[str] | Mapping[str, Collection[str]] | None = None,
     verify: bool = True,
 ) -> Shard:
     """Read a file of a data set.
@@ -68,13 +109,13 @@ def read_shard(
     path : path
     simulations : collection of int, optional
         Numbers of those to read, in this order; all by default.
-    runs : collection of str, optional
-        Names of those to read; all by default.
+    runs : collection of str, or mapping of str to collections of str, optional
+        Names of those to read, as far as they are there; with names of arrays, such as
+        "predictions", only these of each.  All by default.
     verify : bool
         Compare the file with its checksum, which reads all of it and finds every changed
-        byte, and, where all is read, the content with its hash.  Without, only what is
-        asked for is read, and only its size, format, types and values are checked: for
-        files that were verified before.
+        byte.  Without, only its size and version are compared, and what is read has HDF5's
+        checksums.
 
     Returns
     -------
@@ -83,283 +124,102 @@ def read_shard(
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is damaged, is something else or lacks what is asked
-        for; the message names the file and the reason.
+        If the file cannot be read, is damaged, is something else or lacks a simulation that
+        is asked for; the message names the file and the reason.
     """
-    path = Path(path)
-    with opened(path, verify) as file:
-        reader = _Reader(file, file.id.get_filesize())
-        shard = reader.shard(simulations, runs)
-        if verify and simulations is None and runs is None:
-            reader.check_hash()
-        return shard
-
-
-@contextlib.contextmanager
-def opened(path: Path, verify: bool) -> Iterator[h5py.File]:
-    """A file of a data set, open; whatever fails in it is a `FileFormatError`.
-
-    ``verify`` compares the file with its checksum first, see `read_shard`.  Whoever reads
-    need not look at what is there: where that fails, the reason is what `read_shard` says.
-    """
-    try:
-        with _unsealed(path, verify) as file:
-            try:
-                yield file
-            except FileFormatError:
-                raise
-            except Exception:
-                _Reader(file, file.id.get_filesize()).shard(None, None)
-                raise
-    except FileFormatError:
-        raise
-    except RefusalError as refusal:
-        raise FileFormatError(f"{path}: {' '.join(str(refusal).split())}.") from None
-    except Exception as error:  # HDF5 raises nearly every type on damaged bytes
-        text = str(error.args[0]).splitlines() if error.args else []
-        reason = text[0] if text else type(error).__name__
-        raise FileFormatError(f"{path}: damaged, HDF5 cannot read it ({reason}).") from error
-
-
-def stored_hashes(path: Path) -> tuple[str, str]:
-    """The hashes of its configuration and its content that a file holds, if its seal is right.
-
-    Raises
-    ------
-    FileFormatError
-        As `read_shard`.
-    """
-    with opened(path, verify=True) as file:
-        return str(file.attrs["config_hash"]), str(file.attrs[HASH])
-
-
-@contextlib.contextmanager
-def _unsealed(path: Path, verify: bool) -> Iterator[h5py.File]:
-    if verify:
-        with h5py.File(io.BytesIO(read_sealed(path)), "r") as file:
-            yield file
-        return
-    check_seal(path)
-    with h5py.File(path, "r", locking=False) as file:
-        yield file
-
-
-@dataclass(eq=False)
-class _Reader:
-    """Reads and checks one open file.
-
-    Attributes
-    ----------
-    size : int
-        Bytes of the file.
-    content : dict of str to arrays or attributes
-        What was read so far of what counts for the hash.
-    lengths : dict of str to int
-        Of the axes: N, C, and of the simulation being read T and T+1.
-    """
-
-    file: h5py.File
-    size: int
-    content: dict[str, Array | dict[str, Any]] = field(default_factory=dict)
-    lengths: dict[str, int] = field(default_factory=dict)
-
-    def shard(self, simulations: Collection[int] | None, runs: Collection[str] | None) -> Shard:
-        """The file's content, or the chosen part of it."""
-        check_links(self.file)
-        self._check_members(self.file, "", _GROUPS, _GROUPS)
-        attributes = self._noted(self.file, "")
-        if attributes.get("format") != FORMAT or attributes.get("version") != VERSION:
-            raise RefusalError(
-                f"its format is {attributes.get('format')!r}, version "
-                f"{attributes.get('version')!r}: expected {FORMAT!r}, version {VERSION}"
-            )
-        check_types(attributes, {**ATTRIBUTES, HASH: str}, "the file")
-        groups = {name: self._group(self.file, "", name) for name in _GROUPS}
-        mesh = self._mesh(groups)
-        chosen = self._chosen(groups, simulations)
-        self._check_members(groups["provenance"], "provenance", (), ())
-        provenance = values_of(groups["provenance"], "provenance")
+    with _opened(Path(path), verify) as file:
+        lengths: Lengths = {}
+        arrays = {name: _array(file, at, shape, lengths) for name, (at, _, shape) in MESH.items()}
+        _check_cells(arrays["cells"], lengths["N"])
+        chosen = range(len(file["simulations"])) if simulations is None else simulations
         return Shard(
-            attributes={k: v for k, v in attributes.items() if k not in _RESERVED},
-            **mesh,
-            simulations=tuple(
-                self._simulation(groups["simulations"], groups["cost"], k, runs) for k in chosen
-            ),
-            provenance={name: str(value) for name, value in provenance.items()},
+            attributes={name: kind(file.attrs[name]) for name, kind in ATTRIBUTES.items()},
+            **arrays,
+            simulations=tuple(_simulation(file, f"{k:04d}", runs, dict(lengths)) for k in chosen),
+            provenance={name: str(text) for name, text in file["provenance"].attrs.items()},
+            content_hash=str(file.attrs[HASH]),
         )
 
-    def check_hash(self) -> None:
-        """Compare what was read, which is everything, with the hash of the content."""
-        expected = dict(self.content[""])[HASH]
-        if content_hash(self.content) != expected:
-            raise RefusalError(f"damaged: its content is not that of its attribute {HASH!r}")
 
-    def _mesh(self, groups: Mapping[str, h5py.Group]) -> dict[str, Array]:
-        for name in ("mesh", "material"):
-            names = [place.split("/")[1] for place, _, _ in MESH.values() if place.startswith(name)]
-            self._check_members(groups[name], name, names, names)
-            self._noted(groups[name], name)
-        arrays = {}
-        for field_name, (place, kind, shape) in MESH.items():
-            group, name = place.split("/")
-            arrays[field_name] = self._array(groups[group], group, name, (np.dtype(kind),), shape)
-        self._check_cells(arrays["cells"])
-        return arrays
+@contextlib.contextmanager
+def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
+    """A file of a data set, open; whatever fails in it is a `FileFormatError`."""
+    if not path.is_file():
+        raise FileFormatError(f"{path}: there is no such file.")
+    try:
+        with path.open("rb") as stream:
+            check_seal(stream, verify)
+            with h5py.File(stream, "r") as file:
+                yield file
+    except FileFormatError as error:
+        raise type(error)(f"{path}: {error}.") from None
+    except Exception as error:  # HDF5 raises nearly every type on damaged bytes
+        reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
+        raise FileFormatError(f"{path}: cannot be read ({reason}).") from error
 
-    def _check_cells(self, cells: Array) -> None:
-        nodes = self.lengths["N"]
-        if not nodes or not len(cells):
-            raise RefusalError("mesh/points or mesh/cells is empty")
-        if cells.min() < 0 or cells.max() >= nodes:
-            raise RefusalError(
-                f"mesh/cells refers to nodes {cells.min()} to {cells.max()}: expected 0 to "
-                f"{nodes - 1}"
-            )
 
-    def _chosen(
-        self, groups: Mapping[str, h5py.Group], wanted: Collection[int] | None
-    ) -> list[int]:
-        """Numbers of the simulations to read."""
-        count = len(groups["simulations"])
-        if not count:
-            raise RefusalError("it holds no simulation")
-        names = [f"{k:04d}" for k in range(count)]
-        for name in ("simulations", "cost"):
-            self._check_members(groups[name], name, names, names)
-        self._noted(groups["simulations"], "simulations")
-        for k in wanted or ():
-            if not 0 <= k < count:
-                raise RefusalError(f"it has no simulation {k}: expected 0 to {count - 1}")
-        return list(range(count)) if wanted is None else list(wanted)
+def _simulation(
+    file: h5py.File,
+    key: str,
+    wanted: Collection[str] | Mapping[str, Collection[str]] | None,
+    lengths: Lengths,
+) -> Simulation:
+    group, cost = file["simulations"][key], file["cost"][key]
+    forces = _array(group, "forces", ("T", "N", 3), lengths)
+    lengths["T+1"] = len(forces) + 1
+    runs = {}
+    for name, run in group["runs"].items():
+        if wanted is None or name in wanted:
+            arrays = wanted[name] if isinstance(wanted, Mapping) else (*MOTION, *STATISTICS)
+            runs[name] = _run(run, arrays, lengths)
+    return Simulation(
+        forces=forces,
+        runs=runs,
+        scene_toml=str(group.attrs["scene"]),
+        attempt=int(group.attrs["attempt"]),
+        rejected=tuple(group.attrs["rejected"]),
+        seconds={name: float(value) for name, value in cost.attrs.items()},
+    )
 
-    def _simulation(
-        self, simulations: h5py.Group, cost: h5py.Group, k: int, wanted: Collection[str] | None
-    ) -> Simulation:
-        place, where = f"simulations/{k:04d}", f"simulation {k:04d}"
-        group = self._group(simulations, "simulations", f"{k:04d}")
-        self._check_members(group, place, _PARTS, _PARTS)
-        attributes = self._raw(group, place)
-        rejected = texts(attributes, "rejected", where)
-        values = values_of({n: v for n, v in attributes.items() if n != "rejected"}, where)
-        check_types(values, {"attempt": int, "scene": str}, where)
-        self.lengths = {name: self.lengths[name] for name in "NC"}
-        forces = self._array(group, place, "forces", _FLOATS, ("T", "N", 3))
-        if not len(forces):
-            raise RefusalError(f"forces of {where} has no step")
-        self.lengths["T+1"] = len(forces) + 1
-        costs = self._group(cost, "cost", f"{k:04d}")
-        self._check_members(costs, f"cost/{k:04d}", (), ())
-        seconds = values_of(costs, f"cost of {where}")
-        check_types(seconds, dict.fromkeys(seconds, float), f"cost of {where}")
-        return Simulation(
-            forces=forces,
-            runs=self._runs(self._group(group, place, "runs"), f"{place}/runs", wanted),
-            scene_toml=str(values["scene"]),
-            attempt=int(values["attempt"]),
-            rejected=rejected,
-            seconds={name: float(value) for name, value in seconds.items()},
-        )
 
-    def _runs(
-        self, group: h5py.Group, place: str, wanted: Collection[str] | None
-    ) -> dict[str, Run]:
-        names = members_of(group, words(place))
-        if not names:
-            raise RefusalError(f"{words(place)} is empty")
-        for name in wanted or ():
-            if name not in names:
-                raise RefusalError(
-                    f"{words(place)} has no {name!r}: expected one of {', '.join(names)}"
-                )
-        self._noted(group, place)
-        return {
-            name: self._run(group, place, name) for name in (names if wanted is None else wanted)
-        }
+def _run(group: h5py.Group, wanted: Collection[str], lengths: Lengths) -> Run:
+    found = {
+        name: _array(group, name, MOTION.get(name, ("T",)), lengths)
+        for name in wanted
+        if name in group
+    }
+    return Run(
+        **{name: found.get(name) for name in MOTION},
+        statistics={name: values for name, values in found.items() if name in STATISTICS},
+        attributes={name: _value(value) for name, value in group.attrs.items()},
+    )
 
-    def _run(self, runs: h5py.Group, place: str, name: str) -> Run:
-        group, place = self._group(runs, place, name), f"{place}/{name}"
-        members = self._check_members(group, place, (), _RUN)
-        if not members & {"positions", "predictions"}:
-            raise RefusalError(f"{words(place)} has neither positions nor predictions")
-        arrays = {k: self._array(group, place, k, *_RUN[k]) for k in _RUN if k in members}
-        return Run(
-            positions=arrays.get("positions"),
-            predictions=arrays.get("predictions"),
-            statistics={k: arrays[k] for k in STATISTICS if k in arrays},
-            attributes=self._noted(group, place),
-            velocities=arrays.get("velocities"),
-        )
 
-    def _group(self, parent: h5py.Group, place: str, name: str) -> h5py.Group:
-        group = parent[name]
-        if not isinstance(group, h5py.Group):
-            raise RefusalError(f"{words(f'{place}/{name}'.lstrip('/'))} is not a group")
-        return group
+def _value(value: Any) -> str | int | float:
+    """An attribute as text or number."""
+    return value if isinstance(value, str) else value.item()
 
-    def _check_members(
-        self, group: h5py.Group, place: str, needed: Collection[str], known: Collection[str]
-    ) -> set[str]:
-        """Names in a group; refuses one that lacks something or holds something unknown."""
-        found = set(members_of(group, words(place) or "the file"))
-        inside = f"{place}/".lstrip("/")
-        for name in sorted(set(needed) - found):
-            raise RefusalError(f"{words(inside + name)} is missing")
-        for name in sorted(found - set(known)):
-            raise RefusalError(
-                f"{words(inside + name)} is unknown in version {VERSION} of the format"
-            )
-        return found
 
-    def _raw(self, group: h5py.Group, place: str) -> dict[str, Any]:
-        """A group's attributes as they are, noted for the hash."""
-        attributes = attributes_of(group, words(place) or "the file")
-        self.content[place] = attributes
-        return attributes
+def _array(group: h5py.Group, name: str, shape: tuple[int | str, ...], lengths: Lengths) -> Array:
+    """A dataset, finite and of a given shape, in which a new letter stands for any length."""
+    dataset = group[name]
+    place = dataset.name.lstrip("/")
+    try:
+        values = np.asarray(dataset[()])
+    except OSError as error:
+        raise FileFormatError(f"{place} is damaged ({error})") from None
+    if values.ndim == len(shape):
+        lengths |= {n: m for n, m in zip(shape, values.shape, strict=True) if n not in lengths}
+    expected = tuple(lengths.get(n, n) if isinstance(n, str) else n for n in shape)
+    if values.shape != expected:
+        raise FileFormatError(f"{place} has shape {values.shape}: expected {shape} = {expected}")
+    if not np.isfinite(values).all():
+        raise FileFormatError(f"{place} has infinite or NaN entries")
+    return values
 
-    def _noted(self, group: h5py.Group, place: str) -> dict[str, Value]:
-        """A group's attributes as texts and numbers, noted for the hash."""
-        return values_of(self._raw(group, place), words(place) or "the file")
 
-    def _array(
-        self,
-        group: h5py.Group,
-        place: str,
-        name: str,
-        types: tuple[Any, ...],
-        shape: tuple[int | str, ...],
-    ) -> Array:
-        """A dataset of given types and shape, in which a new letter stands for any length."""
-        place = f"{place}/{name}"
-        dataset = group.get(name)
-        if dataset is None:
-            raise RefusalError(f"{words(place)} is missing")
-        if not isinstance(dataset, h5py.Dataset):
-            raise RefusalError(f"{words(place)} is not a dataset")
-        found, kind = dataset.shape, dataset.dtype
-        if not self._fits(found, shape):
-            known = tuple(self.lengths.get(str(n), n) for n in shape)
-            raise RefusalError(
-                f"{words(place)} has shape {found}: expected {symbols(shape)}"
-                + (f" = {known}" if all(isinstance(n, int) for n in known) else "")
-            )
-        if kind not in types:
-            expected = " or ".join(str(t) for t in types)
-            raise RefusalError(f"{words(place)} has type {type_name(kind)}: expected {expected}")
-        check_inside(dataset, self.size, words(place))
-        try:
-            values = dataset[()]
-        except OSError as error:
-            raise RefusalError(f"{words(place)} is damaged ({error})") from None
-        if kind.kind == "f" and not np.isfinite(values).all():
-            raise RefusalError(f"{words(place)} has infinite or NaN entries")
-        self.content[place] = values
-        self.lengths |= {n: m for n, m in zip(shape, found, strict=True) if isinstance(n, str)}
-        return values
-
-    def _fits(self, found: tuple[int, ...] | None, shape: tuple[int | str, ...]) -> bool:
-        if found is None or len(found) != len(shape):
-            return False
-        return all(
-            m == (self.lengths.get(n, m) if isinstance(n, str) else n)
-            for m, n in zip(found, shape, strict=True)
+def _check_cells(cells: Array, nodes: int) -> None:
+    if cells.min() < 0 or cells.max() >= nodes:
+        raise FileFormatError(
+            f"mesh/cells refers to nodes {cells.min()} to {cells.max()}: expected 0 to {nodes - 1}"
         )

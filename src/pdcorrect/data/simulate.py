@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -304,15 +305,13 @@ def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Ste
     """One run of some drafts; each by the engine that its mesh needs."""
     jobs = [draft.job(name) for draft in drafts]
     model, frames = drafts[0].meshed.models[name], drafts[0].meshed.plan.frames
-    by_engine: dict[int, list[int]] = {}
-    for i, job in enumerate(jobs):
-        by_engine.setdefault(id(engines.of(model, job.problem)), []).append(i)
-    out: dict[int, Steps] = {}
-    for chosen in by_engine.values():
-        engine = engines.of(model, jobs[chosen[0]].problem)
-        found = engine.rollouts([jobs[i] for i in chosen], frames, model.divisor)
-        out |= dict(zip(chosen, found, strict=True))
-    return [out[i] for i in range(len(jobs))]
+    chosen = [engines.of(model, job.problem) for job in jobs]
+    found: dict[int, Steps] = {}
+    for engine in {id(each): each for each in chosen}.values():
+        own = [i for i, each in enumerate(chosen) if each is engine]
+        steps = engine.rollouts([jobs[i] for i in own], frames, model.divisor)
+        found |= dict(zip(own, steps, strict=True))
+    return [found[i] for i in range(len(jobs))]
 
 
 def _states(reference: Steps, meshed: _Meshed) -> list[State]:
@@ -418,16 +417,27 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
         If a simulation has no scene, as imported ones, lacks the run, or what its scene
         leads to is not what the file holds.
     """
-    if run not in (*BASES, REFERENCE):
-        raise InputError(f"run {run!r}: expected one of {', '.join((*BASES, REFERENCE))}.")
-    scenes = [_scene(shard, path, k) for k in range(len(shard.simulations))]
     stored = shard.simulations[0].runs.get(run)
-    if stored is None:
-        raise InputError(f"{path}: no run {run!r}: expected one of {_names(shard)}.")
+    if stored is None or run not in (*BASES, REFERENCE):
+        raise InputError(
+            f"{path}: run {run!r}: expected one of {', '.join((*BASES, REFERENCE))} that it has."
+        )
+    if not all(simulation.scene_toml for simulation in shard.simulations):
+        raise InputError(
+            f"{path}: a simulation has no scene, as if imported: expected one that "
+            "`pdcorrect dataset generate` made, for it has to be stepped again."
+        )
+    scenes = [Scene.from_toml(s.scene_toml, f"{path}, a scene") for s in shard.simulations]
     plain = discretise_stored(scenes[0], shard.points, shard.cells)
-    _check_mesh(plain, shard, path)
-    for k, scene in enumerate(scenes):
-        _check_loads(plain.with_loads(scene.loads), shard, path, k)
+    wrong = unlike_arrays(plain, shard)
+    for k, scene in enumerate([] if wrong else scenes):
+        step = unlike_loads(plain.with_loads(scene.loads), shard.simulations[k])
+        wrong += [] if step is None else [f"the loads of simulation {k} in step {step + 1}"]
+    if wrong:
+        raise InputError(
+            f"{path}: {wrong[0]} rebuilt from the stored scene differ from the file's: expected "
+            "the same. Was the file made by another version of the code?"
+        )
     problem = plain
     if run == TOTAL_MASS:
         problem = plain.with_total_mass(float(stored.attributes["total_mass"]))
@@ -446,50 +456,34 @@ def _under(problem: Problem, scene: Scene) -> Problem:
     return replace(loaded, scene=loaded.scene.with_changes(name=scene.name))
 
 
-def _names(shard: Shard) -> str:
-    return ", ".join(sorted(shard.simulations[0].runs))
-
-
-def _scene(shard: Shard, path: Path, k: int) -> Scene:
-    text = shard.simulations[k].scene_toml
-    if not text:
-        raise InputError(
-            f"{path}: simulation {k} has no scene, as if imported: expected one that "
-            "`pdcorrect dataset generate` made, for it has to be stepped again."
-        )
-    return Scene.from_toml(text, f"{path}, scene of simulation {k}")
-
-
-def _check_mesh(problem: Problem, shard: Shard, path: Path) -> None:
-    """Refuse a scene that does not lead to the file's coarse mesh and material."""
-    step = float(shard.attributes["time_step"])
+def unlike_arrays(problem: Problem, shard: Shard) -> list[str]:
+    """Arrays of a file, and its time step, that are not those of its plain coarse problem."""
     materials = problem.materials
-    pairs = {
-        "points": (problem.positions, shard.points),
-        "cells": (problem.cells, shard.cells),
-        "free": (problem.free, shard.free),
-        "mass": (problem.mass, shard.mass),
-        "young": (materials.young, shard.young),
-        "poisson": (materials.poisson, shard.poisson),
-        "density": (materials.density, shard.density),
-        "time_step": (np.array(problem.time_step), np.array(step)),
+    wanted: dict[str, Any] = {
+        "points": problem.positions,
+        "cells": problem.cells,
+        "free": problem.free,
+        "mass": problem.mass,
+        "young": materials.young,
+        "poisson": materials.poisson,
+        "density": materials.density,
     }
-    for name, (found, stored) in pairs.items():
-        if found.shape != stored.shape or not np.allclose(found, stored, rtol=1e-9, atol=1e-12):
-            raise InputError(
-                f"{path}: {name} rebuilt from the stored scene differs from the file's: expected "
-                "the same. Was the file made by another version of the code?"
-            )
+    found = {name: getattr(shard, name) for name in wanted}
+    wanted["time_step"] = np.array(problem.time_step)
+    found["time_step"] = np.array(shard.attributes["time_step"])
+    return [
+        name
+        for name, values in wanted.items()
+        if values.shape != found[name].shape
+        or not np.allclose(values, found[name], rtol=1e-9, atol=1e-12)
+    ]
 
 
-def _check_loads(problem: Problem, shard: Shard, path: Path, k: int) -> None:
-    """The same for the loads in the first and the last step."""
-    forces, h = shard.simulations[k].forces, problem.time_step
-    size = float(np.abs(forces).max())
-    for step in (0, len(forces) - 1):
-        found = problem.external_forces(step * h, (step + 1) * h)
-        if np.abs(found - forces[step]).max() > FORCE_ERROR * size:
-            raise InputError(
-                f"{path}: simulation {k}: loads of step {step + 1} rebuilt from the stored scene "
-                "differ from the file's: expected the same."
-            )
+def unlike_loads(problem: Problem, simulation: Simulation, count: int = 2) -> int | None:
+    """The first of some steps, evenly spread, whose forces are not a problem's loads."""
+    h, size = problem.time_step, np.abs(simulation.forces).max()
+    for step in np.unique(np.linspace(0, simulation.steps - 1, count).astype(int)):
+        loads = problem.external_forces(step * h, (step + 1) * h)
+        if np.abs(loads - simulation.forces[step]).max() > FORCE_ERROR * size:
+            return int(step)
+    return None

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import os
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,7 +27,7 @@ from pdcorrect.errors import InputError, require_extra
 LARGEST_BATCHED = 150_000
 """Nodes of the largest mesh that is stepped in batches.
 
-A step takes about 11 kB a node of hex8-bubble-mean (`pdcorrect.batch.states`), so a batch of 32
+A step takes about 11 kB a node of hex8-bubble-mean (docs/differentiable.md), so a batch of 32
 such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
 """
 
@@ -84,23 +82,18 @@ def one_thread() -> Iterator[None]:
 
 
 def _provenance(config: DatasetConfig, device: str) -> dict[str, str]:
-    date = time.strftime("%Y-%m-%d", time.gmtime())
+    if device.startswith("cuda"):
+        import torch
+
+        device = str(torch.cuda.get_device_name(device))
     return {
         **environment(),
         "code": code_digest(),
         "threads": "1",
-        "device": _device_name(device),
-        "date": date,
+        "device": device,
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "configuration": config.to_toml(),
     }
-
-
-def _device_name(device: str) -> str:
-    if not device.startswith("cuda"):
-        return device
-    import torch
-
-    return str(torch.cuda.get_device_name(device))
 
 
 _PATIENCE = 600
@@ -129,7 +122,7 @@ class Workers:
     Raises
     ------
     InputError
-        If ``count`` or ``batch`` is less than 1.
+        If ``count`` or ``batch`` is less than 1, or the device is another.
     """
 
     count: int = 1
@@ -141,16 +134,12 @@ class Workers:
         for name, value in (("count", self.count), ("batch", self.batch)):
             if value < 1:
                 raise InputError(f"{name} = {value}: expected 1 or more.")
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", self.device):
+            raise InputError(f"device {self.device!r}: expected cpu, cuda or cuda:N.")
 
 
 ONE_WORKER = Workers()
 """This process, on the CPU."""
-
-
-def check_device(device: str) -> None:
-    """Refuse what is neither the CPU nor a CUDA device."""
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-        raise InputError(f"device {device!r}: expected cpu, cuda or cuda:N.")
 
 
 def computed(
@@ -163,15 +152,11 @@ def computed(
     """Units in order of completion."""
     if workers.scheduler is None and min(workers.count, len(units)) < 2:
         for unit in units:
-            if _over(deadline):
+            if deadline is not None and time.monotonic() > deadline:
                 return
             yield produce(config, folder, unit, workers.device)
         return
     yield from _distributed(partial(_work, config, folder.resolve()), units, workers, deadline)
-
-
-def _over(deadline: float | None) -> bool:
-    return deadline is not None and time.monotonic() > deadline
 
 
 def _distributed(
@@ -183,14 +168,20 @@ def _distributed(
     """The same on Dask workers: a unit is handed out when a worker is free."""
     distributed = require_extra("distributed", "cluster")
     with _client(distributed, workers) as client, client.as_current():
-        _wait_for_worker(client)
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE)
+        except TimeoutError:
+            raise InputError(
+                f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
+            ) from None
         waiting = iter(units)
         running = distributed.as_completed(raise_errors=True)
 
         def hand_out() -> None:
             """Keep every worker busy, also those that have joined since."""
             while running.count() < sum(client.nthreads().values()):
-                unit = None if _over(deadline) else next(waiting, None)
+                late = deadline is not None and time.monotonic() > deadline
+                unit = None if late else next(waiting, None)
                 if unit is None:
                     return
                 call = client.submit(work, unit, workers.device, pure=False)
@@ -204,9 +195,16 @@ def _distributed(
 
 def _client(distributed: Any, workers: Workers) -> Any:
     """A client of the given scheduler, or of new processes on this machine."""
-    if workers.scheduler is not None:
-        return _scheduler_client(distributed, workers.scheduler)
-    return distributed.Client(local_cluster(workers.count), set_as_default=False)
+    address = workers.scheduler
+    if address is None:
+        return distributed.Client(local_cluster(workers.count), set_as_default=False)
+    try:
+        return distributed.Client(address, timeout=_ANSWER, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--scheduler {address}: no scheduler answers there ({error}): expected the address of "
+            "one that is running, such as tcp://HOST:8786."
+        ) from None
 
 
 def local_cluster(count: int) -> Any:
@@ -236,34 +234,6 @@ def local_scheduler(count: int) -> Iterator[str | None]:
     finally:
         with contextlib.suppress(TimeoutError):
             cluster.close()
-
-
-def _scheduler_client(distributed: Any, address: str) -> Any:
-    """A client of a scheduler that was seen to answer: a failed one takes long to close."""
-    with ThreadPoolExecutor(1) as thread:  # this one may have a loop of its own
-        try:
-            thread.submit(asyncio.run, _greet(address)).result()
-        except (OSError, ValueError) as error:
-            raise InputError(
-                f"--scheduler {address}: no scheduler answers there ({error}): expected the "
-                "address of one that is running, such as tcp://HOST:8786."
-            ) from None
-    return distributed.Client(address, set_as_default=False)
-
-
-async def _greet(address: str) -> None:
-    """Connect to a scheduler and leave."""
-    comm = await require_extra("distributed.comm", "cluster").connect(address, timeout=_ANSWER)
-    await comm.close()
-
-
-def _wait_for_worker(client: Any) -> None:
-    try:
-        client.wait_for_workers(1, timeout=_PATIENCE)
-    except TimeoutError:
-        raise InputError(
-            f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
-        ) from None
 
 
 def _work(

@@ -13,16 +13,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect._environment import environment
-from pdcorrect._files import make_folder, replacing, write_bytes, write_text
+from pdcorrect._files import make_folder, replacing, write_text
 from pdcorrect.elements.collection import DRAWN, file_paths, generate, read_file
 from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Sample, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.element_network import write_network
 from pdcorrect.fem.learned import LARGEST_POISSON
 
 WEIGHTS, CARD = "hex8_learned.safetensors", "hex8_learned.json"
@@ -109,7 +110,7 @@ def train(
             pass
         trainer.save(path)
         report(trainer.line())
-    write_bytes(folder / WEIGHTS, save(trainer.weights()))
+    write_network(folder / WEIGHTS, trainer.weights())
     write_text(folder / CARD, json.dumps(trainer.card(device), indent=1) + "\n")
     report(f"wrote {folder / WEIGHTS}")
     return True
@@ -222,10 +223,10 @@ class Trainer:
             f"({100 * found['first frequency, without']:.2f} %)"
         )
 
-    def weights(self) -> dict[str, Tensor]:
-        """By name, on the CPU, in half precision: corrections change by 1e-3 of themselves."""
+    def weights(self) -> dict[str, NDArray[np.float16]]:
+        """By name, in half precision: corrections change by 1e-3 of themselves."""
         state = self._network.state_dict()
-        return {k: v.detach().cpu().half().contiguous() for k, v in state.items()}
+        return {k: v.detach().cpu().half().numpy() for k, v in state.items()}
 
     def card(self, device: str) -> dict[str, Any]:
         """What is written beside the weights."""

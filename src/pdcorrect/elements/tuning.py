@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load, save
+from safetensors.torch import load
 
 from pdcorrect._environment import environment
-from pdcorrect._files import make_folder, write_bytes, write_text
+from pdcorrect._files import make_folder, write_text
 from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
 from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.element_network import MODEL, read_network
-from pdcorrect.fem.learned import effective_moduli
+from pdcorrect.fem.element_network import MODEL, read_network, write_network
+from pdcorrect.fem.learned import LARGEST_POISSON, effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
 from pdcorrect.fem.problem import Problem
 
@@ -72,8 +72,8 @@ def tune(
         If the weights do not stay finite.
     InputError
         If cells are off the grid or the body is in several pieces, nodes are held in some
-        components, or some nodes but no face of a cell, there are several Poisson's ratios, or the
-        file's name does not end with safetensors.
+        components, or some nodes but no face of a cell, Poisson's ratios are several or too large,
+        or the file's name does not end with safetensors.
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
@@ -102,7 +102,7 @@ def tune(
     tuned = Tuned(means(base), means(started), means(_found(network, batches)))
     if not np.isfinite(tuned.after["displacements"]):
         raise ConvergenceError("the weights have become infinite or NaN.")
-    write_bytes(path, save({k: v.contiguous() for k, v in network.state_dict().items()}))
+    write_network(path, {k: v.numpy() for k, v in network.state_dict().items()})
     card = {
         "format": 1,
         "scene": problem.scene.name,
@@ -135,6 +135,8 @@ def own_body(problem: Problem) -> VoxelBody:
     if not np.ptp(poisson) < 1e-6:
         found = f"{poisson.min():.3g} to {poisson.max():.3g}"
         raise InputError(f"poisson = {found}: expected one for the body.")
+    if poisson[0] > LARGEST_POISSON:
+        raise InputError(f"poisson = {poisson[0]:.4g}: expected at most {LARGEST_POISSON:.3g}.")
     places = grid.place - grid.place.min(axis=0)
     shape = places.max(axis=0) + 1
     solid, young, density = np.zeros(shape, dtype=bool), np.ones(shape), np.ones(shape)

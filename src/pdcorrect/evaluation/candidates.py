@@ -64,30 +64,18 @@ class SavedCandidate:
 
     def warnings(self, dataset: str, config_hash: str, split: str) -> list[str]:
         """What speaks against taking its errors for those on unseen meshes of its own data."""
-        record, name = self.model.record, self.candidate.name
+        name, trained = self.candidate.name, repr(self.model.record.dataset)
         known = [x for own, x in self.model.data_sets if own == dataset]
-        several = len({own for own, _ in self.model.data_sets}) > 1
         if not {config_hash, None}.intersection(known):
-            other = f", not on {dataset!r}"
-            if known:
-                own = f", of which {dataset!r} was" if several else ""
-                other = f"{own} of another configuration than here"
-            return [
-                f"{name} was trained on {record.dataset!r}{other}: bodies, loads, materials and "
-                "the coarse model's setting may be others than it knows, and its training meshes "
-                "may be among these."
-            ]
-        if split not in (TRAINING, VALIDATION) and several:
-            same = "this" if config_hash in known else "an unrecorded"
-            return [
-                f"{name} was trained on {record.dataset!r}, among them {dataset!r} of {same} "
-                "configuration: meshes of this split may be among the training meshes of the other "
-                "sets."
-            ]
+            other = f"another configuration of {dataset!r}" if known else f"not on {dataset!r}"
+            return [f"{name} was trained on {trained}, {other}: it may know meshes of this split."]
         if split == TRAINING:
             return [f"{name} was trained on this split: these are not unseen meshes."]
         if split == VALIDATION:
             return [f"{name}'s weights were chosen by this split: the figures are too good."]
+        if len({own for own, _ in self.model.data_sets}) > 1:
+            others = f"sets other than {dataset!r} may hold meshes of this split"
+            return [f"{name} was trained on {trained}: {others}."]
         return []
 
 

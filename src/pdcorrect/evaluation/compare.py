@@ -13,11 +13,8 @@ from pdcorrect import metrics
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.comparison_cases import (
     CASE_BASES,
-    CASES,
     Case,
     cases_for,
-    cases_with,
-    check_corrected,
     without_best,
 )
 from pdcorrect.fem.problem import Problem, discretise
@@ -28,11 +25,6 @@ from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
 from pdcorrect.state import Status, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
-
-__all__ = [
-    "CASES", "Case", "Comparison", "Row", "case_stepper", "cases_for", "cases_with", "compare",
-    "make_stepper",
-]  # fmt: skip
 
 _FALLBACKS = [Status.RECOVERED.name, Status.SUBSTEPPED.name]
 OnStep = Callable[[str, int, StepResult], None]
@@ -129,12 +121,8 @@ class Comparison:
         }
 
 
-def make_stepper(scene: Scene, solver: str, refine: int) -> Stepper:
+def make_stepper(problem: Problem, solver: str) -> Stepper:
     """A stepper by name, ``"pd"`` or ``"newton"``, factorised and with its kernels compiled."""
-    return _stepper(discretise(scene, refine=refine), solver)
-
-
-def _stepper(problem: Problem, solver: str) -> Stepper:
     kinds = {"pd": ProjectiveDynamics, "newton": Newton}
     if solver not in kinds:
         raise InputError(f"solver {solver!r}: expected one of {', '.join(kinds)}.")
@@ -151,11 +139,16 @@ def case_stepper(scene: Scene, case: Case) -> Stepper:
         has another solver, mesh or base than the model.
     """
     if case.model is None:
-        return _stepper(case.problem(scene), case.solver)
+        return make_stepper(case.problem(scene), case.solver)
     from pdcorrect.corrector.hybrid import hybrid_of
     from pdcorrect.corrector.model_io import load_model
 
-    check_corrected(case, load_model(case.model).base)
+    base = load_model(case.model).base
+    if case != Case(case.label, "pd", 1, base, case.model, case.gate):
+        raise InputError(
+            f"{case.label}: the corrector {case.model} is run by projective dynamics on the coarse "
+            f"model {base!r} that it was trained for: expected that in {case}."
+        )
     return hybrid_of(scene, case.model, gate=case.gate).prepare()
 
 

@@ -47,11 +47,9 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> Array:
     scene = Scene.from_toml(run.scene_toml, "the run's scene")
     scene = scene.with_changes(time={"frames": max(1, len(run))})
     refine = int(run.attributes.get("refine", "1"))
-    _check_steps(run, scene)
-    _check_begin(run, discretise(scene, refine))
-    finer = finer_run(scene, len(run), refine, on_step=on_step)
-    distance = np.linalg.norm(run.positions - restrict(finer, run).positions, axis=2)
-    return np.asarray(distance)
+    _check_own(run, discretise(scene, refine))
+    finer = restrict(finer_run(scene, len(run), refine, on_step=on_step), run)
+    return np.asarray(np.linalg.norm(run.positions - finer.positions, axis=2))
 
 
 def finer_run(
@@ -63,8 +61,12 @@ def finer_run(
     ------
     ConvergenceError
     """
+    # weights tuned to a body do not know finer cells
+    scene = scene.with_changes(solver={"weights": None})
+    if scene.time.integrator != "quasi-static":
+        scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **INTEGRATOR})
+    problem = discretise(learned_coarse(scene), FINER * refine)
     try:
-        problem = _finer(scene, refine)
         return rollout(ProjectiveDynamics(problem).prepare(), frames, on_step=on_step)
     except ConvergenceError as error:
         raise ConvergenceError(
@@ -72,40 +74,26 @@ def finer_run(
         ) from None
 
 
-def _finer(scene: Scene, refine: int) -> Problem:
-    """The scene as the estimate computes it; weights tuned to a body do not know finer cells."""
-    scene = scene.with_changes(solver={"weights": None})
-    if scene.time.integrator != "quasi-static":
-        scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **INTEGRATOR})
-    return discretise(learned_coarse(scene), FINER * refine)
-
-
-def _check_steps(run: Trajectory, scene: Scene) -> None:
-    static = scene.time.integrator == "quasi-static"
-    other = run.attributes.get("integrator", scene.time.integrator)
-    expected = scene.time.step * np.arange(len(run) + 1)
-    if static != (other == "quasi-static") or not np.allclose(run.times, expected):
+def _check_own(run: Trajectory, problem: Problem) -> None:
+    """Refuse a run of other steps, material or initial state than those of its scene's problem."""
+    time = problem.scene.time
+    kind = run.attributes.get("integrator", time.integrator)
+    still = [name == "quasi-static" for name in (kind, time.integrator)]
+    if still[0] != still[1] or not np.allclose(run.times, time.step * np.arange(len(run) + 1)):
         raise InputError(
-            f"the run's frames, by {other}, are not at the times of its scene (steps of "
-            f"{scene.time.step:g} s, {scene.time.integrator}): expected a run of the scene itself."
+            f"the run's frames, by {kind}, are not at the times of its scene (steps of "
+            f"{time.step:g} s, {time.integrator}): expected a run of the scene itself."
         )
-
-
-def _check_begin(run: Trajectory, problem: Problem) -> None:
     material = run.attributes.get("material", OWN_MATERIAL)
     if material != OWN_MATERIAL:
         raise InputError(f"the run's material is {material}: expected that of its scene.")
-    begin = problem.initial_state()
-    start = restrict(
-        Trajectory(
-            begin.positions[None], begin.velocities[None], np.zeros(1), {}, problem.positions,
-            problem.cells,
-        ),
-        run,
-    )  # fmt: skip
-    far = float(np.abs(run.positions[0] - start.positions[0]).max())
-    fast = float(np.abs(run.velocities[0] - start.velocities[0]).max()) * problem.time_step
-    if max(far, fast) > _SAME * problem.cell_size:
+    begin, far = problem.initial_state(), _SAME * problem.cell_size
+    x, v = begin.positions[None], begin.velocities[None]
+    own = restrict(Trajectory(x, v, np.zeros(1), {}, problem.positions, problem.cells), run)
+    if (
+        np.abs(run.positions[0] - own.positions[0]).max() > far
+        or np.abs(run.velocities[0] - own.velocities[0]).max() * problem.time_step > far
+    ):
         raise InputError(
             "the run begins with another state than its scene: expected the scene's initial one."
         )

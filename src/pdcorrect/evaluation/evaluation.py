@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numba
@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, accepted_gaps
+from pdcorrect.data.folder import Damage, check_whole, missing_files
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.measures import (
     EvaluationCase,
     MeasuredRollout,
-    Outcome,
     TrajectoryMeasures,
     measure,
     read_cases,
 )
 from pdcorrect.evaluation.rollouts import (
     Hybrid,
+    Outcome,
     roll_out,
     roll_out_alone,
     single_steps,
@@ -91,22 +91,10 @@ class EvaluatedRun:
         known = [(float(x), mesh) for x, mesh in found if x is not None]
         return [x for x, _ in known], [mesh for _, mesh in known]
 
-    def gaps(self) -> dict[str, int]:
-        """Of measures that some trajectories have and others lack: how many lack them."""
-        names = [f.name for f in fields(TrajectoryMeasures) if f.name != "failed"]
-        every = len(self.trajectories)
-        missing = {name: every - len(self.values(name)[0]) for name in names}
-        return {name: count for name, count in missing.items() if 0 < count < every}
-
-    def refused_by(self) -> list[int]:
-        """Of each trajectory, the `MeasuredRollout.refused_by`."""
-        return [t.refused_by for t in self.trajectories]
-
     @property
-    def all_refused(self) -> bool:
-        """Whether a gate refused all corrections of all trajectories."""
-        every = [reason > 0 for t in self.trajectories for reason in t.reasons.tolist()]
-        return bool(every) and all(every)
+    def reasons(self) -> list[int]:
+        """Why a gate left steps of all trajectories uncorrected, see `MeasuredRollout`."""
+        return [reason for t in self.trajectories for reason in t.reasons.tolist()]
 
     def failures(self) -> list[TrajectoryMeasures]:
         """Trajectories that failed."""
@@ -190,58 +178,38 @@ def evaluate(
     FileFormatError
         As of `read_cases`.
     """
-    if batch < 1:
-        raise InputError(f"batch = {batch}: expected 1 or more.")
-    if workers < 1:
-        raise InputError(f"workers = {workers}: expected 1 or more.")
+    if batch < 1 or workers < 1:
+        raise InputError(f"batch = {batch}, workers = {workers}: expected 1 or more.")
     bases = [candidate.base for candidate in candidates]
-    gaps = accepted_gaps(folder, split, incomplete=incomplete)  # files may be added while reading
+    missing: tuple[Path, ...] = ()
+    if incomplete:
+        with contextlib.suppress(InputError):  # of a configuration that cannot be used
+            missing = tuple(missing_files(folder, split))
+    else:
+        check_whole(folder, [split])
     found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
     read = {*found.shards, *(path.name for path in found.damaged)}
-    missing = tuple(path for path in gaps if path.name not in read)
-    stored = list(dict.fromkeys(name for case in found.cases for name in _stored(case)))
-    names = [candidate.name for candidate in candidates]
-    if len({*names, *stored, REFERENCE}) < len(names) + len({*stored, REFERENCE}):
-        raise InputError(
-            f"names {', '.join(names)}: expected each one once, and none of a stored run "
-            f"({', '.join(stored)})."
-        )
-    measured: dict[str, dict[int, MeasuredRollout]] = {
-        name: {} for name in (*names, *stored, REFERENCE)
-    }
-    done = 0
-
-    def take(numbers: Sequence[int], results: Iterator[dict[str, MeasuredRollout]]) -> None:
-        nonlocal done
-        for i, by_run in zip(numbers, results, strict=True):
-            for name, one in by_run.items():
-                measured[name][i] = one
-            done += 1
-            if on_cases:
-                on_cases(done, len(found.cases))
-
-    with _pool(workers) as each:
-        waiting: list[tuple[list[int], Iterator[dict[str, MeasuredRollout]]]] = []
-        for numbers in _batches(found.cases, bases, batch):
-            cases = [found.cases[i] for i in numbers]
-            outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in cases]
-            for name, new in _outcomes(candidates, cases, device):
-                for by_name, outcome in zip(outcomes, new, strict=True):
-                    by_name[name] = outcome
-            waiting.append((numbers, each(_measure_all, cases, outcomes)))
-            if workers == 1:
-                take(*waiting.pop())
-        for numbers, results in waiting:  # which others measured while the next ones were moving
-            take(numbers, results)
+    missing = tuple(path for path in missing if path.name not in read)
     known = {candidate.name: candidate for candidate in candidates}
+    stored = dict.fromkeys(name for case in found.cases for name in _stored(case))
+    if len(known) < len(candidates) or known.keys() & {*stored, REFERENCE}:
+        raise InputError(
+            f"names {', '.join(c.name for c in candidates)}: expected each one once, and none of a "
+            f"stored run ({', '.join(stored)})."
+        )
+    measured: dict[int, dict[str, MeasuredRollout]] = {}
+    for number, by_run in _measured(candidates, found.cases, device, batch, workers):
+        measured[number] = by_run
+        if on_cases:
+            on_cases(len(measured), len(found.cases))
     runs = {
         name: EvaluatedRun(
             name,
             known[name].base if name in known else None,
             known[name].group if name in known else None,
-            tuple(by_case[i] for i in sorted(by_case)),
+            tuple(measured[i][name] for i in sorted(measured) if name in measured[i]),
         )
-        for name, by_case in measured.items()
+        for name in (*known, *stored, REFERENCE)
     }
     about = found.attributes
     return Evaluation(
@@ -249,6 +217,30 @@ def evaluate(
         float(about["time_step"]), found.cases[0].cell_size, runs, found.shards, found.damaged,
         missing,
     )  # fmt: skip
+
+
+def _measured(
+    candidates: Sequence[Candidate],
+    cases: Sequence[EvaluationCase],
+    device: str,
+    batch: int,
+    workers: int,
+) -> Iterator[tuple[int, dict[str, MeasuredRollout]]]:
+    """Numbers of cases and what is measured of their runs, by name."""
+    waiting = []
+    with _pool(workers) as each:
+        for numbers in _batches(cases, [candidate.base for candidate in candidates], batch):
+            some = [cases[i] for i in numbers]
+            outcomes = [{**_stored(case), REFERENCE: Outcome(case.reference)} for case in some]
+            for name, new in _outcomes(candidates, some, device):
+                for by_name, outcome in zip(outcomes, new, strict=True):
+                    by_name[name] = outcome
+            # other processes measure while the next ones are moving
+            waiting.append(zip(numbers, each(_measure_all, some, outcomes), strict=True))
+            if workers == 1:
+                yield from waiting.pop()
+        for results in waiting:
+            yield from results
 
 
 def _measure_all(
@@ -273,13 +265,10 @@ def _pool(workers: int) -> Iterator[Callable[..., Iterator[dict[str, MeasuredRol
 def _stored(case: EvaluationCase) -> dict[str, Outcome]:
     """Stored runs by name, the plain one first."""
     names = sorted(case.runs.keys() | case.predictions, key=lambda name: (name != PLAIN, name))
+    bases = {name: name if name in case.problems else None for name in names}
     return {
-        name: Outcome(
-            case.runs.get(name),
-            case.predictions.get(name),
-            base=name if name in case.problems else None,
-        )
-        for name in names
+        name: Outcome(case.runs.get(name), case.predictions.get(name), base)
+        for name, base in bases.items()
     }
 
 
@@ -300,31 +289,22 @@ def _outcomes(
     candidates: Sequence[Candidate], cases: Sequence[EvaluationCase], device: str
 ) -> Iterator[tuple[str, list[Outcome]]]:
     steppers: dict[str, BatchStepper] = {}
+    references = [case.reference for case in cases]
     for candidate in candidates:
         base = candidate.base
-        if device == "cpu" and candidate.alone is not None:
-            yield candidate.name, [_outcome_alone(candidate.alone, base, case) for case in cases]
-            continue
-        if base not in steppers:
-            steppers[base] = BatchStepper([case.problems[base] for case in cases], device=device)
-        stepper = steppers[base]
-        hybrid = candidate.hybrid(stepper)
-        runs = roll_out(hybrid, stepper, [case.steps for case in cases])
+        problems = [case.problems[base] for case in cases]
         coarse = [case.predictions.get(base) for case in cases]
-        steps = single_steps(hybrid, stepper, [case.reference for case in cases], coarse)
+        if device == "cpu" and candidate.alone is not None:
+            alone = [candidate.alone(problem) for problem in problems]
+            runs = [roll_out_alone(x, case.steps) for x, case in zip(alone, cases, strict=True)]
+            steps = list(map(single_steps_alone, alone, references, coarse))
+        else:
+            if base not in steppers:
+                steppers[base] = BatchStepper(problems, device=device)
+            hybrid = candidate.hybrid(steppers[base])
+            runs = roll_out(hybrid, steppers[base], [case.steps for case in cases])
+            steps = single_steps(hybrid, steppers[base], references, coarse)
         yield (
             candidate.name,
-            [
-                Outcome(run.positions, one, base, run.reasons, run.failed)
-                for run, one in zip(runs, steps, strict=True)
-            ],
+            [replace(x, predictions=y, base=base) for x, y in zip(runs, steps, strict=True)],
         )
-
-
-def _outcome_alone(
-    alone: Callable[[Problem], HybridStepper], base: str, case: EvaluationCase
-) -> Outcome:
-    hybrid = alone(case.problems[base])
-    run = roll_out_alone(hybrid, case.steps)
-    steps = single_steps_alone(hybrid, case.reference, case.predictions.get(base))
-    return Outcome(run.positions, steps, base, run.reasons, run.failed)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.corrector.gate import Reason
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, shard_paths, whole_files
+from pdcorrect.data.folder import Damage, read_files, shard_paths
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard, stored_hashes
+from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.evaluation.rollouts import Outcome
 from pdcorrect.fem.graph import velocities
 from pdcorrect.fem.problem import BASES, Problem
 from pdcorrect.fem.stress import stress
@@ -115,56 +115,52 @@ def read_cases(
         If a file is damaged; with ``skip_damaged`` if all are.
     """
     damaged: Damage = {}
-    paths = whole_files(shard_paths(folder, split), damaged if skip_damaged else None)
-    wanted = [PLAIN, *(base for base in dict.fromkeys(bases) if base != PLAIN)]
+    wanted = [PLAIN, *bases]
     shards: dict[str, str] = {}
     cases: list[EvaluationCase] = []
-    attributes: list[Mapping[str, str | int | float]] = []
-    for path in paths:
+
+    def read(path: Path) -> Mapping[str, str | int | float]:
         shard = read_shard(path)
-        attributes.append(shard.attributes)
-        shards[path.name] = stored_hashes(path)[1]
-        cases += _cases(shard, path, wanted)
+        shards[path.name] = shard.content_hash
+        cases.extend(_cases(shard, path, wanted))
+        return shard.attributes
+
+    attributes = read_files(shard_paths(folder, split), read, damaged if skip_damaged else None)
     if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
         raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
     return SplitCases(attributes[0], tuple(cases), shards, damaged)
 
 
 def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[EvaluationCase]:
-    for base in bases:
-        if base not in BASES:
-            raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")
-    problems = {base: rebuilt_problems(shard, path, base) for base in bases}
-    for base in BASES:  # what is told of a stored run does not depend on the candidates
-        if base in shard.simulations[0].runs and base not in problems:
-            problems[base] = rebuilt_problems(shard, path, base)
+    # what is told of a stored run does not depend on the candidates
+    stored = [base for base in BASES if base in shard.simulations[0].runs]
+    problems = {
+        base: rebuilt_problems(shard, path, base) for base in dict.fromkeys([*bases, *stored])
+    }
     out = []
     for k, simulation in enumerate(shard.simulations):
         reference = simulation.runs[REFERENCE].positions
         if reference is None:
             raise InputError(f"{path}: simulation {k} has no reference rollout.")
         others = {name: run for name, run in simulation.runs.items() if name != REFERENCE}
-        rollouts = _float64({name: run.positions for name, run in others.items()})
+        rollouts = {name: run.positions for name, run in others.items()}
+        steps = {name: run.predictions for name, run in others.items()}
         out.append(
             EvaluationCase(
                 int(shard.attributes["number"]),
                 k,
                 {base: each[k] for base, each in problems.items()},
-                _from_rest(reference.astype(np.float64), shard.points),
-                {name: _from_rest(x, shard.points) for name, x in rollouts.items()},
-                _float64({name: run.predictions for name, run in others.items()}),
+                _from_rest(reference, shard.points),
+                {n: _from_rest(x, shard.points) for n, x in rollouts.items() if x is not None},
+                {n: x.astype(np.float64) for n, x in steps.items() if x is not None},
             )
         )
     return out
 
 
-def _from_rest(positions: Array, rest: Array) -> Array:
-    """A stored rollout with the rest shape in frame 0, which storing has rounded."""
-    return np.concatenate([rest[None], positions[1:]])
-
-
-def _float64(arrays: Mapping[str, NDArray[np.generic] | None]) -> dict[str, Array]:
-    return {name: x.astype(np.float64) for name, x in arrays.items() if x is not None}
+def _from_rest(positions: NDArray[np.generic], rest: Array) -> Array:
+    """A stored rollout in float64 with the rest shape in frame 0, which storing has rounded."""
+    return np.concatenate([rest[None], positions[1:].astype(np.float64)])
 
 
 _STRESS_FRAMES = 10
@@ -205,31 +201,6 @@ def stress_error(problem: Problem, positions: Array, reference: Array) -> float 
         difference += float((weights * (ours.cauchy - truth.cauchy) ** 2).sum())
         size += float((weights * truth.cauchy**2).sum())
     return float(np.sqrt(difference / size)) if size and np.isfinite(difference) else None
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What a run makes of a case.
-
-    Attributes
-    ----------
-    positions : (T+1, N, 3) or None
-        Free rollout, m.
-    predictions : (T, N, 3) or None
-        Single steps from the reference's frames, m.
-    base : str or None
-        Coarse model that was stepped, with a corrector or without; None for other models.
-    reasons : (T,) int64 or None
-        Why a gate left steps of the rollout uncorrected, numbers of `Reason`; 0 where it did not.
-    failed : int or None
-        First step of the rollout that failed; the body is held from there on.
-    """
-
-    positions: Array | None = None
-    predictions: Array | None = None
-    base: str | None = None
-    reasons: NDArray[np.int64] | None = None
-    failed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -311,22 +282,13 @@ class MeasuredRollout:
     errors : (T+1,)
         RMS distance from the reference over time, m.
     reasons : (T,) int64
-        Why a gate left its steps uncorrected, numbers of `Reason`; those until it failed.
+        Why a gate left its steps uncorrected, numbers of `pdcorrect.corrector.gate.Reason`, 0 where
+        it did not; those until it failed.
     """
 
     measures: TrajectoryMeasures
     errors: Array = field(default_factory=lambda: np.zeros(0))
     reasons: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-
-    @property
-    def refused_by(self) -> int:
-        """Number of the `Reason` by which a gate refused the whole of it; 0 if it did not.
-
-        That is the body at rest or the time step.  What is refused by one of these is so in all
-        steps, so the first one tells.
-        """
-        first = int(self.reasons[0]) if len(self.reasons) else 0
-        return first if first in (Reason.BODY, Reason.TIME_STEP) else 0
 
 
 def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
@@ -355,10 +317,8 @@ def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
             "a run whose errors can be measured."
         )
     measures = TrajectoryMeasures(case.mesh, case.simulation, failed=outcome.failed, **numbers)  # type: ignore[arg-type]
-    if outcome.reasons is None:
-        return MeasuredRollout(measures, errors)
-    steps = None if outcome.failed is None else outcome.failed - 1
-    return MeasuredRollout(measures, errors, outcome.reasons[:steps])
+    reasons = np.zeros(0, dtype=np.int64) if outcome.reasons is None else outcome.reasons
+    return MeasuredRollout(measures, errors, reasons[: outcome.failed and outcome.failed - 1])
 
 
 def omega(positions: Array, coarse: Array | None, reference: Array) -> float | None:

@@ -9,39 +9,84 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
+
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
-from pdcorrect.evaluation.report_figures import draw_figures, overlaid_labels
-from pdcorrect.evaluation.report_notes import (
-    gained_energy,
-    grouped,
-    inverted_frames,
-    notes,
-    refused_corrections,
-)
-from pdcorrect.evaluation.report_table import headings, table, three_digits
+from pdcorrect.evaluation.report_figures import draw_figures
+from pdcorrect.evaluation.report_notes import notes
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.trajectory import Trajectory
-
-__all__ = [
-    "VTU", "draw_figures", "gained_energy", "grouped", "headings", "inverted_frames", "notes",
-    "overlaid_labels",
-    "refused_corrections", "table", "three_digits", "to_csv", "to_json", "to_markdown",
-    "write_report", "write_series",
-]  # fmt: skip
 
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 
+# --- the table ---------------------------------------------------------------------------
+
+
+def table(comparison: Comparison) -> list[dict[str, str]]:
+    """The comparison as rows of text by heading; the first error is that which is asked for.
+
+    "error" is relative and to the converged motion, "estimated" the same to a finer run; others
+    are from the reference.  "corrected" is the share of the scene's own coarse PD run's squared
+    error that is gone.
+    """
+    by_label = {row.label: row for row in comparison.rows}
+    reference = by_label[comparison.reference]
+    found = []
+    for row in comparison.rows:
+        distances = {
+            "RMS mm": f"{1e3 * row.rms_error:.3g}",
+            "worst mm": f"{1e3 * row.largest_error:.3g}",
+            "corrected": "" if np.isnan(row.omega) else f"{round(row.omega, 1) + 0.0:.1f} %",
+        }
+        cells = {"solver": shown_label(comparison, row)}
+        if comparison.finer is not None:
+            cells["estimated"] = _percent(row.estimated_error)
+        if comparison.converged is not None:
+            cells["error"] = _percent(row.relative_error)
+        found.append({
+            **cells,
+            **(dict.fromkeys(distances, "ref.") if row is reference else distances),
+            "ms/frame": three_digits(1e3 * row.seconds_a_frame),
+            "speed-up": f"{three_digits(reference.seconds_a_frame / row.seconds_a_frame)}x",
+            "iter.": f"{row.iterations_a_frame:.1f}",
+            "nodes": str(row.nodes),
+        })  # fmt: skip
+    none = dict.fromkeys(found[0], "")
+    failed = "RMS mm" if comparison.converged is None else "error"
+    return [*found, *({**none, "solver": x, failed: "failed"} for x in comparison.failures)]
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{three_digits(100.0 * share)} %"
+
+
+def three_digits(value: float) -> str:
+    """A number with three significant digits and without powers of ten where it is large."""
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
+
+
+def shown_label(comparison: Comparison, row: Row) -> str:
+    """A label for readers: of a hybrid also how many of its corrections were refused."""
+    if not row.refused_frames:
+        return row.label
+    frames = len(comparison.runs[row.label])
+    share = "all" if row.refused_frames == frames else f"{row.refused_frames} of {frames}"
+    return f"{row.label} ({share} refused)"
+
+
+# --- files -------------------------------------------------------------------------------
+
 
 def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
     """The whole report as Markdown."""
+    rows = table(comparison)
     lines = [f"# {comparison.scene.name}", ""]
     lines += [f"![{name}]({name})" for name in pictures[:1]] + [""]
-    names = headings(comparison)
-    lines += ["| " + " | ".join(names) + " |", "|---|" + "---:|" * (len(names) - 1)]
-    lines += ["| " + " | ".join(cells) + " |" for cells in table(comparison)]
+    lines += ["| " + " | ".join(rows[0]) + " |", "|---|" + "---:|" * (len(rows[0]) - 1)]
+    lines += ["| " + " | ".join(row.values()) + " |" for row in rows]
     lines += ["", *[f"- {note}" for note in notes(comparison)], ""]
     lines += [f"![{name}]({name})\n" for name in pictures[1:]]
     lines += ["Measured on: " + ", ".join(f"{k} {v}" for k, v in environment().items()) + ".", ""]
@@ -119,25 +164,15 @@ def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
         If they cannot be written.
     """
     target = make_folder(Path(folder) / VTU)
-    runs = _named_runs(comparison)
+    runs: dict[str, Trajectory] = {}
+    for row in comparison.rows:
+        name = re.sub(r"[^a-z0-9.]+", "-", row.label.lower()).strip("-.") or "run"
+        while name in runs:  # labels that differ in other signs only
+            name += "-again"
+        runs[name] = comparison.runs[row.label]
     for stale in {path.stem for path in target.glob("*.pvd")} - set(runs):
         delete_vtu_series(target, stale)
     return [
         write_vtu_series(run, target, name=name, stress_of=run.problem)
         for name, run in runs.items()
     ]
-
-
-def _named_runs(comparison: Comparison) -> dict[str, Trajectory]:
-    """Runs of the rows by the names of their files."""
-    found: dict[str, Trajectory] = {}
-    for row in comparison.rows:
-        name = _file_name(row.label)
-        while name in found:  # labels that differ in other signs only
-            name += "-again"
-        found[name] = comparison.runs[row.label]
-    return found
-
-
-def _file_name(label: str) -> str:
-    return re.sub(r"[^a-z0-9.]+", "-", label.lower()).strip("-.") or "run"

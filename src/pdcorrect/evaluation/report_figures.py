@@ -8,12 +8,6 @@ import numpy as np
 
 import pdcorrect.figures as figures
 from pdcorrect.evaluation.compare import Comparison, Row
-from pdcorrect.evaluation.report_table import (
-    refused_share,
-    relative_text,
-    shown_labels,
-    three_digits,
-)
 
 
 def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
@@ -21,9 +15,8 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
 
     No plot of errors where there is none but the reference's.
     """
-    runs = [comparison.runs[row.label] for row in comparison.rows]
-    shown = shown_labels(comparison)
-    labels = [*shown.values()]
+    labels = [row.label for row in comparison.rows]
+    runs = [comparison.runs[label] for label in labels]
     truth = comparison.on_coarse[comparison.reference]
     distance = np.linalg.norm(truth.positions - truth.points, axis=2)
     frame, node = np.unravel_index(int(distance.argmax()), distance.shape)
@@ -34,30 +27,27 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
         colour="displacement",
         frame=int(frame),
     )
+    names = ["comparison.png"]
     overlaid = overlaid_labels(comparison)
     if len(overlaid) > 1:
         last = comparison.on_coarse[overlaid[-1]]
         figures.render_overlay(
             [comparison.on_coarse[label] for label in overlaid],
             folder / "overlay.png",
-            labels=[shown[label] for label in overlaid],
+            labels=overlaid,
             frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
         )
-    figures.plot_node_trajectories(
-        runs, folder / "node.png", node_point=truth.points[node], labels=labels
-    )
+        names.append("overlay.png")
+    point = truth.points[node]
+    figures.plot_node_trajectories(runs, folder / "node.png", node_point=point, labels=labels)
     figures.plot_energy(runs, folder / "energy.png", labels=labels)
-    names = ["comparison.png", *(["overlay.png"] if len(overlaid) > 1 else [])]
-    marks = {
-        shown[row.label]: (row.seconds_a_frame, error)
-        for row in comparison.rows
-        if (error := _error(row)) > 0
-    }
+    relative = comparison.converged is not None
+    marks = {row.label: (row.seconds_a_frame, _error(row)) for row in comparison.rows}
+    marks = {label: mark for label, mark in marks.items() if mark[1] > 0}
     if marks:
         names += ["error_against_time.png", "error_over_time.png"]
-        relative = comparison.converged is not None
         figures.plot_error_over_time(
-            {shown[label]: errors for label, errors in comparison.errors_over_time().items()},
+            comparison.errors_over_time(),
             truth.times,
             folder / "error_over_time.png",
             "converged motion" if relative else "reference",
@@ -88,14 +78,16 @@ def overlaid_labels(comparison: Comparison) -> list[str]:
 
 
 def _panel_label(comparison: Comparison, row: Row) -> str:
-    """Lines above a body; a line more is narrower than a longer name."""
+    """Lines above a body."""
     error = f"RMS error {1e3 * row.rms_error:.2g} mm"
     if row.relative_error is not None:
-        error = f"error {relative_text(row.relative_error)}"
+        error = f"error {100.0 * row.relative_error:.3g} %"
     elif row.label == comparison.reference:
         error = "reference"
-    time = three_digits(1e3 * row.seconds_a_frame)
-    refused = refused_share(comparison, row)
-    return f"{row.label}, {row.nodes} nodes\n{error}, {time} ms a frame" + (
-        f"\n{refused}" if refused else ""
-    )
+    lines = [
+        f"{row.label}, {row.nodes} nodes",
+        f"{error}, {1e3 * row.seconds_a_frame:.3g} ms a frame",
+    ]
+    if row.refused_frames:
+        lines.append(f"{row.refused_frames} of {len(comparison.runs[row.label])} refused")
+    return "\n".join(lines)

@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from pdcorrect.errors import InputError
-
 Array = NDArray[np.float64]
 
 RESAMPLES = 2000
@@ -105,19 +103,8 @@ def mean_interval(
     Returns
     -------
     (low, high), or None if there is one cluster only, which tells nothing of others
-
-    Raises
-    ------
-    InputError
-        If lengths differ, or the level is none.
     """
     found = np.asarray(values, dtype=np.float64)
-    if found.shape != (len(clusters),) or not len(found):
-        raise InputError(
-            f"{found.shape} values and {len(clusters)} clusters: expected one or more of each."
-        )
-    if not 0.0 < level < 1.0:
-        raise InputError(f"level = {level}: expected a share between 0 and 1.")
     names, owner = np.unique(np.asarray(clusters), return_inverse=True)
     if len(names) < 2:
         return None
@@ -125,22 +112,15 @@ def mean_interval(
     rng = np.random.default_rng(seed)
     drawn = rng.integers(len(names), size=(resamples, len(names)))
     means = sums[drawn].sum(axis=1) / counts[drawn].sum(axis=1)
-    tail = _expanded_tail(len(names), level)
+    t = stats.t.ppf((1.0 + level) / 2.0, len(names) - 1)
+    tail = float(stats.norm.cdf(-t * np.sqrt(len(names) / (len(names) - 1.0))))
     low, high = np.quantile(means, (tail, 1.0 - tail)).tolist()
     return low, high
-
-
-def _expanded_tail(clusters: int, level: float) -> float:
-    """Share of the resamples below an interval."""
-    t = stats.t.ppf((1.0 + level) / 2.0, clusters - 1)
-    return float(stats.norm.cdf(-t * np.sqrt(clusters / (clusters - 1.0))))
 
 
 def over_seeds(means: Sequence[float]) -> SeedSummary:
     """Summary of two means or more, one a seed."""
     found = np.asarray(means, dtype=np.float64)
-    if len(found) < 2:
-        raise InputError(f"{len(found)} seeds: expected two or more.")
     return SeedSummary(
         len(found), float(found.mean()), float(found.std(ddof=1)), float(found.min()),
         float(found.max()),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -11,8 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.states import BatchResult, BatchState
+from pdcorrect.batch.states import BatchState
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.batch_hybrid import BatchHybridResult
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.fem.graph import velocities
 from pdcorrect.state import State, StepResult
@@ -22,94 +23,84 @@ LOST = 1e3
 """Of a body's size: a node that is further away from its place at rest has failed."""
 
 
-class HybridResult(Protocol):
-    """What a step of a hybrid gives; see `pdcorrect.corrector.batch_hybrid`."""
-
-    @property
-    def state(self) -> BatchState:
-        """After the step."""
-
-    @property
-    def correction(self) -> Tensor:
-        """What was added, (n, 3), m."""
-
-    @property
-    def coarse(self) -> BatchResult:
-        """The coarse solver's step."""
-
-    @property
-    def reasons(self) -> Tensor:
-        """Why scenes (B,) were left uncorrected: numbers of `Reason`, 0 where they were not."""
-
-
 class Hybrid(Protocol):
     """A step of many scenes with a correction."""
 
-    def __call__(self, state: BatchState, previous: Tensor | None = None) -> HybridResult:
+    def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
         """One step; ``previous`` (n, 3) is the correction of the step before, m."""
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
-    """One scene's free rollout from rest.
+class Outcome:
+    """What a run makes of a simulation.
 
     Attributes
     ----------
-    positions : (T+1, N, 3)
-        m.
-    reasons : (T,) int64
-        Why steps are without correction, numbers of `Reason`; 0 where they have one, and after a
-        failure.
+    positions : (T+1, N, 3) or None
+        Free rollout from rest, m.
+    predictions : (T, N, 3) or None
+        Single steps from the reference's frames, m.
+    base : str or None
+        Coarse model that was stepped, with a corrector or without; None for other models.
+    reasons : (T,) int64 or None
+        Why steps of the rollout are without correction, numbers of `Reason`; 0 where they have
+        one, and after a failure.
     failed : int or None
-        First step that did not converge, or gave numbers that are not finite or a node that is
-        `LOST`.  The body is held where it was before.
+        First step of the rollout that did not converge, or gave numbers that are not finite or a
+        node that is `LOST`.  The body is held from there on where it was before.
     """
 
-    positions: Array
-    reasons: NDArray[np.int64]
-    failed: int | None
-
-    @property
-    def refused(self) -> NDArray[np.bool_]:
-        """Steps without correction, (T,)."""
-        return self.reasons > 0
+    positions: Array | None = None
+    predictions: Array | None = None
+    base: str | None = None
+    reasons: NDArray[np.int64] | None = None
+    failed: int | None = None
 
 
-def roll_out(hybrid: Hybrid, stepper: BatchStepper, steps: Sequence[int]) -> list[Rollout]:
+def roll_out(
+    hybrid: Hybrid,
+    stepper: BatchStepper,
+    steps: Sequence[int],
+    worth: Callable[[int, Tensor], Tensor] | None = None,
+) -> list[Outcome]:
     """All scenes of a stepper from their initial states, each for its number of steps.
 
     A failed scene is held at its last state, so its error is that of a simulation that has
     stopped: it is neither left out nor replaced by anything better.
+
+    Parameters
+    ----------
+    hybrid, stepper
+    steps : sequence of int
+    worth : callable, optional
+        Told each frame and the positions (B, N, 3) there, m: which scenes (B,) are to go on.
+        Others are held without having failed.
     """
-    rest = stepper.rest_state()
-    state = stepper.state([problem.initial_state() for problem in stepper.problems])
-    previous = None
+    rest, state, previous = stepper.rest_state(), stepper.initial_state(), None
     frames, reasons = [rest.positions], []
-    failed: list[int | None] = [None] * len(steps)
+    last = torch.tensor(steps, device=rest.positions.device)
+    failed, going = torch.zeros_like(last), torch.ones_like(last, dtype=torch.bool)
     for number in range(1, max(steps) + 1):
         result = hybrid(state, previous)
         fine = _fine(result) & _near(result.state.positions, rest.positions, stepper.node_mask)
-        for i, good in enumerate(fine.tolist()):
-            if not good and failed[i] is None and number <= steps[i]:
-                failed[i] = number
-        alive = torch.tensor([f is None for f in failed], device=fine.device) & fine
-        frames.append(_where(alive, result.state.positions, frames[-1]))
-        reasons.append(torch.where(alive, result.reasons, 0))
-        state = BatchState(
-            _where(alive, result.state.positions, rest.positions),
-            _where(alive, result.state.velocities, rest.velocities),
-            result.state.times,
-            {
-                name: _where(alive, x, torch.zeros_like(x))
-                for name, x in result.state.memory.items()
-            },
-        )
-        previous = torch.where(_by_node(stepper, alive), result.correction, 0.0)
+        failed = torch.where(going & ~fine, number, failed)
+        going = going & fine
+        frames.append(_where(going, result.state.positions, frames[-1]))
+        reasons.append(torch.where(going, result.reasons, 0))
+        going = going & (last > number)
+        if worth is not None:
+            going = worth(number, frames[-1]) & going
+        state = result.state.where(going, rest)  # at rest scenes cost little
+        previous = torch.where(_by_node(stepper, going), result.correction, 0.0)
     positions = torch.stack(frames).to("cpu", torch.float64).numpy()
     told = torch.stack(reasons).cpu().numpy()
     return [
-        Rollout(positions[: count + 1, i, : stepper.node_counts[i]], told[:count, i], failed[i])
-        for i, count in enumerate(steps)
+        Outcome(
+            positions[: n + 1, i, : stepper.node_counts[i]],
+            reasons=told[:n, i],
+            failed=first or None,
+        )
+        for i, (n, first) in enumerate(zip(steps, failed.tolist(), strict=True))
     ]
 
 
@@ -154,7 +145,7 @@ def single_steps(
     return [positions[:n, i, : stepper.node_counts[i]] for i, n in enumerate(steps)]
 
 
-def _fine(result: HybridResult) -> Tensor:
+def _fine(result: BatchHybridResult) -> Tensor:
     """Scenes (B,) whose step converged and gave finite numbers."""
     state = result.state
     finite = torch.isfinite(state.positions) & torch.isfinite(state.velocities)
@@ -181,7 +172,7 @@ def _by_node(stepper: BatchStepper, scenes: Tensor) -> Tensor:
     return scenes[:, None].expand_as(mask)[mask][:, None]
 
 
-def roll_out_alone(hybrid: HybridStepper, steps: int) -> Rollout:
+def roll_out_alone(hybrid: HybridStepper, steps: int) -> Outcome:
     """From its initial state; a body that fails is held where it was, see `roll_out`."""
     state = hybrid.problem.initial_state()
     rest = state.positions
@@ -198,7 +189,7 @@ def roll_out_alone(hybrid: HybridStepper, steps: int) -> Rollout:
         frames.append(state.positions)
         reasons[number - 1] = int(result.stats["gate"])
     frames += [frames[-1]] * (steps + 1 - len(frames))
-    return Rollout(np.stack(frames), reasons, failed)
+    return Outcome(np.stack(frames), reasons=reasons, failed=failed)
 
 
 def single_steps_alone(hybrid: HybridStepper, reference: Array, coarse: Array | None) -> Array:

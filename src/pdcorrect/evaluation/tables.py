@@ -40,12 +40,9 @@ def seed_summaries(evaluation: Evaluation) -> dict[str, dict[str, SeedSummary]]:
     """By group of two models or more and measure: the split's means over the seeds."""
     out = {}
     for group, runs in _groups(evaluation).items():
-        values = {name: [run.values(name)[0] for run in runs] for name in MEASURES}
-        out[group] = {
-            name: over_seeds([float(np.mean(x)) for x in each])
-            for name, each in values.items()
-            if all(each)
-        }
+        means = [{name: x.mean for name, x in summaries(run).items()} for run in runs]
+        shared = [name for name in MEASURES if all(name in each for each in means)]
+        out[group] = {name: over_seeds([each[name] for each in means]) for name in shared}
     return out
 
 
@@ -67,7 +64,19 @@ def to_json(evaluation: Evaluation, record: Mapping[str, Any] | None = None, see
             "damaged": {path.name: text for path, text in evaluation.damaged.items()},
             "missing": [path.name for path in evaluation.missing],
         },
-        "runs": {name: _run(run, seed) for name, run in evaluation.runs.items()},
+        "runs": {
+            name: {
+                "base": run.base,
+                "group": run.group,
+                "trajectories": len(run.trajectories),
+                "failed": [
+                    {"mesh": m.mesh, "simulation": m.simulation, "step": m.failed}
+                    for m in run.failures()
+                ],
+                "measures": {name: asdict(x) for name, x in summaries(run, seed).items()},
+            }
+            for name, run in evaluation.runs.items()
+        },
         "seeds": {
             group: {
                 "models": [run.name for run in _groups(evaluation)[group]],
@@ -112,13 +121,14 @@ def mean_errors(evaluation: Evaluation) -> dict[str, NDArray[np.float64]]:
     trajectories.
     """
     count = len(evaluation.runs[REFERENCE].trajectories)
-    found: dict[str, NDArray[np.float64]] = {}
-    for name, run in evaluation.runs.items():
-        errors = [t.errors for t in run.trajectories if len(t.errors)]
-        if name != REFERENCE and len(errors) == count:
-            shortest = min(map(len, errors))
-            found[name] = np.stack([x[:shortest] for x in errors]).mean(axis=0)
-    return found
+    every = {
+        name: [t.errors for t in run.trajectories if len(t.errors)]
+        for name, run in evaluation.runs.items()
+        if name != REFERENCE
+    }
+    every = {name: errors for name, errors in every.items() if len(errors) == count}
+    shortest = min((len(x) for errors in every.values() for x in errors), default=0)
+    return {name: np.mean([x[:shortest] for x in each], axis=0) for name, each in every.items()}
 
 
 # --- tables ------------------------------------------------------------------------------
@@ -139,12 +149,14 @@ def headline(evaluation: Evaluation, seed: int = 0) -> tuple[list[str], Rows]:
     rows = []
     for run in _shown(evaluation):
         found = every[run.name]
-        omega = found.get("omega")
-        shares = (omega.median, omega.q05, omega.smallest) if omega else (None, None, None)
+        shares = [""] * 5
+        if "omega" in found:
+            x = found["omega"]
+            interval = " to ".join(map(_number, x.interval or ()))
+            shares = [_number(x.mean), interval, *map(_number, (x.median, x.q05, x.smallest))]
         rows.append([
-            _marked(run), *(_mean(found, measure) for measure in first),
-            _number(omega.mean if omega else None), _interval(omega),
-            *map(_number, shares), *(_mean(found, measure) for measure in means),
+            _marked(run), *(_mean(found, measure) for measure in first), *shares,
+            *(_mean(found, measure) for measure in means),
             f"{len(run.failures())}/{len(run.trajectories)}",
         ])  # fmt: skip
     return headings, rows
@@ -246,25 +258,13 @@ def _groups(evaluation: Evaluation) -> dict[str, list[EvaluatedRun]]:
     return {group: runs for group, runs in found.items() if len(runs) > 1}
 
 
-def _run(run: EvaluatedRun, seed: int) -> dict[str, Any]:
-    return {
-        "base": run.base,
-        "group": run.group,
-        "trajectories": len(run.trajectories),
-        "failed": [
-            {"mesh": m.mesh, "simulation": m.simulation, "step": m.failed} for m in run.failures()
-        ],
-        "measures": {name: asdict(x) for name, x in summaries(run, seed).items()},
-    }
-
-
 def _shown(evaluation: Evaluation) -> list[EvaluatedRun]:
     return [run for name, run in evaluation.runs.items() if name != REFERENCE]
 
 
 def _marked(run: EvaluatedRun) -> str:
     """Its name, and whether it is no corrected run."""
-    return f"{run.name} (all refused)" if run.all_refused else run.name
+    return f"{run.name} (all refused)" if run.reasons and all(run.reasons) else run.name
 
 
 def _csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -275,18 +275,11 @@ def _csv(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    return "" if value is None else f"{round(value, digits) + 0.0:.{digits}f}"
+def _number(value: float) -> str:
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def _mean(found: Mapping[str, Summary], measure: str, factor: float = 1.0) -> str:
     if measure not in found:
         return ""
     return f"{factor * found[measure].mean:.3g}" if factor != 1.0 else _number(found[measure].mean)
-
-
-def _interval(omega: Summary | None) -> str:
-    if omega is None or omega.interval is None:
-        return ""
-    low, high = map(_number, omega.interval)
-    return f"{low} to {high}"

@@ -111,6 +111,14 @@ class Clamps:
     rest: Array
     moving: tuple[tuple[NDArray[np.int64], NDArray[np.int64], Course], ...]
 
+    @property
+    def still(self) -> NDArray[np.bool_]:
+        """Components (N, 3) that are held where they are."""
+        out = ~self.free
+        for nodes, components, _ in self.moving:
+            out[np.ix_(nodes, components)] = False
+        return out
+
     def positions(self, time: float) -> Array:
         """Prescribed positions (N, 3), m, at a time (s); meaningful where not free."""
         if not self.moving:

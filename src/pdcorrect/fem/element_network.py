@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect._files import write_bytes
 from pdcorrect.errors import FileFormatError, FileVersionError
 from pdcorrect.fem.cube_symmetry import on_scalars, on_strains
 from pdcorrect.fem.neighbourhood import NEIGHBOURS, SIZE, CellGraph, permutations
@@ -20,6 +22,8 @@ Array = NDArray[np.float64]
 
 STRAINS, SCALARS = 18, 7
 """Rows of the matrices of stiffness and of mass."""
+KIND = {"element": "hex8-learned 1"}
+"""In every file of weights: what cells' numbers and the network's answers mean."""
 MODEL = Path(__file__).parent / "hex8_learned.safetensors"
 EPSILON = 1e-6
 """Of the mean square that features are divided by."""
@@ -253,9 +257,9 @@ def read_network(path: Path) -> Network:
     Raises
     ------
     FileFormatError
-        If the file is missing or damaged.
+        If the file is missing or damaged, or has other sizes.
     FileVersionError
-        If the network sees other numbers, or answers otherwise.
+        If it is of another version of the element.
     """
     from safetensors import SafetensorError
     from safetensors.numpy import load
@@ -266,23 +270,38 @@ def read_network(path: Path) -> Network:
         raise FileFormatError(
             f"{path}: weights cannot be read ({error.strerror or error})."
         ) from None
-    expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
+    told = (
+        f"{path}: no weights of a learned element, or damaged: expected a file as `pdcorrect "
+        "tune-element` or `train-element` writes it."
+    )
     try:
         arrays = load(content)
-        finite = all(np.isfinite(x).all() for x in arrays.values())
-        network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
-        if finite and network.shape == expected:  # one cell alone, for the sizes in between
-            network(CellGraph(np.zeros((1, SIZE)), np.ones((1, NEIGHBOURS), dtype=np.int64)))
-    except (SafetensorError, KeyError, IndexError, ValueError):
-        raise FileFormatError(
-            f"{path}: no weights of a learned element, or damaged: expected a file as `pdcorrect "
-            "tune-element` or `train-element` writes it."
-        ) from None
-    if not finite:
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    except (SafetensorError, ValueError):
+        raise FileFormatError(told) from None
+    if (kind := header.get("__metadata__")) != KIND:
+        raise FileVersionError(f"{path}: weights of {kind}: expected {KIND}: train or tune again.")
+    if not all(np.isfinite(x).all() for x in arrays.values()):
         raise FileFormatError(f"{path}: weights that are not finite.")
-    if network.shape != expected:
-        raise FileVersionError(
-            f"{path}: from {network.shape[0]} to {network.shape[1]} numbers: expected "
-            f"{expected[0]} and {expected[1]}, those of this version's learned element."
-        )
-    return network
+    expected = SIZE, sum(halves(n).places.shape[1] for n in (STRAINS, SCALARS))
+    try:
+        network = Network(arrays, hashlib.sha256(content).hexdigest()[:_DIGEST])
+        if network.shape == expected:  # one cell alone, for the sizes in between
+            network(CellGraph(np.zeros((1, SIZE)), np.ones((1, NEIGHBOURS), dtype=np.int64)))
+            return network
+    except (KeyError, IndexError, ValueError):
+        pass
+    raise FileFormatError(told)
+
+
+def write_network(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write weights by name, as `pdcorrect.elements.network` has them.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    from safetensors.numpy import save
+
+    write_bytes(path, save(dict(arrays), metadata=KIND))

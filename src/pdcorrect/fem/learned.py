@@ -12,8 +12,9 @@ a cell stays the same, and what a translation feels.  The symmetric matrices N c
 network on the graph of cells, see `neighbourhood`.  Strains are corrected in cells with a held
 corner only; elsewhere affine deformations stay exact.
 
-A cell keeps the element without learning where the network was not trained: off a grid, beside
-partly held nodes, of another Poisson's ratio, or beside ones of much other modulus or density.
+A body on planes of symmetry (rollers) is seen with its mirror images.  A cell keeps the element
+without learning where the network was not trained: off a grid, beside other partly held nodes, of
+another Poisson's ratio, or beside cells of much other modulus or density.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
+from pdcorrect.fem.clamps import Clamps
 from pdcorrect.fem.cube_symmetry import MANDEL, SCALAR_PATTERNS
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.element_network import STRAINS, Network
@@ -35,7 +37,7 @@ from pdcorrect.fem.neighbourhood import (
     cell_graph,
     cell_graph_slopes,
     extremes,
-    neighbours_of,
+    mirrored,
     on_grid,
 )
 
@@ -48,8 +50,10 @@ STIFFEST, VOLUME = 3.0, 0.3
 lets it change by this share of its own."""
 LARGEST_POISSON = 0.4951
 _LEAST_POISSON = -1e-9
-_CONTRAST, _DENSITIES, _POISSONS = 12.0, 5.0, 0.1
-"""Ratios of the moduli and of the densities, and the difference of Poisson's ratios, in reach."""
+_CONTRAST, _DENSITIES, _POISSONS = 10.0, 2.0, 0.1
+"""Ratios of the moduli and of the densities in reach, those of the training, and the difference of
+Poisson's ratios, whose training has one a body."""
+_ROUNDING = 1.0 + 1e-6
 _STEP = 1e-4
 """Of the shear modulus, for differences."""
 
@@ -113,26 +117,23 @@ class ElementWriter:
     network : Network
     body : ElasticBody
         Of an element with 8 nodes.
-    free : (N, 3)
-        Components that may move.
+    clamps : Clamps
     """
 
-    def __init__(self, network: Network, body: ElasticBody, free: NDArray[np.bool_]) -> None:
+    def __init__(self, network: Network, body: ElasticBody, clamps: Clamps) -> None:
         self._network, self._body = network, body
         self.digest = network.digest
         self._grid = on_grid(body.positions, body.cells)
-        held: NDArray[np.bool_] = ~free.max(axis=1)
-        some: NDArray[np.bool_] = ~free.min(axis=1)
         cells = self._grid.cells
-        self._held = held[cells].astype(float)
-        self._inside = self._held.max(axis=1) == 0.0
-        partly: NDArray[np.bool_] = (some & ~held)[cells].max(axis=1)
-        self._neighbours = neighbours_of(body.cells, self._grid.place)
-        least, most = extremes(self._neighbours, body.materials.density, network.reach)
+        self._images = mirrored(self._grid, clamps.free, clamps.still)
+        self._inside: NDArray[np.bool_] = ~self._images.held[: len(cells)].max(axis=1)
+        least, most = self._extremes(body.materials.density)
         self._placed: dict[str, NDArray[np.bool_]] = {
             "that are not cubes of the grid": self._grid.regular,
-            "beside nodes held in some components": ~partly,
-            f"in reach of densities over {_DENSITIES:g} times apart": most <= _DENSITIES * least,
+            "beside nodes held in some components": ~self._images.partly,
+            f"in reach of densities over {_DENSITIES:g} times apart": (
+                most <= _ROUNDING * _DENSITIES * least
+            ),
         }
         self._shapes, self._sizes = cell_shapes(body.positions[cells])
         self._back = np.argsort(self._grid.order, axis=1)  # to the mesh's order of corners
@@ -194,12 +195,18 @@ class ElementWriter:
         ]
         stiff, heavy = self._roots(mu, omega)
         stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
-        by_N, by_H = np.zeros((len(learned), *N.shape[1:])), np.zeros((len(learned), *H.shape[1:]))
-        by_N[learned] = _bounded_transposed(N, stiff @ G @ stiff)
-        by_N[self._inside, :6] = by_N[self._inside, :, :6] = 0.0
-        by_H[learned] = _bounded_transposed(H, heavy @ J @ np.swapaxes(heavy, 1, 2))
+        original, own_cells = self._images.original, np.flatnonzero(learned)
+        by_N, by_H = (np.zeros((len(original), *x.shape[1:])) for x in (N, H))
+        by_N[own_cells] = _bounded_transposed(N, stiff @ G @ stiff)
+        by_N[: len(learned)][self._inside, :6] = by_N[: len(learned)][self._inside, :, :6] = 0.0
+        by_H[own_cells] = _bounded_transposed(H, heavy @ J @ np.swapaxes(heavy, 1, 2))
         by_numbers = self._network.slopes(graph, by_N, by_H)
-        by_young, by_poisson = cell_graph_slopes(graph, young, poisson.clip(0.0), by_numbers)
+        by_young, by_poisson = (
+            np.bincount(original, slopes, len(learned))
+            for slopes in cell_graph_slopes(
+                graph, young[original], poisson[original].clip(0.0), by_numbers
+            )
+        )
         for which, moved in enumerate(_moduli_slopes(mu, omega)):
             found[which] = found[which] + by_young * moved[0] + by_poisson * moved[1]
         return found[0], found[1]
@@ -224,30 +231,39 @@ class ElementWriter:
 
     def _fits(self, young: Array, poisson: Array) -> dict[str, NDArray[np.bool_]]:
         """Which cells are as those of the training, by what the others are."""
-        reach = self._network.reach
-        soft, stiff = extremes(self._neighbours, np.nan_to_num(young, nan=np.inf), reach)
-        least, most = extremes(self._neighbours, np.nan_to_num(poisson).clip(0.0), reach)
+        soft, stiff = self._extremes(np.nan_to_num(young, nan=np.inf))
+        least, most = self._extremes(np.nan_to_num(poisson).clip(0.0))
         return {
             **self._placed,
             f"of nu outside 0 to {LARGEST_POISSON:.3g}": (
                 (poisson >= _LEAST_POISSON) & (poisson <= LARGEST_POISSON)
             ),
-            f"in reach of moduli over {_CONTRAST:g} times apart": stiff <= _CONTRAST * soft,
-            f"in reach of nu over {_POISSONS:g} apart": most <= least + _POISSONS,
+            f"in reach of moduli over {_CONTRAST:g} times apart": (
+                stiff <= _ROUNDING * _CONTRAST * soft
+            ),
+            f"in reach of nu over {_POISSONS:g} apart": most <= least + _ROUNDING * _POISSONS,
         }
 
+    def _extremes(self, values: Array) -> tuple[Array, Array]:
+        """Least and largest of cells' values in reach of each, (C,)."""
+        images = self._images
+        found = extremes(images.neighbours, values[images.original], self._network.reach)
+        return found[0][: len(values)], found[1][: len(values)]
+
     def _seen(self, young: Array, poisson: Array) -> tuple[CellGraph, NDArray[np.bool_]]:
-        """What the network sees of all cells, and which it was trained for."""
+        """What the network sees of all cells and images, and which cells it was trained for."""
+        images = self._images
         learned = np.logical_and.reduce([*self._fits(young, poisson).values()])
-        known = np.where(np.isfinite(young), young, 0.0), np.nan_to_num(poisson).clip(0.0)
+        young = np.where(np.isfinite(young), young, 0.0)[images.original]
+        poisson = np.nan_to_num(poisson).clip(0.0)[images.original]
         with np.errstate(invalid="ignore"):
-            graph = cell_graph(self._neighbours, *known, self._held)
+            graph = cell_graph(images.neighbours, young, poisson, images.held.astype(float))
         numbers = np.nan_to_num(graph.numbers)
         return CellGraph(numbers, graph.neighbours), learned
 
     def _answers(self, graph: CellGraph, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
         """N and H of the learned cells, strains uncorrected away from held corners."""
-        N, H = (x[learned] for x in self._network(graph))
+        N, H = (x[: len(learned)][learned] for x in self._network(graph))
         inside = self._inside[learned]
         N[inside, :6], N[inside, :, :6] = 0.0, 0.0
         return N, H

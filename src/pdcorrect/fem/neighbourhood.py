@@ -108,6 +108,64 @@ def neighbours_of(cells: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray
     return out
 
 
+class Images(NamedTuple):
+    """A body of C cells with its mirror images at planes of symmetry, C' cells, its own first.
+
+    Attributes
+    ----------
+    neighbours : (C', 27) int
+        See `neighbours_of`.
+    original : (C',) int
+        Cell that each is an image of.
+    held : (C', 8) bool
+        Corners that are held in all components, VTK order.
+    partly : (C,) bool
+        Cells with a corner held in some components that no plane of symmetry explains.
+    """
+
+    neighbours: NDArray[np.int64]
+    original: NDArray[np.int64]
+    held: NDArray[np.bool_]
+    partly: NDArray[np.bool_]
+
+
+def mirrored(grid: Grid, free: NDArray[np.bool_], still: NDArray[np.bool_]) -> Images:
+    """The body that cells on a grid are a half, quarter or eighth of, by how nodes are held.
+
+    The outermost face of cells along an axis is a plane of symmetry where all its nodes are held
+    along the axis, as by rollers that do not move, and not all of them in all components; one for
+    each axis.
+
+    Parameters
+    ----------
+    free, still : (N, 3)
+        Components that may move, and those that are held where they are.
+    """
+    cells, place, count = grid.cells, grid.place, len(free)
+    planes = np.zeros((count, 3), dtype=bool)
+    original, mirrors = np.arange(len(cells)), []
+    for axis, side in np.ndindex(3, 2):
+        outermost = (place[:, axis].max if side else place[:, axis].min)()
+        face = cells[place[:, axis] == outermost][:, VTK_CORNERS[:, axis] == side]
+        if not (still[face, axis].all() and free[face].any()) or planes[:, axis].any():
+            continue
+        planes[face, axis] = True
+        mirrors.append((axis, 2 * outermost + 2 * side - 1))
+    at_corners: NDArray[np.bool_] = ~free.max(axis=1) & ~planes.min(axis=1)
+    unexplained: NDArray[np.bool_] = (~free & ~planes).max(axis=1) & ~at_corners
+    for nth, (axis, twice) in enumerate(mirrors):
+        across = VTK_CORNERS ^ (np.arange(3) == axis)
+        flipped = (across[:, None] == VTK_CORNERS).all(axis=2).argmax(axis=1)
+        images = np.where(planes[cells % count, axis], cells, cells + 2**nth * count)
+        there = place.copy()
+        there[:, axis] = twice - place[:, axis]
+        cells = np.concatenate([cells, images[:, flipped]])
+        place, original = np.concatenate([place, there]), np.tile(original, 2)
+    held = at_corners[cells % count]
+    partly: NDArray[np.bool_] = unexplained[grid.cells].max(axis=1)
+    return Images(neighbours_of(cells, place), original, held, partly)
+
+
 def cell_graph(
     neighbours: NDArray[np.int64], young: Array, poisson: Array, held: Array
 ) -> CellGraph:

@@ -354,7 +354,7 @@ def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
     materials = body.materials
     path = scene.solver.weights
     network = element_network.released() if path is None else element_network.read_network(path)
-    writer = ElementWriter(network, body, clamps.free)
+    writer = ElementWriter(network, body, clamps)
     found = writer.correction(materials.mu, materials.volume_weight)
     count = int((~found.learned).sum())
     if count:

@@ -27,7 +27,8 @@ z counts times c(J) e(q), q = sum_n w_n z_n^2 / a^2 with the `SHARES` w.  c is 1
 and 0 below `GONE`: the frame is not defined where two stretches add up to nothing.  e is 1 for q
 below `LARGE` and 0 above `HUGE`.  So cells that are crushed, inside out, folded or drawn out have
 the element's own energy alone, which may get them back, and on the way there no force drives them
-further.
+further: with the stiffest K energy grows all the way, but for cells drawn out in two directions
+with a change of volume, where it falls by 1 % of its largest at nu = 0.45 and 12 % at 0.48.
 """
 
 from __future__ import annotations

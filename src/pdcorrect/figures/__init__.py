@@ -78,7 +78,6 @@ def render(
     frame: int | Sequence[int] | None = None,
     fps: float = 25.0,
     window: int | None = None,
-    scale: float = 1.0,
 ) -> Path:
     """Draw one run or several side by side, without a screen.
 
@@ -99,15 +98,13 @@ def render(
         For ``colour = "error"``; its mesh may be finer or coarser.
     frame : int or sequence of int, optional
         Which of the common frames; negative ones count from the end.  By
-        default the last one in a picture, all in a film.  Several in a picture
-        are drawn in rows below each other, or side by side for a single run.  Of one frame
-        more than five runs are drawn in several rows, likewise more than five frames of a run.
+        default the last one in a picture, all in a film.  Several in a picture of several runs
+        are drawn in rows below each other.  More than five frames of one run, or runs in one
+        frame, are drawn in several rows.
     fps : float
         Frames a second of a film.
     window : int, optional
-        Width of the picture in pixels before ``scale``; the height follows.
-    scale : float
-        Size factor of everything, also of the text.
+        Width of the picture in pixels; the height and the size of the text follow.
 
     Returns
     -------
@@ -126,8 +123,6 @@ def render(
     runs = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     output = Path(output)
     film = _check_arguments(runs, output, labels, colour, reference)
-    if not (0 < fps < 1000 and 0 < scale < 100):
-        raise InputError(f"fps = {fps}, scale = {scale}: expected positive numbers.")
     names = list(labels) if labels is not None else [""] * len(runs)
     shared = _common_frames([*runs, reference] if colour == "error" and reference else runs)
     chosen = shared[:, _choose(frame, shared.shape[1], film)]
@@ -135,17 +130,38 @@ def render(
         _body(run, frames, colour, reference, chosen[-1])
         for run, frames in zip(runs, chosen, strict=False)
     ]
-    columns = len(runs) if film or len(runs) > 1 else chosen.shape[1]
-    width = (window or (_FILM if film else _STILL)) if columns > 1 else (window or 900)
-    picture = _Picture(bodies, names, colour, film, round(width * scale))
+    bar = None
+    if colour:
+        bodies, bar = _scaled(bodies, colour)
+    count, side = chosen.shape[1], len(runs)
+    panels = [(body, time) for time in range(count) for body in range(side)]
+    a_page = side if film else len(panels)
+    in_rows = not film and (side == 1 or count == 1)
+    columns = -(-a_page // -(-a_page // _ROW)) if in_rows else side  # about as many in each row
+    width = window or (900 if columns == 1 else _FILM if film else _STILL)
+    rest = _moves(bodies)
+    view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns))
+    times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
+    captions = names + [""] * (a_page - side)
+    longest = max(map(max, times))
+    sheet = Sheet(view, captions, columns, bar, _font(width, columns), longest=longest)
+    palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
+    painter = Painter(bodies, view, palette, limit, rest)
+
+    def pages() -> Iterator[Image]:
+        for start in range(0, len(panels), a_page):
+            shown = panels[start : start + a_page]
+            images = [painter.image(body, time) for body, time in shown]
+            yield sheet.page(images, [times[body][time] for body, time in shown])
+
     try:
         with picture_file(output) as part:
             if film:
-                write_film(part, picture.pages(), fps)
+                write_film(part, pages(), fps)
             else:
-                write_png(part, picture.whole())
+                write_png(part, next(pages()))
     finally:
-        picture.close()
+        painter.close()
     return output
 
 
@@ -213,63 +229,11 @@ def render_overlay(
     return output
 
 
-class _Picture:
-    """Panels and the sheet they are on."""
-
-    def __init__(
-        self, bodies: list[Body], labels: list[str], colour: Colour | None, film: bool, width: int
-    ) -> None:
-        self._times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
-        count = len(bodies[0].frames)
-        strip = not film and len(bodies) == 1
-        side = count if strip else len(bodies)
-        table = not film and not strip and count > 1
-        rows, columns = (count, side) if table else (1, side) if film else _wrapped(side)
-        bar = None
-        if colour:
-            bodies, bar = _scaled(bodies, colour)
-        rest = _moves(bodies)
-        view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns))
-        captions = labels + [""] * (side - len(labels))
-        longest = max(map(max, self._times))
-        font = _font(width, columns)
-        self._sheet = Sheet(
-            view, captions, rows, bar, font, None if table else columns, longest=longest
-        )
-        palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
-        self._painter = Painter(bodies, view, palette, limit, rest)
-        self._panels = [(body, time) for time in range(count) for body in range(len(bodies))]
-        self._each = len(bodies)
-
-    def whole(self) -> Image:
-        """All panels on one page."""
-        return self._page(self._panels)
-
-    def pages(self) -> Iterator[Image]:
-        """One page for each time."""
-        for start in range(0, len(self._panels), self._each):
-            yield self._page(self._panels[start : start + self._each])
-
-    def close(self) -> None:
-        """Free the window."""
-        self._painter.close()
-
-    def _page(self, panels: list[tuple[int, int]]) -> Image:
-        images = [self._painter.image(body, time) for body, time in panels]
-        return self._sheet.page(images, [self._times[body][time] for body, time in panels])
-
-
 def _font(width: int, columns: int) -> float:
     """Height of the text: a sixtieth of a picture, and of many panels an eighteenth of one."""
     if columns > 2:
         return min(width / 62, width / columns / 18)
     return width / 50 if columns == 2 else width / 36
-
-
-def _wrapped(panels: int) -> tuple[int, int]:
-    """Rows and columns of a picture's panels, about as many in each row."""
-    rows = -(-panels // _ROW)
-    return rows, -(-panels // rows)
 
 
 def _check_arguments(
@@ -367,8 +331,8 @@ def _scaled(bodies: list[Body], colour: Colour) -> tuple[list[Body], ColourBar]:
 
 def _moves(bodies: list[Body]) -> bool:
     """Whether some body is seen away from rest, by a hundredth of its size."""
-    for body in bodies:
-        size = np.ptp(body.run.points, axis=0).max()
-        if np.abs(body.run.positions[body.frames] - body.run.points).max() > 0.01 * size:
-            return True
-    return False
+    return any(
+        np.abs(body.run.positions[body.frames] - body.run.points).max()
+        > 0.01 * np.ptp(body.run.points, axis=0).max()
+        for body in bodies
+    )

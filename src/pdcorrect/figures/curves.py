@@ -143,7 +143,7 @@ def plot_energy(
     if not names:
         raise InputError(f"no run has any of {', '.join(_ENERGIES)} among its statistics.")
     for name, title in _OTHER_WORK.items():
-        if any(_matters(run, name) for run, _ in runs):
+        if any(name in run.stats and np.any(run.stats[name]) for run, _ in runs):
             names[name] = title
     figure, axes = _axes(len(names), 1.0 + 2.0 * len(names))
     for axis, (name, title) in zip(axes, names.items(), strict=True):
@@ -156,12 +156,6 @@ def plot_energy(
     _legend(figure, axes)
     axes[-1].set_xlabel("time [s]")
     return _save(figure, output)
-
-
-def _matters(run: Trajectory, work: str) -> bool:
-    """Whether some work of a run is more than rounding beside its energies."""
-    energies = [np.abs(run.stats[name]).max() for name in _ENERGIES if name in run.stats]
-    return work in run.stats and np.abs(run.stats[work]).max() > 1e-9 * max(energies, default=0.0)
 
 
 def plot_error_over_time(

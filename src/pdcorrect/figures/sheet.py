@@ -39,14 +39,11 @@ class Sheet:
     view : Camera
         The panels' camera and size.
     labels : sequence of str
-        One for each column, in the first row; may have several lines.  With ``columns``
-        one for each panel.
-    rows : int
+        One for each panel, row by row; may have several lines.
+    columns : int
     bar : ColourBar or None
     font : float
         Height of the text, pixels.
-    columns : int, optional
-        As many as labels by default.
     longest : float
         The last time on any page, s: chooses the unit of times.
     key : sequence of (str, str), optional
@@ -57,10 +54,9 @@ class Sheet:
         self,
         view: Camera,
         labels: Sequence[str],
-        rows: int,
+        columns: int,
         bar: ColourBar | None,
         font: float,
-        columns: int | None = None,
         longest: float = 1.0,
         key: Sequence[tuple[str, str]] = (),
     ) -> None:
@@ -69,15 +65,11 @@ class Sheet:
         agg = require_extra("matplotlib.backends.backend_agg", "view")
         self._view, self._labels, self._font = view, list(labels), font
         lines = max(len(label.splitlines()) for label in labels)
-        self._columns = columns or len(labels)
-        self._panels = len(labels) if columns else rows * len(labels)
-        self._gap = round(0.5 * font)
-        captions = [lines] + [lines if columns else 0] * (rows - 1)
-        self._captions = [round((n + 1) * _LINE * font + 1.2 * self._gap) for n in captions]
-        self._legend = round(4.2 * font)
+        self._columns, self._gap = columns, round(0.5 * font)
+        self._caption = round((lines + 1) * _LINE * font + 1.2 * self._gap)
         width, height = view.size
-        total = sum(self._captions) + rows * height + self._legend
-        self.size = (_even(width * self._columns), _even(total))
+        total = -(-len(labels) // columns) * (self._caption + height) + round(4.2 * font)
+        self.size = (_even(width * columns), _even(total))
         self._figure = figure.Figure(figsize=(self.size[0] / 100, self.size[1] / 100), dpi=100)
         self._canvas = agg.FigureCanvasAgg(self._figure)
         self._times: list[Any] = []
@@ -100,14 +92,15 @@ class Sheet:
             self._figure.draw_artist(text)
         page = np.array(self._canvas.buffer_rgba())[:, :, :3]
         for number, image in enumerate(images):
-            left, top = self._corner(*divmod(number, self._columns))
+            left, top = self._corner(number)
             page[top : top + image.shape[0], left : left + image.shape[1]] = image
         return page
 
-    def _corner(self, row: int, column: int) -> tuple[int, int]:
+    def _corner(self, panel: int) -> tuple[int, int]:
         """Left and upper pixel of a panel."""
+        row, column = divmod(panel, self._columns)
         width, height = self._view.size
-        return column * width, sum(self._captions[: row + 1]) + row * height
+        return column * width, row * (self._caption + height) + self._caption
 
     def _text(self, x: float, y: float, text: str, size: float, **style: Any) -> Any:
         """Text with its upper left corner at pixel (x, y) from the upper left."""
@@ -120,8 +113,8 @@ class Sheet:
         pad, room = 2 * self._gap, self._view.size[0] - 3 * self._gap
         texts = []
         for number, label in enumerate(self._labels):
-            left, below = self._corner(*divmod(number, self._columns))
-            x, top = left + pad, below - self._captions[number // self._columns] + self._gap
+            left, below = self._corner(number)
+            x, top = left + pad, below - self._caption + self._gap
             for line, words in enumerate(label.splitlines()):
                 style = {"weight": "bold"} if line == 0 else {"color": _GREY}
                 y = top + line * _LINE * self._font
@@ -130,8 +123,8 @@ class Sheet:
         font = self._font * min(1.0, room / max(widest, 1.0))
         for text in texts:
             text.set_fontsize(0.72 * font)
-        for number in range(self._panels):
-            x, y = self._corner(*divmod(number, self._columns))
+        for number in range(len(self._labels)):
+            x, y = self._corner(number)
             y -= round(_LINE * self._font + 0.2 * self._gap)
             time = self._text(x + pad, y, "", font, color=_GREY, animated=True)
             self._times.append(time)
@@ -213,10 +206,8 @@ def round_length(length: float) -> float:
 
 def time_text(time: float, longest: float) -> str:
     """A time (s) with three decimals, in the unit in which the longest time reads best."""
-    factor, unit = (
-        (1.0, "s") if longest >= 0.02 else (1e3, "ms") if longest >= 2e-5 else (1e6, "µs")
-    )
-    return f"{factor * time:.3f} {unit}"
+    units = (1.0, "s") if longest >= 0.02 else (1e3, "ms") if longest >= 2e-5 else (1e6, "µs")
+    return f"{units[0] * time:.3f} {units[1]}"
 
 
 def length_text(length: float) -> str:

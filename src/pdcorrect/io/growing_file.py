@@ -15,7 +15,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self
@@ -69,8 +69,8 @@ class Reserve:
 def abandon(file: Any, path: Path) -> None:
     """Close an h5py file that can no longer be written, without changing it on the disk.
 
-    HDF5 is given a scratch copy to finish its writing on.  If there is no room
-    for one either, the file stays open.
+    HDF5, which would write its metadata, is given a scratch copy to finish on.  If there is no
+    room for one either, the file stays open.
     """
     with contextlib.suppress(Exception), tempfile.TemporaryFile() as scratch:
         with path.open("rb") as original:
@@ -97,14 +97,6 @@ class Column(NamedTuple):
         return self.dtype.itemsize * math.prod(self.shape)
 
 
-class Content(NamedTuple):
-    """What does not grow: attributes of the file, datasets, and groups that may stay empty."""
-
-    attributes: Mapping[str, str | int]
-    arrays: Mapping[str, NDArray[np.generic]]
-    groups: Sequence[str] = ()
-
-
 class GrowingFile:
     """Attributes and fixed arrays, then records.
 
@@ -118,8 +110,9 @@ class GrowingFile:
         The one of them that is written last.
     first : mapping of str to value
         Record 0.
-    content : Content
-        What does not grow.
+    attributes : mapping of str to str or int
+    arrays : mapping of str to array
+        Datasets that do not grow.
     overwrite, compress : bool
         Replace an existing file; use gzip with byte shuffling.
 
@@ -135,7 +128,8 @@ class GrowingFile:
         columns: Mapping[str, Column],
         counter: str,
         first: Mapping[str, Any],
-        content: Content,
+        attributes: Mapping[str, str | int],
+        arrays: Mapping[str, NDArray[np.generic]],
         *,
         overwrite: bool = False,
         compress: bool = False,
@@ -150,7 +144,7 @@ class GrowingFile:
         self._broken = False
         with io.BytesIO() as memory:  # complete before anything is on the disk
             with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
-                self._create(content)
+                self._create(attributes, arrays)
                 self._add(columns)
                 self._write(first)
             _save(memory.getvalue(), path)
@@ -175,11 +169,12 @@ class GrowingFile:
         block = read_superblock(path)
         if block.in_writing or not 0 < block.end <= block.size:
             return None
+        expected = {
+            name: (c.dtype, (max(0, records - c.first), *c.shape), (1, *c.shape), True)
+            for name, c in columns.items()
+        }
         with h5py.File(path, "r", locking=False) as stored:
-            same = _growing(stored) == set(columns) and all(
-                _fits(stored[name], column, records) for name, column in columns.items()
-            )
-            if not same or _texts(stored.attrs) != _texts(attributes):
+            if _layout(stored) != expected or _texts(stored.attrs) != _texts(attributes):
                 return None
             compressed = stored[counter].compression is not None
         file = cls.__new__(cls)
@@ -227,8 +222,10 @@ class GrowingFile:
                 self._file.close()
                 self._reserve.release(read_superblock(self.path).end)
 
-    def _create(self, content: Content) -> None:
-        for name, value in content.attributes.items():
+    def _create(
+        self, attributes: Mapping[str, str | int], arrays: Mapping[str, NDArray[np.generic]]
+    ) -> None:
+        for name, value in attributes.items():
             if isinstance(value, str):
                 # of fixed length, so that it lies under the checksum of the file's index
                 data = value.encode("utf-8")
@@ -236,10 +233,8 @@ class GrowingFile:
                 self._file.attrs.create(name, np.bytes_(data), dtype=dtype)
             else:
                 self._file.attrs.create(name, value)
-        for name, array in content.arrays.items():
+        for name, array in arrays.items():
             self._file.create_dataset(name, data=array, chunks=array.shape, **self._filters)
-        for name in content.groups:
-            self._file.require_group(name)
 
     def _add(self, columns: Mapping[str, Column]) -> None:
         for name, (dtype, shape, first) in columns.items():
@@ -296,13 +291,8 @@ class GrowingFile:
         return size + index + filled + 32768
 
     def _make_room(self) -> None:
-        try:
+        with self._reporting():
             self._reserve.ensure(self._file.id.get_filesize(), self._room())
-        except OSError as error:
-            self._broken = True
-            with contextlib.suppress(OSError, RuntimeError):
-                self._file.close()
-            raise self._failure(error) from error
 
     @contextlib.contextmanager
     def _reporting(self) -> Iterator[None]:
@@ -313,20 +303,15 @@ class GrowingFile:
             self._broken = True
             if self._file:
                 abandon(self._file, self.path)
-            raise self._failure(error) from error
-
-    def _failure(self, error: Exception) -> OutputError:
-        return OutputError(
-            f"{self.path}: cannot be written ({_reason(error)}); its first {self.records} frames "
-            "are intact. Free some space or choose another place."
-        )
+            raise OutputError(
+                f"{self.path}: cannot be written ({_reason(error)}); its first {self.records} "
+                "frames are intact. Free some space or choose another place."
+            ) from error
 
 
 def _check_target(path: Path, overwrite: bool) -> None:
-    if path.is_dir():
-        raise OutputError(f"{path}: is a folder; give the name of a file in it.")
     if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: is a device or a pipe; give the name of a file.")
+        raise OutputError(f"{path}: is a folder, a device or a pipe; give the name of a file.")
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; create it first.")
     if path.exists() and not overwrite:
@@ -360,26 +345,16 @@ def _texts(attributes: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _growing(file: Any) -> set[str]:
-    """Names of the datasets that can grow."""
-    found: set[str] = set()
+def _layout(file: Any) -> dict[str, tuple[Any, ...]]:
+    """Type, shape, chunks and checksums of the datasets that can grow."""
+    found: dict[str, tuple[Any, ...]] = {}
 
     def visit(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset) and item.maxshape[:1] == (None,):
-            found.add(name)
+            found[name] = (item.dtype, item.shape, item.chunks, item.fletcher32)
 
     file.visititems(visit)
     return found
-
-
-def _fits(dataset: Any, column: Column, records: int) -> bool:
-    """Whether a dataset is what `GrowingFile` made, with all its records and no more."""
-    return (
-        dataset.dtype == column.dtype
-        and dataset.shape == (max(0, records - column.first), *column.shape)
-        and dataset.chunks == (1, *column.shape)
-        and dataset.fletcher32
-    )
 
 
 def _reason(error: Exception) -> str:

@@ -1,14 +1,16 @@
 """First bytes of an HDF5 file, and reading a file whose end or closing is missing.
 
 HDF5 refuses a file that is shorter than its superblock says, or that its writer
-never closed.  `RepairedFile` shows such a file to HDF5 as if it were closed, with
-zeros in place of what is missing; every index and chunk of a trajectory carries
-a checksum, so those zeros are noticed and never taken for data.
+never closed; its reading mode for files in writing waits for ever where something is
+damaged.  `RepairedFile` gives HDF5 such a file as if it were closed, with zeros in place
+of what is missing; every index and chunk of a trajectory carries a checksum, so those
+zeros are noticed and never taken for data.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +19,6 @@ from typing import Any
 from pdcorrect.errors import FileFormatError
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_DATASET = b"pdcorrect-dataset "  # see pdcorrect.data.checksum
 _SIZE = 48  # bytes of a version 3 superblock with 8-byte offsets
 _END, _CHECKSUM = 28, 44  # byte positions of the end-of-file address and the checksum
 _WORD = 0xFFFFFFFF
@@ -56,18 +57,11 @@ def read_superblock(path: Path) -> Superblock:
         If the file cannot be read, is not HDF5, or its superblock is damaged.
     """
     try:
-        size = path.stat().st_size
         with path.open("rb") as file:
-            head = file.read(_SIZE)
+            head, size = file.read(_SIZE), os.fstat(file.fileno()).st_size
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from None
-    if not size:
-        raise FileFormatError(f"{path}: the file is empty: expected an HDF5 trajectory.")
-    if head.startswith(_DATASET):
-        raise FileFormatError(
-            f"{path}: a file of a data set already: expected a trajectory of pdcorrect."
-        )
-    if head[:8] != _SIGNATURE[: len(head)]:
+    if not head or head[:8] != _SIGNATURE[: len(head)]:
         raise FileFormatError(f"{path}: not an HDF5 file: expected a trajectory of pdcorrect.")
     if len(head) < _SIZE:
         raise FileFormatError(

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from pdcorrect._files import part_of, replacing
 from pdcorrect._version import __version__
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.io.growing_file import Column, Content, GrowingFile
+from pdcorrect.io.growing_file import Column, GrowingFile
 from pdcorrect.io.trajectory_reader import (
     FORMAT,
     RESERVED,
@@ -105,11 +105,8 @@ class TrajectoryWriter:
             _frame_columns(self._shape) | _memory_columns(initial.memory, self._shape),
             "times",
             _entries(initial),
-            Content(
-                _file_attributes(first),
-                {"mesh/points": first.points, "mesh/cells": first.cells},
-                groups=["stats"],
-            ),
+            _file_attributes(first),
+            {"mesh/points": first.points, "mesh/cells": first.cells},
             overwrite=overwrite,
             compress=compress,
         )

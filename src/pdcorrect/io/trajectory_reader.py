@@ -23,12 +23,6 @@ VERSION = 1
 RESERVED = frozenset({"format", "format_version", "scene_toml", "pdcorrect_version"})
 """Attributes of the file that are not the run's."""
 
-_FRAMES = {"positions": 3, "velocities": 3, "times": 1}  # and their dimensions
-
-
-class _RefusalError(Exception):
-    """Why a file is not accepted; becomes `FileFormatError` with the file's name."""
-
 
 def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
     """Read a trajectory file, finished or not.
@@ -49,9 +43,7 @@ def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
         If the file cannot be read, is not a trajectory, or is damaged; says
         which, and how many frames could be salvaged.
     """
-    path = Path(path)
-    block = read_superblock(path)
-    with _refusing(path, block), _opened(path, block) as file:
+    with _opened(Path(path)) as (file, block):
         return _read(file, block, salvage)
 
 
@@ -64,33 +56,33 @@ class Storage(NamedTuple):
 
 def read_storage(path: Path) -> Storage:
     """What rewriting a trajectory file has to keep; raises as `load_trajectory`."""
-    block = read_superblock(path)
-    with _refusing(path, block), _opened(path, block) as file:
+    with _opened(path) as (file, _):
         _check_format(file)
-        positions = _dataset(file, "positions", "f", 3)
         known = "pdcorrect_version" in file.attrs
         version = _attribute(file, "pdcorrect_version") if known else "of an unknown version"
-        return Storage(positions.compression is not None, version)
+        return Storage(file["positions"].compression is not None, version)
 
 
 @contextlib.contextmanager
-def _refusing(path: Path, block: Superblock) -> Iterator[None]:
-    """Turn whatever a file's content makes HDF5 raise into `FileFormatError`."""
+def _opened(path: Path) -> Iterator[tuple[Any, Superblock]]:
+    """A file, open; whatever its content makes HDF5 raise becomes `FileFormatError`."""
+    block = read_superblock(path)
     try:
-        yield
-    except _RefusalError as refusal:
-        raise FileFormatError(f"{path}: {refusal}.") from None
+        whole = not (block.truncated or block.in_writing)
+        with h5py.File(path if whole else RepairedFile(path, block), "r", locking=False) as file:
+            yield file, block
+    except FileFormatError as error:
+        raise FileFormatError(f"{path}: {error}.") from None
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
-        lost = f"expected {block.end} bytes, got {block.size}" if block.truncated else ""
-        reason = f"truncated ({lost}), with" if lost else "damaged, with"
+        lost = f"truncated ({_lost(block)})" if block.truncated else "damaged"
+        reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
         raise FileFormatError(
-            f"{path}: {reason} its index lost, so that no frame can be read ({_first_line(error)})."
+            f"{path}: {lost}, with its index lost, so that no frame can be read ({reason})."
         ) from error
 
 
-def _first_line(error: Exception) -> str:
-    text = str(error.args[0]) if error.args else ""
-    return text.splitlines()[0] if text else type(error).__name__
+def _lost(block: Superblock) -> str:
+    return f"expected {block.end} bytes, got {block.size}"
 
 
 def trajectory_fault(trajectory: Trajectory) -> str | None:
@@ -147,49 +139,41 @@ def _stats_fault(trajectory: Trajectory, steps: int) -> str | None:
     return f"status {sorted(unknown)[0]!r} is unknown" if unknown else None
 
 
-@contextlib.contextmanager
-def _opened(path: Path, block: Superblock) -> Iterator[Any]:
-    if not (block.truncated or block.in_writing):
-        with h5py.File(path, "r", locking=False) as file:
-            yield file
-        return
-    with RepairedFile(path, block) as view, h5py.File(view, "r") as file:
-        yield file
-
-
 def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     _check_format(file)
-    datasets = {name: _dataset(file, name, "f", ndim) for name, ndim in _FRAMES.items()}
-    remembered = list(_group(file, "memory")) if "memory" in file else []
-    datasets |= {f"memory/{n}": _dataset(file, f"memory/{n}", "f", 3) for n in remembered}
-    points = _dataset(file, "mesh/points", "f", 2)[...]
-    cells = _dataset(file, "mesh/cells", "iu", 2)[...]
-    names = list(_group(file, "stats"))
-    stats = {n: _dataset(file, f"stats/{n}", "S" if n == "status" else "fi", 1) for n in names}
+    remembered = list(file["memory"]) if "memory" in file else []
+    names = ("positions", "velocities", "times", *(f"memory/{name}" for name in remembered))
+    for name in (*names, "mesh/points", "mesh/cells"):
+        if name not in file:
+            raise FileFormatError(f"{name!r} is missing")
+    datasets = {name: file[name] for name in names}
     frames = datasets["times"].shape[0]
-    _check_lengths(datasets, stats, frames)
+    stats = dict(file["stats"].items()) if "stats" in file else {}
     if salvage or block.truncated or block.in_writing:
         intact = _intact_frames([*datasets.values()], [*stats.values()], frames, block.size)
         if not salvage and block.truncated and (intact < frames or not block.in_writing):
-            raise _RefusalError(_truncation(block, intact, frames))
+            raise FileFormatError(
+                f"truncated: {_lost(block)}; {intact} of its {frames} frames are intact, which "
+                "load_trajectory(path, salvage=True) reads"
+            )
         frames = intact
     try:
         frames = _written(datasets["times"][:frames])
         arrays = {name: dataset[:frames] for name, dataset in datasets.items()}
         values = {name: dataset[: max(0, frames - 1)] for name, dataset in stats.items()}
     except OSError as error:
-        raise _RefusalError(
+        raise FileFormatError(
             f"damaged ({error}); salvage reads the frames before the damage"
         ) from None
     if not frames:
-        raise _RefusalError("no complete frame is left")
+        raise FileFormatError("no complete frame is left")
     trajectory = Trajectory(
         positions=arrays["positions"],
         velocities=arrays["velocities"],
         times=arrays["times"],
         stats={name: _text(v) if v.dtype.kind == "S" else v for name, v in values.items()},
-        points=points,
-        cells=cells.astype(np.int64, copy=False),
+        points=file["mesh/points"][...],
+        cells=file["mesh/cells"][...].astype(np.int64, copy=False),
         scene_toml=_attribute(file, "scene_toml"),
         attributes={name: _attribute(file, name) for name in file.attrs if name not in RESERVED},
         memory={
@@ -200,16 +184,16 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     )
     fault = trajectory_fault(trajectory)
     if fault:
-        raise _RefusalError(fault)
+        raise FileFormatError(fault)
     return trajectory
 
 
 def _check_format(file: Any) -> None:
     if "format" not in file.attrs or _attribute(file, "format") != FORMAT:
-        raise _RefusalError(f"an HDF5 file, but not a trajectory: its format is not {FORMAT!r}")
+        raise FileFormatError(f"an HDF5 file, but not a trajectory: its format is not {FORMAT!r}")
     version = file.attrs.get("format_version")
     if version != VERSION:
-        raise _RefusalError(
+        raise FileFormatError(
             f"format version {version}, expected {VERSION}: use the matching pdcorrect"
         )
 
@@ -219,37 +203,10 @@ def _attribute(file: Any, name: str) -> str:
     return value.decode("utf-8") if isinstance(value, bytes) else str(value)
 
 
-def _group(file: Any, name: str) -> Any:
-    if name not in file or not isinstance(file[name], h5py.Group):
-        raise _RefusalError(f"the group {name!r} is missing")
-    return file[name]
-
-
-def _dataset(file: Any, name: str, kinds: str, ndim: int) -> Any:
-    if name not in file or not isinstance(file[name], h5py.Dataset):
-        raise _RefusalError(f"the dataset {name!r} is missing")
-    dataset = file[name]
-    if dataset.dtype.kind not in kinds or dataset.ndim != ndim:
-        raise _RefusalError(
-            f"{name!r} has {dataset.dtype} of shape {dataset.shape}: expected kind {kinds!r} "
-            f"with {ndim} dimensions"
-        )
-    return dataset
-
-
 def _written(times: Any) -> int:
     """Number of frames that were complete: a time that was not written yet is NaN."""
     written = np.flatnonzero(~np.isnan(times))
     return int(written[-1]) + 1 if len(written) else 0
-
-
-def _check_lengths(datasets: dict[str, Any], stats: dict[str, Any], frames: int) -> None:
-    """Nothing may be shorter than ``times`` says; an interrupted writer leaves more."""
-    expected = {name: (dataset, frames) for name, dataset in datasets.items()}
-    expected |= {f"stats/{name}": (dataset, max(0, frames - 1)) for name, dataset in stats.items()}
-    for name, (dataset, length) in expected.items():
-        if dataset.shape[0] < length:
-            raise _RefusalError(f"{name!r} has {dataset.shape[0]} entries, expected {length}")
 
 
 def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int, size: int) -> int:
@@ -285,16 +242,6 @@ def _intact(dataset: Any, index: int, stored: set[int]) -> bool:
     except (OSError, RuntimeError, ValueError):
         return False
     return True
-
-
-def _truncation(block: Superblock, intact: int, frames: int) -> str:
-    kept = (
-        f"{intact} of its {frames} frames are intact; load_trajectory(path, salvage=True) reads "
-        "them"
-    )
-    return f"truncated: expected {block.end} bytes, got {block.size}; " + (
-        kept if intact else f"none of its {frames} frames is intact"
-    )
 
 
 def _text(values: Any) -> Any:

@@ -28,6 +28,7 @@ from pdcorrect.solvers.adjoint_solve import (
 )
 from pdcorrect.solvers.gradients import Gradients, TakenStep
 from pdcorrect.solvers.implicit import ImplicitStepper, positive, quiet_blas
+from pdcorrect.solvers.step import nodal_array
 from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
@@ -86,14 +87,17 @@ def adjoint(
         If the linear system cannot be solved.
     """
     check_solver(solver)
-    _check_types(stepper, state, result)
     positive("tolerance", tolerance)
     _check_status(result.status)
     grad_memory = grad_memory or {}
     _check_names(grad_memory, result.state)
     after = {"positions": grad_positions, "velocities": grad_velocities, **grad_memory}
-    shape = state.positions.shape
-    checked = {name: _gradient(f"grad_{name}", g, shape) for name, g in after.items()}
+    checked = {
+        name: np.zeros_like(state.positions)
+        if g is None
+        else nodal_array(stepper.problem, f"grad_{name}", g)
+        for name, g in after.items()
+    }
     remembered = tuple(state.memory)
     state, h = stepper.accepted(state, forces, time_step)
     integrate = stepper.integrate.held(state, h)
@@ -101,19 +105,6 @@ def adjoint(
     with quiet_blas():
         y = step_solution(step.objective(h), integrate, h, result)
         return Gradients(step, checked, y)
-
-
-def _check_types(stepper: object, state: object, result: object) -> None:
-    if not isinstance(stepper, ImplicitStepper):
-        kind = type(stepper).__name__
-        raise InputError(f"stepper is a {kind}: expected ProjectiveDynamics or Newton.")
-    if not isinstance(state, State):
-        raise InputError(f"state is a {type(state).__name__}: expected the step's State.")
-    if not isinstance(result, StepResult):
-        raise InputError(
-            f"result is a {type(result).__name__}: expected the StepResult that the stepper "
-            "returned. A rollout keeps none: take the steps one by one, result = stepper(state)."
-        )
 
 
 def _check_status(status: Status) -> None:
@@ -133,14 +124,3 @@ def _check_names(grad_memory: Mapping[str, Array], after: State) -> None:
             f"grad_memory has {', '.join(unknown)}: expected names in the memory of the state "
             f"after the step ({', '.join(after.memory) or 'it has none'})."
         )
-
-
-def _gradient(name: str, g: Array | None, shape: tuple[int, ...]) -> Array:
-    if g is None:
-        return np.zeros(shape)
-    out = np.asarray(g, dtype=np.float64)
-    if out.shape != shape:
-        raise InputError(f"{name} has shape {out.shape}: expected {shape}.")
-    if not np.isfinite(out).all():
-        raise InputError(f"{name} contains NaN or infinite entries: expected finite numbers.")
-    return out

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, small_strain_stress
-from pdcorrect.solvers.step import check_input
+from pdcorrect.solvers.step import check_input, nodal_array
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
@@ -54,21 +54,10 @@ def reactions(
     if accelerations is None:
         accelerations = solve_mass(problem, forces_at(problem, state, forces) * problem.free)
     else:
-        accelerations = np.asarray(accelerations, dtype=np.float64)
-        _check(accelerations, problem.positions.shape)
+        accelerations = nodal_array(problem, "accelerations", accelerations)
     out = problem.mass_times(accelerations) - forces_at(problem, state, forces)
     out[problem.free] = 0.0
     return out
-
-
-def _check(accelerations: Array, shape: tuple[int, ...]) -> None:
-    if accelerations.shape != shape:
-        raise InputError(
-            f"accelerations have shape {accelerations.shape}: expected {shape}, one row for each "
-            "node of the problem."
-        )
-    if not np.isfinite(accelerations).all():
-        raise InputError("accelerations contain NaN or infinite entries: expected finite numbers.")
 
 
 def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:

@@ -50,7 +50,6 @@ def march(
     """
     if on_failure not in ("raise", "stop", "continue"):
         raise InputError(f"on_failure = {on_failure!r}: expected 'raise', 'stop' or 'continue'.")
-    _check_stepper(stepper)
     problem = stepper.problem
     frames = whole("frames", problem.scene.time.frames if frames is None else frames)
     current = problem.initial_state() if state is None else state
@@ -125,7 +124,6 @@ def rollout(
     Trajectory
         ``frames + 1`` frames, the first one the initial state.
     """
-    _check_stepper(stepper)
     states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
     steps = march(stepper, frames, state=states[0], forces=forces, on_failure=on_failure)
@@ -139,13 +137,6 @@ def rollout(
         error.trajectory = _trajectory(stepper, states, log)
         raise
     return _trajectory(stepper, states, log)
-
-
-def _check_stepper(stepper: object) -> None:
-    if isinstance(stepper, type) or not callable(stepper) or not hasattr(stepper, "problem"):
-        raise InputError(
-            f"stepper is {stepper!r}: expected a stepper such as ProjectiveDynamics(problem)."
-        )
 
 
 def _failure(frame: int, result: StepResult) -> str:

@@ -288,17 +288,13 @@ class GlobalSolver:
 
 
 def check_input(problem: Problem, state: State, forces: Array | None) -> None:
-    """Refuse what is no state, and states and forces of the wrong shape or with NaN.
+    """Refuse states and forces of the wrong shape or with NaN.
 
     Raises
     ------
     InputError
         That names the node.
     """
-    if not isinstance(state, State):
-        raise InputError(
-            f"state is a {type(state).__name__}: expected State(positions, velocities)."
-        )
     nodal_array(problem, "positions", state.positions)
     nodal_array(problem, "velocities", state.velocities)
     if forces is not None:

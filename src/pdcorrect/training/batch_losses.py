@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.data.reader import ShardShuffle
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses, network_precision
 from pdcorrect.training.recipe import Stage, TrainingConfig
@@ -18,27 +19,10 @@ from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.windows import StepBatch, StepWindows
 
 
-class Source(Protocol):
-    """Losses of one batch after the other."""
-
-    failed: int
-    """Scenes that were left out because a step failed."""
-
-    def __len__(self) -> int:
-        """Batches of an epoch."""
-
-    def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
-        """Of the next batch, which is number ``iteration`` of the stage."""
-
-    def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Where it is: numbers, and tensors by name."""
-
-    def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-        """Go on where a state was taken."""
-
-
 class OneStepBatches:
-    """Windows of the training split in random order.
+    """Windows of the training split in random order, epoch after epoch.
+
+    The last few of an epoch, fewer than a batch, are left out.
 
     Parameters
     ----------
@@ -46,36 +30,50 @@ class OneStepBatches:
     stage : Stage
     seed : int
     world : ProcessGroup
+
+    Attributes
+    ----------
+    failed : int
+        Zero: no step is taken.
     """
 
     def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
-        self._batches = windows.batches(
-            stage.batch, seed=seed, rank=world.rank, world_size=world.size
-        )
-        self._stage, self._seed, self._world = stage, (seed, world.rank), world
+        self._windows, self._stage, self._seed = windows, stage, (seed, world.rank)
+        self._shuffle = ShardShuffle(
+            windows.dataset, seed=seed, block=len(windows.dataset.headers), rank=world.rank,
+            world_size=world.size,
+        )  # fmt: skip
+        self._order = self._shuffle.order()
         self._generator = torch.Generator(windows.device)
         self.failed = 0
 
     def __len__(self) -> int:
         """Batches of an epoch."""
-        return len(self._batches)
+        return max(1, len(self._order) // self._stage.batch)
+
+    def batch(self, iteration: int) -> StepBatch:
+        """Batch number ``iteration`` of the stage."""
+        epoch, place = divmod(iteration, len(self))
+        if epoch != self._shuffle.epoch:
+            self._shuffle.set_epoch(epoch)
+            self._order = self._shuffle.order()
+        first = place * self._stage.batch
+        batch = self._windows.batch(self._order[first : first + self._stage.batch])
+        if self._stage.noise.tau == 0.0:
+            return batch
+        self._generator.manual_seed(_seed(*self._seed, iteration))
+        return batch.with_noise(self._stage.noise.tau, self._generator)
 
     def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
-        """See `Source`."""
-        batch = next(self._batches)
-        noise = self._stage.noise
-        if noise.tau > 0.0:
-            self._generator.manual_seed(_seed(*self._seed, iteration))
-            batch = batch.with_noise(noise.tau, noise.relative, self._generator)
-        return one_step_loss(corrector, batch, self._stage)
+        """The mean loss of a batch; what is drawn depends on ``iteration``."""
+        return one_step_loss(corrector, self.batch(iteration), self._stage)
 
     def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """See `Source`."""
-        return dict(self._batches.state_dict()), {}
+        """Nothing: all depends on the number of the batch."""
+        return {}, {}
 
     def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-        """See `Source`; all processes are in the same place."""
-        self._batches.load_state_dict({**numbers, "rank": self._world.rank})
+        """Nothing to do."""
 
 
 def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tensor:
@@ -87,8 +85,11 @@ def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tenso
     return each.mean()
 
 
+Source = OneStepBatches | UnrolledBatches
+"""Losses of one batch after the other, and states to go on from."""
+
+
 def make_source(
-    stage: Stage,
     number: int,
     config: TrainingConfig,
     windows: StepWindows,
@@ -96,18 +97,11 @@ def make_source(
     world: ProcessGroup,
     teacher: Corrector | None = None,
 ) -> Source:
-    """The source of stage ``number`` of a training."""
-    seed = _seed(config.seed, number)
+    """Where the losses of stage ``number`` of a training come from."""
+    stage, seed = config.stages[number], _seed(config.seed, number)
     if stage.kind == "one-step":
         return OneStepBatches(windows, stage, seed, world)
-    return UnrolledBatches(groups, stage, velocity=config.velocity, seed=seed, teacher=teacher)
-
-
-def share_done(stage: Stage, epoch: int, iteration: int, seconds: float) -> float:
-    """How much of a stage's budget is spent; ``epoch`` is the number of its batches."""
-    if stage.seconds is not None:
-        return seconds / stage.seconds
-    return iteration / (stage.iterations or (stage.epochs or 1) * epoch)
+    return UnrolledBatches(groups, stage, seed=seed, teacher=teacher)
 
 
 def _seed(*names: int) -> int:

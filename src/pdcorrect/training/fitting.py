@@ -6,15 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.envelope import TIME_STEP
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
-from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.errors import InputError
-from pdcorrect.training.windows import StepBatch, StepWindows
+from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 
 _AT_ONCE = 32
 """Windows."""
@@ -37,14 +36,12 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
         Windows; if there are more, so many are drawn without replacement by ``seed``.  The same
         limit holds for first steps.
     """
-    every = np.arange(len(windows.dataset))
-    chosen = _chosen(every, most, seed)
-    corrector.normaliser.fit(*_moments(corrector, windows, chosen))
-    corrector.normaliser.fit_averages(_averages(corrector, windows, chosen))
-    shapes, steps = _at_rest(windows)
-    corrector.normaliser.fit_shapes(shapes)
-    corrector.normaliser.fit_time_steps(steps)
-    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
+    chosen = _chosen(np.arange(len(windows.dataset)), most, seed)
+    found, target = _moments(corrector, windows, chosen)
+    corrector.normaliser.fit(found, target)
+    averages = _averages(corrector, windows, chosen)
+    corrector.envelope.fit({**found, "average": averages, **_at_rest(windows)})
+    _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
 
 @torch.no_grad()
@@ -54,15 +51,12 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
     takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
     """
-    every = np.arange(len(windows.dataset))
-    shapes, steps = _at_rest(windows)
-    corrector.normaliser.widen_shapes(shapes)
-    corrector.normaliser.widen_time_steps(steps)
-    _widen(corrector, windows, _chosen(every, most, seed))
-    _widen(corrector, windows, _chosen(_beginnings(windows), most, seed), last=False)
+    corrector.envelope.widen(_at_rest(windows))
+    _widen(corrector, windows, _chosen(np.arange(len(windows.dataset)), most, seed))
+    _widen(corrector, windows, _chosen(windows.beginnings(), most, seed), last=False)
 
 
-def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> None:
+def check_time_steps(corrector: Corrector, windows: StepWindows) -> None:
     """Refuse data whose time step a default gate refuses, by the ranges of a corrector that stay.
 
     Raises
@@ -70,45 +64,36 @@ def check_time_steps(what: str, corrector: Corrector, windows: StepWindows) -> N
     InputError
         If some have such a time step: the gate would refuse every step of these bodies.
     """
-    _, found = _at_rest(windows)
-    steps, bound = torch.cat([found.low, found.high]), Gate().time_step
-    if bound is None or not (corrector.normaliser.time_step_excess(steps) > bound).any():
+    found = _at_rest(windows)["time_step"]
+    steps = torch.cat([found.low, found.high])
+    if not (corrector.envelope.time_step_excess(steps) > TIME_STEP).any():
         return
     here, there = (
         " to ".join(dict.fromkeys(f"{x:.4g}" for x in each))
-        for each in (steps.exp().tolist(), corrector.normaliser.time_steps)
+        for each in (steps.exp().tolist(), corrector.envelope.time_steps)
     )
     raise InputError(
-        f"{what} with fitting.widen = false: the data's time step over the cell size is {here} "
-        f"s/m, that of the ranges that stay {there} s/m, so a gate would refuse every step of "
-        "bodies that are learned: expected data of that time step, widen = true, or anew = true."
+        f"fitting.widen = false: the data's time step over the cell size is {here} s/m, that of "
+        f"the ranges that stay {there} s/m, so a gate would refuse every step: expected data of "
+        "that time step, or widen = true."
     )
 
 
-def _widen(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
-) -> None:
-    corrector.normaliser.widen(_moments(corrector, windows, chosen, last)[0])
-    corrector.normaliser.widen_averages(_averages(corrector, windows, chosen, last))
+def _widen(corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True) -> None:
+    found, _ = _moments(corrector, windows, chosen, last)
+    averages = _averages(corrector, windows, chosen, last)
+    corrector.envelope.widen({**found, "average": averages})
 
 
-def _beginnings(windows: StepWindows) -> NDArray[np.int64]:
-    """Numbers of the windows with which simulations begin."""
-    every = np.arange(len(windows.dataset))
-    _, _, steps = windows.dataset.places(every)
-    return every[steps == 0]
-
-
-def _chosen(numbers: NDArray[np.int64], most: int, seed: int) -> list[int]:
+def _chosen(numbers: Numbers, most: int, seed: int) -> Numbers:
     """At most so many of some windows."""
     if len(numbers) > most:
         numbers = np.random.default_rng((seed, 1)).choice(numbers, most, replace=False)
-    found: list[int] = np.sort(numbers).tolist()
-    return found
+    return np.sort(numbers)
 
 
 def _moments(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+    corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True
 ) -> tuple[dict[str, RunningMoments], RunningMoments]:
     """Of features by name, and of targets (m, 1)."""
     config = corrector.config
@@ -126,7 +111,7 @@ def _moments(
 
 
 def _averages(
-    corrector: Corrector, windows: StepWindows, chosen: list[int], last: bool = True
+    corrector: Corrector, windows: StepWindows, chosen: Numbers, last: bool = True
 ) -> RunningMoments:
     """Of bodies' mean inputs (m, a), for which the normalisation has to be there."""
     averages = RunningMoments()
@@ -136,16 +121,15 @@ def _averages(
     return averages
 
 
-def _at_rest(windows: StepWindows) -> tuple[RunningMoments, RunningMoments]:
+def _at_rest(windows: StepWindows) -> dict[str, RunningMoments]:
     """Of all bodies' measures (m, 10), and of logarithms of time steps over cell sizes (m, 1)."""
-    meshes, _, _ = windows.dataset.places(np.arange(len(windows.dataset)))
     shapes, steps = RunningMoments(), RunningMoments()
-    for batch in _batches(windows, np.unique(meshes, return_index=True)[1].tolist(), last=False):
+    for batch in _batches(windows, windows.of_each_file(), last=False):
         shapes.add(batch.bodies.shapes)
         steps.add(batch.bodies.time_steps[:, None])
-    return shapes, steps
+    return {"shape": shapes, "time_step": steps}
 
 
-def _batches(windows: StepWindows, chosen: list[int], last: bool) -> Iterator[StepBatch]:
+def _batches(windows: StepWindows, chosen: Numbers, last: bool) -> Iterator[StepBatch]:
     for first in range(0, len(chosen), _AT_ONCE):
         yield windows.batch(chosen[first : first + _AT_ONCE], last=last)

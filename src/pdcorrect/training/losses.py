@@ -104,11 +104,8 @@ def mean_of(values: Tensor, chosen: Tensor) -> Tensor:
     return kept.sum() / chosen.sum()
 
 
-Amp = Literal["none", "bf16"]
-
-
 @contextlib.contextmanager
-def network_precision(corrector: Corrector, amp: Amp) -> Iterator[None]:
+def network_precision(corrector: Corrector, amp: Literal["none", "bf16"]) -> Iterator[None]:
     """Let the network, and nothing else, take its matrix products in bfloat16.
 
     The coarse solver, which may run between, keeps its own precision.

@@ -18,6 +18,8 @@ from pdcorrect.training.recipe import Rate, Stage
 
 _TOLD = ("loss_sum", "count", "skipped", "row", "longest")
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
+LARGEST = 1.0
+"""Norm of the gradient; larger ones are scaled down to it."""
 
 
 def rate_at(rate: Rate, progress: float) -> float:
@@ -77,8 +79,7 @@ class Optimiser:
         self._world.mean([*grads, value])
         norm = torch.nn.utils.get_total_norm(grads)
         self._bad.copy_((~(torch.isfinite(norm) & torch.isfinite(value[0]))).float())
-        if self._stage.clip is not None:
-            torch.nn.utils.clip_grads_with_norm_(self._weights, self._stage.clip, norm)
+        torch.nn.utils.clip_grads_with_norm_(self._weights, LARGEST, norm)
         for group in self._adam.param_groups:
             group["lr"] = rate_at(self._stage.rate, progress)
         self._adam.step()
@@ -97,17 +98,11 @@ class Optimiser:
         told["longest"].copy_(torch.maximum(told["longest"], told["row"]))
 
     def take_report(self) -> dict[str, float]:
-        """Mean loss, batches left out, and the longest row of them; counting starts anew."""
+        """The counts by name; counting starts anew."""
         values: dict[str, float] = dict(zip(_TOLD, self._told.tolist(), strict=True))
         for name, x in self._counts.items():
             x.fill_(values["row"] if name in ("row", "longest") else 0.0)
-        count = values["count"]
-        return {
-            "loss": values["loss_sum"] / count if count else math.nan,
-            "count": count,
-            "skipped": values["skipped"],
-            "longest": values["longest"],
-        }
+        return values
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's moments and the counts, by name."""

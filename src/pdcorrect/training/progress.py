@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pdcorrect._config import Strict, as_toml
+from pdcorrect._config import as_toml
 from pdcorrect.errors import InputError, OutputError, require_extra
-from pdcorrect.training.recipe import Every, TrainingConfig
+from pdcorrect.training.recipe import Every
 
 require_extra("tensorboard", "learn")
 
@@ -38,9 +38,7 @@ class Progress:
         Time spent in the stage and in all, interruptions not counted.
     validated, saved : Mark
     best : float or None
-        Omega of the best weights so far, per cent.
-    stale : int
-        Validations of this stage since there was a better one.
+        Mean Omega of the best weights so far, per cent.
     metrics : dict
         Of the best weights.
     """
@@ -53,7 +51,6 @@ class Progress:
     validated: Mark = field(default_factory=Mark)
     saved: Mark = field(default_factory=Mark)
     best: float | None = None
-    stale: int = 0
     metrics: dict[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -84,14 +81,13 @@ class Progress:
 
     def next_stage(self) -> None:
         """Begin another stage."""
-        self.stage, self.iteration, self.stage_seconds, self.stale = self.stage + 1, 0, 0.0, 0
+        self.stage, self.iteration, self.stage_seconds = self.stage + 1, 0, 0.0
 
 
 def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
     """Refuse to go on with other settings, naming the first that differs.
 
-    A key that is not there counts as one of None; where the configuration leaves a key out that
-    has its default, the message tells that value.
+    A key that is not there counts as one of None.
 
     Raises
     ------
@@ -99,50 +95,16 @@ def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
     """
     if isinstance(found, dict) and isinstance(expected, dict):
         for name in sorted(found.keys() | expected.keys()):
-            one, other = (each.get(name, _ABSENT) for each in (found, expected))
-            check_same(one, other, where, f"{key}.{name}".lstrip("."))
+            check_same(found.get(name), expected.get(name), where, f"{key}.{name}".lstrip("."))
     elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
         for k, (one, other) in enumerate(zip(found, expected, strict=True)):
             check_same(one, other, where, f"{key}.{k}")
-    elif _or_none(found) != _or_none(expected):
-        before, now = _in_words(found, expected, key), _in_words(expected, found, key)
-        begun = f"without {key}" if before is None else f"with {key} = {before}"
+    elif found != expected:
+        before, now = ("none" if x is None else f"{as_toml(x):.80}" for x in (found, expected))
         raise InputError(
-            f"{where}: was begun {begun}, and is now to go on "
-            f"{'without it' if now is None else f'with {now}'}: expected the same; begin another "
-            "one in another folder."
+            f"{where}: was begun with {key} = {before}, and is now to go on with {now}: expected "
+            "the same; begin another one in another folder."
         )
-
-
-_ABSENT = object()
-"""In place of the value of a key that is not there."""
-
-
-def _or_none(value: Any) -> Any:
-    return None if value is _ABSENT else value
-
-
-def _in_words(value: Any, other: Any, key: str) -> str | None:
-    """A value as in TOML; None if there is none, nor a default that differs from the other one."""
-    if value is not _ABSENT:
-        return _as_text(value)
-    default = _default(key)
-    return None if default in (_ABSENT, other) else f"{_as_text(default)} (the default)"
-
-
-def _as_text(value: Any) -> str:
-    return "none" if value is None else f"{as_toml(value):.80}"
-
-
-def _default(key: str) -> Any:
-    """Of a key of the configuration, such as "config.fitting.widen", if it is known."""
-    first, *names = key.split(".")
-    value: Any = TrainingConfig.model_construct() if first == "config" else _ABSENT
-    for name in names:
-        value = getattr(value, name, _ABSENT) if isinstance(value, Strict) else _ABSENT
-    if isinstance(value, Strict):
-        return _ABSENT
-    return list(value) if isinstance(value, tuple) else value
 
 
 COLUMNS = (

@@ -9,10 +9,8 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     Field,
-    SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
-    model_serializer,
     model_validator,
 )
 from pydantic.config import JsonDict
@@ -40,14 +38,11 @@ def _rising(steps: tuple[int, ...]) -> tuple[int, ...]:
 
 def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
     for name in names:
-        if not _FILE.fullmatch(name):
+        if not _FILE.fullmatch(name) or names.count(name) > 1:
             raise ValueError(
-                f"{name!r}: expected files of the training and validation splits without their "
-                "ending, such as 'training/mesh-0042', with several data sets "
-                "'SET/training/mesh-0042'"
+                f"{name!r}: expected files of the training and validation splits, each once, such "
+                "as 'training/mesh-0042', with several data sets 'SET/training/mesh-0042'"
             )
-    if len(set(names)) < len(names):
-        raise ValueError("expected each file once")
     return names
 
 
@@ -133,12 +128,11 @@ class Noise(Strict):
     Attributes
     ----------
     tau
-        Deviation of a component, m; if ``relative``, in root mean squared one-step errors
-        (a component) of the base model on the same trajectory.
+        Deviation of a component, in root mean squared one-step errors (a component) of the base
+        model on the same trajectory.
     """
 
     tau: NonNegative = 0.0
-    relative: Flag = True
 
 
 class Rate(Strict):
@@ -177,9 +171,6 @@ class Stage(Strict):
     kind
         "one-step": on the stored predictions of the base model, without the simulator.
         "unrolled": steps of the hybrid, simulator included.
-    begin
-        From the best weights so far, or from the last ones of the stage before (averaged ones
-        if it had them).
     steps
         Of "unrolled"; several numbers share the stage equally, in order.
     through_solver
@@ -187,8 +178,8 @@ class Stage(Strict):
     start
         Of "unrolled": states of the reference, or of a pool of the model's own rollouts,
         each of which goes back to the reference with probability ``restart`` after it was used,
-        and in any case where its mean squared distance from it is more than ``lost`` times that
-        of the base model's rollout: nothing is to be learned there.
+        and in any case where its mean squared distance from it is more than that of the base
+        model's rollout: nothing is to be learned there.
     at_rest
         Of "unrolled": share of the states of the reference that are those at rest, before the first
         step; the others are of any frame.  For loads that act in the first steps only, as kicks,
@@ -201,24 +192,18 @@ class Stage(Strict):
         Exactly one; epochs only of "one-step".
     batch
         Windows or scenes, for each process.
-    clip
-        Largest norm of the gradient; None leaves it.
     ema
         Decay a step of the averaged weights that are validated and kept; None: no average.
     amp
         "bf16": matrix products of the network in bfloat16.
-    patience
-        Validations without a better result after which the stage ends; None: never.
     """
 
     kind: Literal["one-step", "unrolled"]
-    begin: Literal["best", "last"] = "best"
     steps: Horizon = (1,)
     through_solver: Flag = False
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
     at_rest: Share = 0.0
-    lost: Positive = 1.0
     teacher: ModelName | None = None
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
@@ -227,10 +212,8 @@ class Stage(Strict):
     rate: Rate = Rate()
     loss: Loss = Loss()
     noise: Noise = Noise()
-    clip: Positive | None = 1.0
     ema: Decay | None = None
     amp: Literal["none", "bf16"] = "none"
-    patience: PositiveCount | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Stage:
@@ -248,18 +231,23 @@ class Stage(Strict):
         for name, given in told.items():
             if given:
                 raise ValueError(f"{name} has no meaning in a stage of kind {self.kind!r}")
-        if self.teacher is not None and (self.through_solver or self.loss.kind != "relative"):
+        absolute, ahead = self.loss.kind == "absolute", self.loss.ahead is not None
+        if self.teacher is not None and (self.through_solver or absolute or ahead):
             raise ValueError(
                 "teacher: its corrections are learned step by step, over the base model's error: "
-                "expected through_solver = false and a loss of kind 'relative'"
+                "expected through_solver = false and a relative loss without loss.ahead"
             )
-        if self.teacher is not None and self.loss.ahead is not None:
-            raise ValueError("teacher: loss.ahead is of errors from the reference: expected none")
         return self
 
     def horizon(self, progress: float) -> int:
         """Steps at a share 0 to 1 of the stage."""
         return self.steps[min(len(self.steps) - 1, int(progress * len(self.steps)))]
+
+    def share_done(self, batches: int, iteration: int, seconds: float) -> float:
+        """How much of the stage is done, where an epoch has so many batches."""
+        if self.seconds is not None:
+            return seconds / self.seconds
+        return iteration / (self.iterations or (self.epochs or 1) * batches)
 
 
 class Fitting(Strict):
@@ -274,32 +262,10 @@ class Fitting(Strict):
         inputs and bodies to what it learns.  They are extremes, so the more there is to learn, the
         less a gate refuses.  Weights do not depend on it.  If not, the data's time step has to be
         one that the other model's gate lets pass.
-    anew
-        Whether a training that goes on with another model takes over its weights only, and fits
-        the normalisation to what it learns itself.  That model may then correct another base:
-        inputs and corrections are alike in units of their own deviations.
     """
 
     windows: PositiveCount = 10_000
     widen: Flag = True
-    anew: Flag = False
-
-    @model_serializer(mode="wrap")
-    def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Choices that are not the default: configurations of before do not have them."""
-        found: dict[str, Any] = dump(self)
-        for name in ("widen", "anew"):
-            if found.get(name) == type(self).model_fields[name].default:
-                found.pop(name)
-        return found
-
-    @model_validator(mode="after")
-    def _one_of_both(self) -> Fitting:
-        if self.anew and not self.widen:
-            raise ValueError(
-                "anew = true fits ranges anew, widen = false keeps them: expected one of both"
-            )
-        return self
 
 
 class TrainingConfig(TomlConfig):
@@ -309,51 +275,33 @@ class TrainingConfig(TomlConfig):
     ----------
     start_from
         Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
-        training begins with, in place of drawn and fitted ones (weights alone if ``fitting.anew``);
-        ``corrector`` must describe its architecture.  A folder's path starts where the program
-        does.
+        training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
+        architecture.  A folder's path starts where the program does.
     without
         Files of the data set that are left out, such as "training/mesh-0042": of bodies that
         another set keeps for its evaluation, say.  Of several data sets with the name of a set's
         folder, "impulse-more/training/mesh-0042".
     base
         Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
-    velocity
-        See `pdcorrect.corrector.batch_hybrid.BatchHybrid`.
     validate_every, checkpoint_every, report_every
         The last in iterations.
-    select
-        Of the validation's simulations, by which the best model is chosen.
-    most_skipped
-        Batches in a row whose loss or gradient is not finite, at which training fails.
-    workers
-        Processes that read windows ahead.
     """
 
     corrector: Architecture = Architecture()
     start_from: ModelName | None = None
     without: Files = ()
     base: Base = "plain"
-    velocity: Literal["recomputed", "kept"] = "recomputed"
     seed: Count = 0
     fitting: Fitting = Fitting()
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
     validate_every: Every = Every(seconds=60.0)
     checkpoint_every: Every = Every(seconds=60.0)
     report_every: PositiveCount = 50
-    select: Literal["mean", "median"] = "mean"
-    most_skipped: PositiveCount = 20
-    workers: Count = 0
 
     @model_validator(mode="after")
-    def _placed(self) -> TrainingConfig:
+    def _possible(self) -> TrainingConfig:
         placement = self.corrector.config().placement
         for k, stage in enumerate(self.stages):
-            if stage.loss.ahead is not None and self.velocity != "recomputed":
-                raise ValueError(
-                    f"stages[{k}]: loss.ahead is of velocities that are differences of positions, "
-                    "as the reference's are: expected velocity = 'recomputed'"
-                )
             if placement != "state" and stage.teacher is not None:
                 raise ValueError(f"stages[{k}]: a teacher teaches corrections of states only")
             if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
@@ -366,25 +314,9 @@ class TrainingConfig(TomlConfig):
                     f"stages[{k}]: a first guess does not change a step's result: expected kind = "
                     "'one-step'"
                 )
+        if self.start_from is None and not self.fitting.widen:
+            raise ValueError("fitting.widen = false is about a model to start from: expected one")
         return self
-
-    @model_validator(mode="after")
-    def _goes_on(self) -> TrainingConfig:
-        told = {"widen = false": not self.fitting.widen, "anew = true": self.fitting.anew}
-        for choice, given in told.items():
-            if given and self.start_from is None:
-                raise ValueError(
-                    f"fitting.{choice} is about a model that is gone on with: expected start_from"
-                )
-        return self
-
-    @model_serializer(mode="wrap")
-    def _named(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Without an empty ``without``, which configurations of before do not have."""
-        found: dict[str, Any] = dump(self)
-        if not self.without:
-            found.pop("without", None)
-        return found
 
     def architecture(self) -> CorrectorConfig:
         """Of the corrector."""

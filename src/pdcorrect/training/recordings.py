@@ -13,19 +13,14 @@ import torch
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import Folders, folders_of, shard_paths
-from pdcorrect.data.importing import discretise_stored
-from pdcorrect.data.schema import BEST, PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
-from pdcorrect.data.shard_arrays import ShardHeader, read_header
+from pdcorrect.data.schema import PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Base, Problem
-from pdcorrect.scene import Scene, trained_coarse
 from pdcorrect.training.losses import LEAST_ERROR, BaseErrors
 
 Array = NDArray[Any]
-
-_SAME_MESH = 1e-5
-"""Of the cell size: distance of a scene's nodes from the file's that counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +31,11 @@ class Recording:
     ----------
     path : Path
         The file, which has one mesh.
-    dataset, config_hash, setting, split : str
+    dataset, config_hash, content_hash, setting, split : str
     mesh, number : int
         Of the mesh in its split, and on the mesh.
     time_step : float
         s.
-    scene_toml : str
-    points : (N, 3) float64
-        Rest positions, m.
-    cells : (C, 8)
-        VTK order.
     reference, plain : (T+1, N, 3)
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
@@ -57,14 +47,12 @@ class Recording:
     path: Path
     dataset: str
     config_hash: str
+    content_hash: str
     setting: str
     split: str
     mesh: int
     number: int
     time_step: float
-    scene_toml: str
-    points: Array
-    cells: Array
     reference: Array
     plain: Array
     one_step: float
@@ -83,9 +71,8 @@ class Recording:
 
 
 def load_recordings(
-    folder: Folders, split: str, base: Base, *, scenes: bool = True, meshes: int | None = None,
-    without: Collection[str] = (),
-) -> list[Recording]:  # fmt: skip
+    folder: Folders, split: str, base: Base, *, scenes: bool = True, without: Collection[str] = ()
+) -> list[Recording]:
     """The simulations of a split, mesh by mesh.
 
     Parameters
@@ -96,26 +83,22 @@ def load_recordings(
     base : {"plain", "best", "total-mass"}
     scenes : bool
         Whether the base model is to step again, for which it takes the scenes.
-    meshes : int, optional
-        At most so many, spread evenly over the split; all by default.
     without : collection of str
         Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
 
     Raises
     ------
     InputError
-        If there is no such split, or ``meshes`` is less than 1, or a simulation lacks a run or a
-        scene that is needed; names the file and all that it lacks.
+        If there is no such split, or a simulation lacks a run or a scene that is needed; names
+        the file and all that it lacks.
     FileFormatError
         If a file is damaged.
     """
-    if meshes is not None and meshes < 1:
-        raise InputError(f"meshes = {meshes}: expected 1 or more.")
-    found, paths = [], _paths(folder, split, without)
-    count = len(paths) if meshes is None else min(meshes, len(paths))
-    for path in (paths[k * len(paths) // count] for k in range(count)):
-        _check_complete(read_header(path), base, scenes)
-        shard = read_shard(path, verify=False, runs=tuple(dict.fromkeys((REFERENCE, PLAIN, base))))
+    found = []
+    for path in _paths(folder, split, without):
+        runs = dict.fromkeys(_runs(base), ("positions", "predictions"))
+        shard = read_shard(path, verify=False, runs=runs)
+        _check_complete(path, shard, base, scenes)
         for number, simulation in enumerate(shard.simulations):
             found.append(_recording(path, shard, simulation, number, split, base))
     return found
@@ -123,13 +106,8 @@ def load_recordings(
 
 def base_errors(recordings: Sequence[Recording], device: str | torch.device = "cpu") -> BaseErrors:
     """Of some simulations, in their order."""
-
-    def tensor(values: list[float]) -> torch.Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=device)
-
-    return BaseErrors(
-        tensor([r.one_step for r in recordings]), tensor([r.rollout for r in recordings])
-    )
+    values = [[r.one_step for r in recordings], [r.rollout for r in recordings]]
+    return BaseErrors(*torch.tensor(values, dtype=torch.float64, device=device))
 
 
 def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
@@ -140,27 +118,17 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     InputError
         If a scene is not that of the recorded mesh.
     """
-    known: dict[Path, Problem] = {}
-    problems = []
-    for recording in recordings:
-        scene = Scene.from_toml(recording.scene_toml, recording.name)
-        if recording.path not in known:
-            model = trained_coarse(scene) if base == BEST else scene
-            problem = discretise_stored(model, recording.points, recording.cells)
-            _check_mesh(recording, problem)
-            if recording.total_mass is not None:
-                problem = problem.with_total_mass(recording.total_mass)
-            known[recording.path] = problem
-        problems.append(known[recording.path].with_loads(scene.loads))
-    return problems
+    known: dict[Path, list[Problem]] = {}
+    for path in dict.fromkeys(recording.path for recording in recordings):
+        known[path] = rebuilt_problems(read_shard(path, verify=False, runs=(base,)), path, base)
+    return [known[recording.path][recording.number] for recording in recordings]
 
 
-def data_hash(folder: Folders, splits: Sequence[str], without: Collection[str] = ()) -> str:
-    """SHA-256 of the content hashes of the files of some splits, those left out left out."""
-    digest, folders = hashlib.sha256(), folders_of(folder)
-    for split in splits:
-        for path in _paths(folders, split, without):
-            digest.update(f"{split}/{path.name} {read_header(path).content_hash}\n".encode())
+def data_hash(recordings: Sequence[Recording]) -> str:
+    """SHA-256 of the content hashes of the files of some simulations, in their order."""
+    digest = hashlib.sha256()
+    for path, one in {recording.path: recording for recording in recordings}.items():
+        digest.update(f"{one.split}/{path.name} {one.content_hash}\n".encode())
     return digest.hexdigest()
 
 
@@ -169,52 +137,53 @@ def _paths(folder: Folders, split: str, without: Collection[str]) -> list[Path]:
     return [path for each in folders_of(folder) for path in shard_paths(each, split, without)]
 
 
-def _check_complete(header: ShardHeader, base: Base, scenes: bool) -> None:
+def _check_complete(path: Path, shard: Shard, base: Base, scenes: bool) -> None:
     """Refuse a file of which a simulation lacks what a training of ``base`` needs."""
-    rollouts = tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
-    for number, (positions, predictions) in enumerate(header.runs):
-        lacks = ["scene"] if scenes and not header.scenes[number] else []
-        lacks += [f"rollout of run {name!r}" for name in rollouts if name not in positions]
-        lacks += [f"single steps of run {base!r}"] if base not in predictions else []
+    for number, simulation in enumerate(shard.simulations):
+        runs = simulation.runs
+        single = runs[base].predictions if base in runs else None
+        lacks = ["scene"] if scenes and not simulation.scene_toml else []
+        lacks += [
+            f"rollout of run {name!r}"
+            for name in _runs(base)
+            if name not in runs or runs[name].positions is None
+        ]
+        lacks += [f"single steps of run {base!r}"] if single is None else []
         if lacks:
-            runs = " and ".join(map(repr, rollouts[1:]))
             raise InputError(
-                f"{header.path}: simulation {number} has no {', no '.join(lacks)}: a training "
-                f"with base = {base!r} needs simulations with rollouts of {REFERENCE!r} and "
-                f"{runs}, single steps of {base!r}"
-                f"{', and scenes for stepping them again' if scenes else ''}."
+                f"{path}: simulation {number} has no {', no '.join(lacks)}: expected what a "
+                f"training with base = {base!r} needs."
             )
+
+
+def _runs(base: Base) -> tuple[str, ...]:
+    """Whose rollouts are needed."""
+    return tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
 
 
 def _recording(
     path: Path, shard: Shard, simulation: Simulation, number: int, split: str, base: Base
 ) -> Recording:
     """A simulation that lacks nothing, see `_check_complete`."""
-    reference, plain, rollout = (_positions(simulation, run) for run in (REFERENCE, PLAIN, base))
+    runs = simulation.runs
+    reference, plain, rollout = (np.asarray(runs[n].positions) for n in (REFERENCE, PLAIN, base))
+    mass = float(runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
     return Recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
+        content_hash=shard.content_hash,
         setting=str(shard.attributes["setting"]),
         split=split,
         mesh=int(shard.attributes["number"]),
         number=number,
         time_step=float(shard.attributes["time_step"]),
-        scene_toml=simulation.scene_toml,
-        points=shard.points,
-        cells=shard.cells,
         reference=reference,
         plain=plain,
-        one_step=_mean_square(np.asarray(simulation.runs[base].predictions), reference[1:]),
+        one_step=_mean_square(np.asarray(runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
-        total_mass=(
-            float(simulation.runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
-        ),
+        total_mass=mass,
     )
-
-
-def _positions(simulation: Simulation, run: str) -> Array:
-    return np.asarray(simulation.runs[run].positions)
 
 
 def _mean_square(x: Array, y: Array) -> float:
@@ -231,14 +200,3 @@ def rounding(positions: Array) -> float:
     """Squared distance that storing positions in their type may make, m2."""
     size = float(np.abs(positions).max(initial=0.0))
     return (size * float(np.finfo(positions.dtype).eps)) ** 2
-
-
-def _check_mesh(recording: Recording, problem: Problem) -> None:
-    found, wanted = problem.positions, recording.points
-    if found.shape != wanted.shape or not np.allclose(
-        found, wanted, rtol=0.0, atol=_SAME_MESH * problem.cell_size
-    ):
-        raise InputError(
-            f"{recording.name}: its scene has {len(found)} nodes which are not the file's "
-            f"{len(wanted)}: expected data whose scenes make their meshes."
-        )

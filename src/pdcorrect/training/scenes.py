@@ -15,9 +15,8 @@ from torch import Tensor
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.placements import Velocity
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.problem import Base, Problem
+from pdcorrect.fem.problem import Base
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
 from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 
@@ -69,7 +68,7 @@ class SceneGroup:
         self.nodes = sum(self.stepper.node_counts)
         self._rows = torch.arange(len(self), device=self.device)
         self._reference = self._padded([r.reference for r in recordings])
-        self._layers: dict[tuple[int, bool, Velocity], HybridLayer] = {}
+        self._layers: dict[tuple[int, bool], HybridLayer] = {}
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -79,16 +78,15 @@ class SceneGroup:
         """Seconds."""
         return self.stepper.time_step
 
-    def layer(self, corrector: Corrector, through_solver: bool, velocity: Velocity) -> HybridLayer:
+    def layer(self, corrector: Corrector, through_solver: bool) -> HybridLayer:
         """The hybrid's step; scenes that fail have no derivatives."""
-        key = id(corrector), through_solver, velocity
+        key = id(corrector), through_solver
         if key not in self._layers:
             self._layers = {
                 key: HybridLayer(
-                    self.stepper, corrector, through_solver=through_solver, velocity=velocity,
-                    on_failure="zero",
+                    self.stepper, corrector, through_solver=through_solver, on_failure="zero"
                 )
-            }  # fmt: skip
+            }
         return self._layers[key]
 
     def truth(self, frames: Frames) -> Tensor:
@@ -133,15 +131,16 @@ class SceneGroup:
                 f"loss.ahead with integrator {self.stepper.integrator!r}: expected backward-euler, "
                 "whose velocities are differences of positions, as the reference's are."
             )
-        meshes: dict[Path, int] = {}
         for recording, problem in zip(self.recordings, self.stepper.problems, strict=True):
-            key = recording.path  # of which all simulations have one material
-            meshes.setdefault(key, len(meshes))
-            if key not in self._modes:
-                self._modes[key] = _modes(recording, problem)
+            if recording.path not in self._modes:  # all its simulations have one material
+                try:
+                    self._modes[recording.path] = body_modes(problem)
+                except ConvergenceError as error:
+                    raise ConvergenceError(f"{recording.name}: its modes: {error}") from None
+        meshes = list(dict.fromkeys(r.path for r in self.recordings))
         return Vibrations(
-            [self._modes[key] for key in meshes],
-            [meshes[r.path] for r in self.recordings],
+            [self._modes[path] for path in meshes],
+            [meshes.index(r.path) for r in self.recordings],
             self.steps,
             self.time_step,
             self.mask.shape[1],
@@ -156,10 +155,10 @@ class SceneGroup:
         """Sums (B,) over the nodes of each scene of values (B, N)."""
         return torch.where(self.mask, values, 0.0).sum(dim=1)
 
-    def lost(self, positions: Tensor, frames: Frames, most: float) -> NDArray[np.bool_]:
-        """Which scenes are off by more than ``most`` times the base model's D, squared, (B,)."""
+    def lost(self, positions: Tensor, frames: Frames) -> NDArray[np.bool_]:
+        """Which scenes' mean squared distance is more than the base model's D, (B,)."""
         squares = self.sums((positions - self.truth(frames)).square().sum(dim=2)) / self.counts
-        far = ~(squares <= most * self.errors.largest)
+        far = ~(squares <= self.errors.largest)
         found: NDArray[np.bool_] = far.cpu().numpy()
         return found
 
@@ -168,8 +167,7 @@ class SceneGroup:
         frames, nodes = max(map(len, runs)), self.mask.shape[1]
         out = np.zeros((len(runs), frames, nodes, 3), dtype=np.float32)
         for row, run in zip(out, runs, strict=True):
-            row[: len(run), : run.shape[1]] = run
-            row[len(run) :, : run.shape[1]] = run[-1]
+            row[:, : run.shape[1]] = run[np.minimum(np.arange(frames), len(run) - 1)]
         return torch.from_numpy(out).to(self.device)
 
 
@@ -195,8 +193,7 @@ class SceneGroups:
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        self.recordings, self.device = tuple(recordings), torch.device(device)
-        self.rank = rank
+        self.recordings, self.device, self.rank = tuple(recordings), torch.device(device), rank
         self._base, self._place = base, {"seed": seed, "rank": rank, "world_size": world_size}
         self._known: dict[tuple[tuple[Path, int], ...], SceneGroup] = {}
         self._modes: dict[Path, BodyModes] = {}
@@ -235,13 +232,6 @@ class SceneGroups:
             del self._known[next(iter(self._known))]
             torch.cuda.empty_cache()
             free, total = torch.cuda.mem_get_info(self.device)
-
-
-def _modes(recording: Recording, problem: Problem) -> BodyModes:
-    try:
-        return body_modes(problem)
-    except ConvergenceError as error:
-        raise ConvergenceError(f"{recording.name}: its modes: {error}") from None
 
 
 def grouped(

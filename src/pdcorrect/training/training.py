@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 import time
@@ -24,11 +25,11 @@ from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.training.batch_losses import Source, make_source, share_done
-from pdcorrect.training.checkpoints import lineage_of, read_checkpoint, write_checkpoint
-from pdcorrect.training.distillation import load_start, load_teachers
+from pdcorrect.training.batch_losses import Source, make_source
+from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
+from pdcorrect.training.models import Lineage, load_start, load_teachers
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import HistoryFile, Progress, check_same
 from pdcorrect.training.recipe import Stage, TrainingConfig
@@ -37,6 +38,8 @@ from pdcorrect.training.scenes import SceneGroups
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import StepWindows
 
+MOST_SKIPPED = 20
+"""Batches in a row whose loss or gradient is not finite, at which training fails."""
 CHECKPOINT, MODEL, CONFIG = "checkpoint.safetensors", "model", "config.toml"
 
 Report = Callable[[Progress, Mapping[str, Any]], None]
@@ -75,9 +78,8 @@ class Training:
         If the folder holds a training and ``resume`` is not set, or it was another one; if
         files of the data sets are missing, or do not have what the configuration wants; if one
         has a validation split and another has none, or their settings or time steps differ; if the
-        model to start from is missing, or of another architecture, base (unless the normalisation
-        is fitted anew) or velocity, or its ranges stay and the data have another time step; if a
-        teacher is.
+        model to start from is missing, or of another architecture or base, or its ranges stay and
+        the data have another time step; if a teacher is.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -103,7 +105,14 @@ class Training:
                 check_whole(folder, (TRAINING, VALIDATION))
         splits, without = _common_splits(data), config.without
         _check_left_out(without, data)
-        digest = data_hash(data, splits, without)
+        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
+        self._recordings = load_recordings(
+            data, TRAINING, config.base, scenes=unrolled, without=without
+        )
+        validated: list[Recording] = []
+        if VALIDATION in splits:
+            validated = load_recordings(data, VALIDATION, config.base, without=without)
+        digest = data_hash([*self._recordings, *validated])
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
@@ -114,16 +123,11 @@ class Training:
         if self._teachers:
             self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
-        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
-        self._recordings = load_recordings(
-            data, TRAINING, config.base, scenes=unrolled, without=without
-        )
-        if len(data) > 1:
-            _check_alike(self._recordings)
-        self._lineage = lineage_of(config, start, self._recordings)
+        _check_alike(self._recordings)
+        self._lineage = Lineage.of(config, start, self._recordings)
         self._windows = StepWindows(
             data, self._recordings, config.architecture(), config.base, device=self.device,
-            workers=config.workers, without=without,
+            without=without,
         )  # fmt: skip
         self._groups = SceneGroups(
             self._recordings, config.base, self.device, seed=config.seed, rank=self.world.rank,
@@ -133,10 +137,9 @@ class Training:
         self._averaged = copy.deepcopy(self.corrector)
         self._best: dict[str, Tensor] = {}
         self._validation: Validation | None = None
-        if VALIDATION in splits:
+        if validated:
             self._validation = Validation(
-                load_recordings(data, VALIDATION, config.base, without=without), config.base,
-                velocity=config.velocity, device=self.device, world=self.world,
+                validated, config.base, device=self.device, world=self.world,
             )  # fmt: skip
         self.progress = Progress()
         self._waiting: tuple[dict[str, Any], dict[str, Tensor]] | None = None
@@ -174,12 +177,12 @@ class Training:
         """One stage, or what is left of it; whether it came to its end."""
         at = self.progress
         source = make_source(
-            stage, at.stage, self.config, self._windows, self._groups, self.world,
+            at.stage, self.config, self._windows, self._groups, self.world,
             self._teachers.get(stage.teacher or ""),
         )  # fmt: skip
         optimiser = self._optimiser(stage, source)
         shown = self.corrector if stage.ema is None else self._averaged
-        while (share := share_done(stage, len(source), at.iteration, at.stage_seconds)) < 1.0:
+        while (share := stage.share_done(len(source), at.iteration, at.stage_seconds)) < 1.0:
             loss = source.loss(self.corrector, at.iteration, stage.horizon(share))
             optimiser.step(loss, share)
             at.stepped(self._tick())
@@ -188,8 +191,6 @@ class Training:
             kept = False
             if at.due(self.config.validate_every, at.validated):
                 kept = self._validate(shown)
-                if stage.patience is not None and at.stale >= stage.patience:
-                    break
             late = at.seconds >= self._limit
             if late or kept or at.due(self.config.checkpoint_every, at.saved):
                 self._save(optimiser, source)  # with new best weights, of which model/ is made
@@ -201,11 +202,7 @@ class Training:
         if self._validation is None:
             self._keep(shown, {})
         at.next_stage()
-        later = self.config.stages[at.stage : at.stage + 1]
-        goes_on = bool(later) and later[0].begin == "last"
-        self.corrector.network.load_state_dict(
-            shown.network.state_dict() if goes_on else self._best
-        )
+        self.corrector.network.load_state_dict(self._best)
         self._save()
         return True
 
@@ -213,12 +210,12 @@ class Training:
         """For a stage that begins, or one that goes on from a checkpoint."""
         if self._waiting is None:
             self._averaged.load_state_dict(self.corrector.state_dict())
-            return Optimiser(self.corrector, stage, self._averaged, self.world)
-        numbers, tensors = self._waiting
         optimiser = Optimiser(self.corrector, stage, self._averaged, self.world)
-        optimiser.load_state_dict(_part(tensors, "optimiser."))
-        source.load_state_dict(numbers, _part(tensors, "source."))
-        self._waiting = None
+        if self._waiting is not None:
+            numbers, tensors = self._waiting
+            optimiser.load_state_dict(_part(tensors, "optimiser."))
+            source.load_state_dict(numbers, _part(tensors, "source."))
+            self._waiting = None
         return optimiser
 
     def _tick(self) -> float:
@@ -230,16 +227,15 @@ class Training:
     def _report(self, stage: Stage, optimiser: Optimiser, source: Source, share: float) -> None:
         """A row about the batches since the last one."""
         told = optimiser.take_report()
-        if told["longest"] >= self.config.most_skipped:
+        if told["longest"] >= MOST_SKIPPED:
             raise ConvergenceError(
                 f"stage {self.progress.stage}, iteration {self.progress.iteration}: "
                 f"{told['longest']:.0f} batches in a row had a loss or gradient that is not "
-                "finite. Expected a smaller learning rate, gradients that are clipped, or data "
-                "without extreme values."
+                "finite. Expected a smaller learning rate, or data without extreme values."
             )
         failed = self.world.total(torch.tensor([source.failed], dtype=torch.float64))
         if told["count"] + told["skipped"]:
-            loss = {"loss": told["loss"]} if told["count"] else {}
+            loss = {"loss": told["loss_sum"] / told["count"]} if told["count"] else {}
             self._tell(
                 **loss, rate=rate_at(stage.rate, share), steps=stage.horizon(share),
                 skipped=int(told["skipped"]), failed_scenes=int(failed),
@@ -256,11 +252,9 @@ class Training:
         at.validated = at.now()
         metrics = scores.metrics()
         self._tell(**metrics)
-        value = metrics[f"omega_{self.config.select}"]
-        at.stale += 1
-        if at.best is not None and not value > at.best:
+        if at.best is not None and not scores.mean > at.best:
             return False
-        at.best, at.stale = value, 0
+        at.best = scores.mean
         self._keep(shown, metrics)
         return True
 
@@ -284,13 +278,12 @@ class Training:
                 corrector = Corrector(config.architecture()).to(self.device)
         if fit:
             windows, seed = config.fitting.windows, config.seed
-            if start is None or config.fitting.anew:
+            if start is None:
                 fit_normaliser(corrector, self._windows, windows, seed)
             elif config.fitting.widen:
                 widen_ranges(corrector, self._windows, windows, seed)
             else:
-                what = f"start_from = {config.start_from!r}"
-                check_time_steps(what, corrector, self._windows)
+                check_time_steps(corrector, self._windows)
             self.world.same(list(corrector.state_dict().values()))
         return corrector
 
@@ -355,39 +348,31 @@ class Training:
 
 def _common_splits(folders: Sequence[Path]) -> list[str]:
     """Training and, if there is one, validation split."""
-    found = [TRAINING]
-    with_validation = [folder for folder in folders if VALIDATION in splits_of(folder)]
-    if with_validation:
-        found.append(VALIDATION)
-        for folder in folders:
-            if folder not in with_validation:
-                raise InputError(
-                    f"{folder}: no split {VALIDATION!r}, which {with_validation[0]} has: "
-                    "expected one in all data sets, or in none."
-                )
-    return found
+    without = [folder for folder in folders if VALIDATION not in splits_of(folder)]
+    if not without:
+        return [TRAINING, VALIDATION]
+    if len(without) < len(folders):
+        raise InputError(
+            f"{without[0]}: no split {VALIDATION!r}: expected one in all data sets, or in none."
+        )
+    return [TRAINING]
 
 
 def _check_left_out(names: Sequence[str], folders: Sequence[Path]) -> None:
     """Refuse files to be left out that are not there, or that may be of several data sets."""
     for name in names:
         *given, split, mesh = name.split("/")
-        having = [each for each in folders if not given or each.resolve().name == given[0]]
-        if len(having) > 1 and given:
+        having = [
+            folder
+            for folder in folders
+            if (not given or folder.resolve().name == given[0])
+            and (folder / split / f"{mesh}{SUFFIX}").exists()
+        ]
+        if len(having) != 1:
             raise InputError(
-                f"without = {name!r}: {having[0]} and {having[1]} have the same name: expected "
-                "folders of different names."
+                f"without = {name!r}: {len(having)} files of {', '.join(map(str, folders))} are "
+                "called so: expected one, of several data sets as 'SET/training/mesh-0042'."
             )
-        if len(having) > 1:
-            raise InputError(
-                f"without = {name!r}: expected the folder of one of the {len(folders)} data sets "
-                f"before it, such as '{folders[0].resolve().name}/{name}'."
-            )
-        if not having:
-            known = ", ".join(each.resolve().name for each in folders)
-            raise InputError(f"without = {name!r}: expected a data set among {known}.")
-        if not (having[0] / split / f"{mesh}{SUFFIX}").exists():
-            raise InputError(f"without: {having[0]} has no {split}/{mesh}: expected files of it.")
 
 
 def _check_alike(recordings: Sequence[Recording]) -> None:
@@ -396,14 +381,13 @@ def _check_alike(recordings: Sequence[Recording]) -> None:
     What else a batch asks to be the same is told when one is made, see `BatchStepper`.
     """
     first = recordings[0]
-    for other in recordings:
-        for name in ("setting", "time_step"):
-            here, there = getattr(first, name), getattr(other, name)
-            if here != there:
-                raise InputError(
-                    f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
-                    "the same in all data sets."
-                )
+    for other, name in itertools.product(recordings, ("setting", "time_step")):
+        here, there = getattr(first, name), getattr(other, name)
+        if here != there:
+            raise InputError(
+                f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
+                "the same in all data sets."
+            )
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -14,7 +14,6 @@ from torch import Tensor
 from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import FeatureView
-from pdcorrect.corrector.placements import Velocity
 from pdcorrect.training.losses import body_losses, mean_of, network_precision
 from pdcorrect.training.recipe import Stage
 from pdcorrect.training.scenes import Frames, SceneGroup, SceneGroups
@@ -69,7 +68,6 @@ class UnrolledBatches:
     ----------
     groups : SceneGroups
     stage : Stage
-    velocity : {"recomputed", "kept"}
     seed : int
     teacher : Corrector, optional
         Whose corrections of the same states are to be learned.
@@ -90,14 +88,11 @@ class UnrolledBatches:
         groups: SceneGroups,
         stage: Stage,
         *,
-        velocity: Velocity = "recomputed",
         seed: int = 0,
         teacher: Corrector | None = None,
     ) -> None:
-        self._teacher = teacher
-        self._groups = groups
+        self._groups, self._stage, self._teacher = groups, stage, teacher
         self._chosen = groups.of(stage.batch, max(stage.steps))
-        self._stage, self._velocity = stage, velocity
         self._seed = (seed, groups.rank)
         self._pool: dict[int, Rollouts] = {}
         self.failed = 0
@@ -112,10 +107,10 @@ class UnrolledBatches:
         number = self._turn(iteration)
         group = self._groups(self._chosen[number])
         start = self._start(number, group, steps, rng)
-        found = unroll(group, corrector, start, steps, self._stage, self._velocity, self._teacher)
+        found = unroll(group, corrector, start, steps, self._stage, self._teacher)
         self.failed += int((~found.alive).sum())
         if self._stage.start == "pool":
-            lost = group.lost(found.end.positions, found.end.frames, self._stage.lost)
+            lost = group.lost(found.end.positions, found.end.frames)
             found.end.ages[~found.alive | lost] = -1
             self._pool[number] = found.end
         return mean_of(found.losses, group.on_device(found.alive))
@@ -174,20 +169,19 @@ def unroll(
     start: Rollouts,
     steps: int,
     stage: Stage,
-    velocity: Velocity = "recomputed",
     teacher: Corrector | None = None,
 ) -> Unrolled:
     """Step a group and compare each frame with the reference.
 
     With a teacher its correction of each step is compared with that of the teacher, over d(1).
     """
-    layer = group.layer(corrector, stage.through_solver, velocity)
+    layer = group.layer(corrector, stage.through_solver)
     views: list[FeatureView] = []
     layer.watch = None if teacher is None else views.append
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
     total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
-    living = torch.ones(len(group), dtype=torch.bool, device=group.device)
+    living = torch.ones_like(total, dtype=torch.bool)
     for _ in range(steps):
         with network_precision(corrector, stage.amp):
             positions, velocities, correction = layer(

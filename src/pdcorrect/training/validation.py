@@ -8,17 +8,16 @@ rollout does not hide what the others say.  What a model is worth is told by
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.states import BatchState
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.placements import Velocity
+from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.recordings import Recording, rounding
@@ -48,21 +47,11 @@ class Scores:
         """Eq. 7-3, with `LEAST` as the least value."""
         return float(self.omegas.mean())
 
-    @property
-    def median(self) -> float:
-        """Per cent."""
-        return float(np.median(self.omegas))
-
-    @property
-    def least(self) -> float:
-        """Per cent."""
-        return float(self.omegas.min())
-
     def metrics(self) -> dict[str, float]:
         """By name, for tables and files."""
         return {
-            "omega_mean": self.mean, "omega_median": self.median, "omega_least": self.least,
-            "failed_rollouts": float(self.failed),
+            "omega_mean": self.mean, "omega_median": float(np.median(self.omegas)),
+            "omega_least": float(self.omegas.min()), "failed_rollouts": float(self.failed),
         }  # fmt: skip
 
 
@@ -83,11 +72,10 @@ class Validation:
         recordings: Sequence[Recording],
         base: Base,
         *,
-        velocity: Velocity = "recomputed",
         device: str | torch.device = "cpu",
         world: ProcessGroup | None = None,
     ) -> None:
-        self.recordings, self._velocity = tuple(recordings), velocity
+        self.recordings = tuple(recordings)
         self._world = ProcessGroup() if world is None else world
         self._numbers = range(self._world.rank, len(recordings), self._world.size)
         own = [recordings[i] for i in self._numbers]
@@ -100,54 +88,34 @@ class Validation:
         if self._group is not None:
             chosen = list(self._numbers)
             omegas, failed = self._rollout(self._group, corrector)
-            found[0, chosen], found[1, chosen] = omegas.cpu(), failed.double().cpu()
+            found[0, chosen], found[1, chosen] = omegas, failed.double()
         found = self._world.total(found)
         return Scores(found[0].numpy(), int(found[1].sum()))
 
     def _rollout(self, group: SceneGroup, corrector: Corrector) -> tuple[Tensor, Tensor]:
-        """Omega of a group, (B,), and which rollouts failed.
+        """Omega of a group, (B,), and which rollouts failed, on the CPU.
 
-        Those that failed, are sure to end below `LEAST`, or have come to their last frame are
-        put back to rest, where they cost little.
+        Those that are sure to end below `LEAST` are not gone on with.
         """
-        hybrid = BatchHybrid(group.stepper, corrector, velocity=self._velocity)
-        rest = group.stepper.rest_state()
-        state, previous = group.stepper.initial_state(), None
-        total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
-        ok = torch.ones(len(group), dtype=torch.bool, device=group.device)
-        good = ok.clone()
         squares = [_squares(r) for r in group.recordings]
         plain = torch.tensor(squares, dtype=torch.float64, device=group.device)
-        worst = (1.0 - LEAST / 100.0) * plain
-        steps = torch.from_numpy(group.steps).to(group.device)
-        for frame in range(1, int(group.steps.max()) + 1):
-            result = hybrid(state, previous)
-            state, previous = result.state, result.correction
-            running = steps >= frame
-            fine = torch.tensor([s.ok for s in result.coarse.statuses], device=group.device)
-            fine &= torch.isfinite(state.positions).flatten(1).all(dim=1) & ~result.refused
-            ok &= fine | ~running
-            error = state.positions - group.truth(np.minimum(frame, group.steps))
-            square = group.sums(error.square().sum(dim=2))
-            total += torch.where(running & ok, square, 0.0)
-            good &= ok & (total <= worst)
-            state = _where(good & (steps > frame), state, rest)
-        return torch.where(good, 100.0 * (1.0 - total / plain), LEAST), ~ok
+        total, steps = torch.zeros_like(plain), group.on_device(group.steps)
+
+        def worth(frame: int, positions: Tensor) -> Tensor:
+            error = positions - group.truth(np.minimum(frame, group.steps))
+            total.add_(torch.where(frame <= steps, group.sums(error.square().sum(dim=2)), 0.0))
+            return total <= (1.0 - LEAST / 100.0) * plain
+
+        hybrid = BatchHybrid(group.stepper, corrector)
+        runs = roll_out(hybrid, group.stepper, group.steps.tolist(), worth)
+        # without a gate only corrections that are not finite are refused
+        failed = torch.tensor([r.failed is not None or bool(np.any(r.reasons)) for r in runs])
+        omegas = (100.0 * (1.0 - total / plain)).clamp(min=LEAST).cpu()
+        return torch.where(failed, LEAST, omegas), failed
 
 
 def _squares(recording: Recording) -> float:
     """Of the plain model's rollout, over all frames and nodes, m2; at least what rounding makes."""
     distance = recording.plain[1:].astype(np.float64) - recording.reference[1:]
-    least = recording.steps * len(recording.points) * rounding(recording.reference)
+    least = recording.steps * recording.reference.shape[1] * rounding(recording.reference)
     return max(float((distance**2).sum()), least)
-
-
-def _where(ok: Tensor, state: BatchState, rest: BatchState) -> BatchState:
-    """The state, but rest where it is not ok."""
-    at = ok[:, None, None]
-    return replace(
-        state,
-        positions=torch.where(at, state.positions, rest.positions),
-        velocities=torch.where(at, state.velocities, rest.velocities),
-        memory={name: torch.where(at, x, 0.0) for name, x in state.memory.items()},
-    )

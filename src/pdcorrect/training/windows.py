@@ -1,34 +1,37 @@
-"""`StepBatch`: single steps of many bodies with the corrections that they need.
+"""`StepWindows`: single steps of many bodies with the corrections that they need.
 
 They come from the stored predictions of a data set, so no simulator runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.corrector.architecture import CorrectorConfig
-from pdcorrect.corrector.bodies import KNOWN, BodyGraph
+from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.folder import Folders
-from pdcorrect.data.reader import CACHE_BYTES, ShardShuffle, TrajectoryDataset, TrajectoryLoader
+from pdcorrect.data.reader import TrajectoryDataset
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Base
-from pdcorrect.training.losses import BaseErrors
 from pdcorrect.training.recordings import Recording, base_errors
-from pdcorrect.training.resident import ResidentWindows, StoredWindows
+
+Numbers = NDArray[np.int64]
 
 _SHARE_OF_DEVICE = 0.3
 """Of a GPU's free memory, which the windows may fill."""
+_FRAMES = ("positions", "velocities", "predictions", "forces")
+_BODY = ("rest", "free", "mass", "young", "poisson", "density", "cell_size", "time_step")
+_AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,23 +54,26 @@ class StepBatch:
     target: Tensor
     scale: Tensor
 
-    def with_noise(self, tau: float, relative: bool, generator: torch.Generator) -> StepBatch:
+    def with_noise(self, tau: float, generator: torch.Generator) -> StepBatch:
         """The same with Gaussian noise on the proposal, which the target takes back.
 
-        ``tau`` is the deviation of a component, in m or, if ``relative``, in the root mean
-        square of a component of the base model's one-step errors.
+        ``tau`` is the deviation of a component in the root mean square of a component of the
+        base model's one-step errors.
         """
         x = self.snapshot.proposed
         noise = torch.randn(x.shape, generator=generator, dtype=x.dtype, device=x.device)
-        if relative:
-            noise = noise * self.bodies.by_node((self.scale / 3.0).sqrt())[:, None]
+        noise = noise * self.bodies.by_node((self.scale / 3.0).sqrt())[:, None]
         noise = torch.where(self.bodies.free, tau * noise, 0.0)
         snapshot = replace(self.snapshot, proposed=x + noise)
         return replace(self, snapshot=snapshot, target=self.target - noise)
 
 
 class StepWindows:
-    """Endless batches of windows of a data set's training split, on a device.
+    """Single steps of a data set's training split, in one piece of memory.
+
+    There is one table for each quantity, with all nodes of all frames.  It is on the device, or
+    on the CPU if all would fill more than 0.3 of what is free on a GPU.  Of bodies all that is
+    known at rest is computed once.
 
     Parameters
     ----------
@@ -77,15 +83,13 @@ class StepWindows:
     config : CorrectorConfig
     base : {"plain", "best", "total-mass"}
     device : str or torch.device
-    workers : int
-        Processes that read ahead; none are needed where the split is kept in memory.
-    steps : int
-        Of what `windows` gives, at least; `batch` takes the first one or two.
-    resident : bool, optional
-        Whether all windows are kept in the device's memory, see `ResidentWindows`.  By
-        default if they take less than 0.3 of what is free on a GPU, or 4 GiB on the CPU.
     without : collection of str
         Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
+
+    Raises
+    ------
+    InputError
+        If the recordings are not those of the split.
     """
 
     def __init__(
@@ -96,172 +100,133 @@ class StepWindows:
         base: Base,
         *,
         device: str | torch.device = "cpu",
-        workers: int = 0,
-        steps: int = 1,
-        resident: bool | None = None,
         without: Collection[str] = (),
     ) -> None:
         self.config, self.device = config, torch.device(device)
         self._history = "previous-correction" in config.node_features
-        steps = max(steps, 2 if self._history else 1)
-        self.dataset = TrajectoryDataset(folder, TRAINING, window=steps, base=base, without=without)
-        size = int(self.dataset.shard_bytes().sum())
-        self.resident = _fits(size, self.device) if resident is None else resident
-        self._workers = 0 if self.resident else workers
-        numbers = {header.path: k for k, header in enumerate(self.dataset.headers)}
-        wanted = [(h.path, k) for h in self.dataset.headers for k in range(len(h.steps))]
+        self.dataset = TrajectoryDataset(
+            folder, TRAINING, window=2 if self._history else 1, base=base, without=without
+        )
+        headers = self.dataset.headers
+        wanted = [(h.path, k) for h in headers for k in range(len(h.steps))]
         if sorted((r.path, r.number) for r in recordings) != sorted(wanted):
             raise InputError(
                 f"{len(recordings)} recordings for {len(wanted)} simulations: expected those of "
                 "the same files, one each."
             )
-        columns = max(r.number for r in recordings) + 1
-        places = torch.full((len(numbers), columns), -1, dtype=torch.int64)
+        files = {header.path: k for k, header in enumerate(headers)}
+        self._numbers = np.zeros((len(headers), max(len(h.steps) for h in headers)), dtype=np.int64)
         for k, r in enumerate(recordings):
-            places[numbers[r.path], r.number] = k
-        self._recordings = places.to(self.device)
-        self._masses = {numbers[r.path]: r.total_mass for r in recordings}
+            self._numbers[files[r.path], r.number] = k
         self._errors = base_errors(recordings, self.device)
-        files, first = np.unique(self.dataset.shard_numbers(), return_index=True)
-        self._first = dict(zip(files.tolist(), first.tolist(), strict=True))
-        self._known: dict[int, BodyGraph] = {}
+        masses = {files[r.path]: r.total_mass for r in recordings}
+        self._nodes = np.array([h.nodes for h in headers])
+        rows = np.zeros(self._numbers.shape, dtype=np.int64)
+        for row, h in zip(rows, headers, strict=True):
+            row[: len(h.steps)] = (np.array(h.steps) + 1) * h.nodes
+        self._starts = (np.cumsum(rows) - rows.reshape(-1)).reshape(rows.shape)
+        size, self._home = (int(rows.sum()), 3), self._chosen_home()
+        self._frames = {name: torch.zeros(size, device=self._home) for name in _FRAMES}
+        self._bodies: dict[int, BodyGraph] = {}
+        for window in self.of_each_file().tolist():
+            file = int(self.dataset.places([window])[0][0])
+            self._bodies[file] = self._alone(window, masses[file])
+            self._keep(file)
+            self.dataset.forget()
 
-    def batch(self, indices: Sequence[int], *, last: bool = True) -> StepBatch:
-        """The first steps of chosen windows, or the last of those that `batch` looks at.
+    def _chosen_home(self) -> torch.device:
+        """Where the tables are kept."""
+        if self.device.type != "cuda":
+            return self.device
+        free = torch.cuda.mem_get_info(self.device)[0]
+        fits = int(self.dataset.shard_bytes().sum()) < _SHARE_OF_DEVICE * free
+        return self.device if fits else torch.device("cpu")
 
-        These are two where the network sees the correction of the step before, else one.  Of a
-        window's first step that correction is None, as where a simulation begins.
+    def _alone(self, window: int, mass: float | None) -> BodyGraph:
+        """The body of a window, float64, of the base model's mass (kg)."""
+        body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
+        body = body.to(dtype=torch.float64)
+        if mass is None:
+            return body
+        factor = mass / body.mass.sum()
+        return replace(body, mass=factor * body.mass, density=factor * body.density)
+
+    def _keep(self, file: int) -> None:
+        """Copy a file's frames to their places; a last frame has no step that follows it."""
+        motions = self.dataset.decoded(file).motions
+        for start, motion in zip(self._starts[file][: len(motions)], motions, strict=True):
+            fields = {"positions": motion.positions, "velocities": motion.velocities}
+            for name, values in (fields | motion.steps).items():
+                flat = values.reshape(-1, 3)
+                self._frames[name][start : start + len(flat)] = flat
+
+    def batch(self, indices: Sequence[int] | Numbers, *, last: bool = True) -> StepBatch:
+        """The last steps of chosen windows, or the first.
+
+        Windows have two where the network sees the correction of the step before, else one.  Of
+        a window's first step that correction is None, as where a simulation begins.
         """
-        return self.step_batch(self.windows(indices), last=last)
+        files, simulations, frames = self.dataset.places(indices)
+        second = self._history and last
+        nodes = self._nodes[files]
+        starts = self._starts[files, simulations] + (frames + second) * nodes
+        first = np.cumsum(nodes) - nodes
+        rows = np.repeat(starts - first, nodes) + np.arange(nodes.sum())
+        step = np.repeat(nodes, nodes)
+        here, ahead = (torch.from_numpy(x).to(self._home) for x in (rows, rows + step))
 
-    def windows(self, indices: Sequence[int]) -> StoredWindows:
-        """All steps of chosen windows."""
-        if self.resident:
-            return self._tables.batch(indices)
-        return self._stored(self.dataset.batch(indices))
-
-    def errors(self, stored: StoredWindows) -> BaseErrors:
-        """The base model's on the trajectory of each window."""
-        return self._errors.of(self._recordings[stored.file, stored.simulation])
-
-    @cached_property
-    def _tables(self) -> ResidentWindows:
-        return ResidentWindows(self.dataset, self._alone, self.device)
-
-    def batches(
-        self, size: int, *, seed: int, rank: int = 0, world_size: int = 1
-    ) -> EndlessBatches:
-        """Batches of ``size`` windows in random order, epoch after epoch."""
-        options: dict[str, Any] = {"pin_memory": self.device.type == "cuda" and self._workers > 0}
-        if self._workers:
-            options |= {"num_workers": self._workers, "persistent_workers": True}
-        if self.resident:
-            options |= {"assemble": self._tables.batch}
-        block = len(self.dataset.headers) if self.resident else None
-        shuffle = ShardShuffle(
-            self.dataset, seed=seed, block=block, rank=rank, world_size=world_size
-        )
-        whole = len(shuffle) >= size
-        loader = TrajectoryLoader(self.dataset, size, shuffle, drop_last=whole, **options)
-        return EndlessBatches(self, loader)
-
-    def step_batch(self, found: Any, *, last: bool = True) -> StepBatch:
-        """What `StoredWindows`, or a batch of samples on the CPU, say about a step of theirs."""
-        stored, step = found if isinstance(found, StoredWindows) else self._stored(found), 0
-        positions, velocities, previous = stored.positions, stored.velocities, None
-        bodies = stored.bodies
-        if self._history and last:
-            step = 1
-            before, positions = positions, stored.targets[0]
-            previous = positions - stored.predictions[0]
-            velocities = (positions - before) / bodies.by_node(bodies.time_step)[:, None]
-        coarse = stored.predictions[step]
-        state = Snapshot(positions, velocities, coarse, stored.forces[step], previous)
-        target = stored.targets[step] - coarse
+        positions, velocities, coarse, forces = (self._taken(name, here) for name in _FRAMES)
+        previous = None
+        if second:
+            before = torch.from_numpy(rows - step).to(self._home)
+            previous = positions - self._taken("predictions", before)
+        bodies = joined([self._bodies[file] for file in files.tolist()])
+        state = Snapshot(positions, velocities, coarse, forces, previous)
+        target = self._taken("positions", ahead) - coarse
         if self.config.placement != "state":
             h: Any = bodies.by_node(bodies.time_step)[:, None]
             # the clamps of the stored coarse step are where they are prescribed
             start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
             state = replace(state, proposed=start)
             target = coarse - start if self.config.placement == "guess" else target
-        return StepBatch(bodies, state, target, self.errors(stored).after(1))
+        which = torch.from_numpy(self._numbers[files, simulations]).to(self.device)
+        return StepBatch(bodies, state, target, self._errors.of(which).after(1))
 
-    def _stored(self, found: Any) -> StoredWindows:
-        """A batch of samples on the device."""
-        files = found.file.tolist()
-        found = found.to(self.device, non_blocking=True)
-        positions, velocities, targets, predictions, forces = (
-            getattr(found, name).to(torch.float64)
-            for name in ("positions", "velocities", "targets", "predictions", "forces")
-        )
-        return StoredWindows(
-            self._bodies(found, files), positions, velocities, targets.transpose(0, 1),
-            predictions.transpose(0, 1), forces.transpose(0, 1), found.file, found.simulation,
-        )  # fmt: skip
+    def _taken(self, name: str, rows: Tensor) -> Tensor:
+        """Rows of a table, float64, on the device."""
+        found = self._frames[name].index_select(0, rows).to(self.device, non_blocking=True)
+        return found.to(torch.float64)
 
-    def _bodies(self, found: Any, files: Sequence[int]) -> BodyGraph:
-        """The bodies of a batch, with what is computed of them at rest once for each file."""
-        for file in set(files) - self._known.keys():
-            self._known[file] = self._alone(self._first[file])
-        known = [self._known[file] for file in files]
-        bodies = replace(
-            BodyGraph.of_batch(found).to(dtype=torch.float64),
-            **{
-                name: torch.cat([getattr(body, name) for body in known])
-                for name in ("mass", "density", "cell_size")
-            },
-        )
-        for name in KNOWN:
-            vars(bodies)[name] = torch.cat([getattr(body, name) for body in known])
-        return bodies
+    def beginnings(self) -> Numbers:
+        """Numbers of the windows with which simulations begin."""
+        every = np.arange(len(self.dataset))
+        return every[self.dataset.places(every)[2] == 0]
 
-    def _alone(self, window: int) -> BodyGraph:
-        """The body of a window, of the base model's mass."""
-        found = self.dataset.batch([window]).to(self.device)
-        body = BodyGraph.of_batch(found).to(dtype=torch.float64)
-        mass = self._masses[int(found.file)]
-        if mass is None:
-            return body
-        factor = mass / body.mass.sum()
-        return replace(body, mass=factor * body.mass, density=factor * body.density)
+    def of_each_file(self) -> Numbers:
+        """Numbers of one window of each file."""
+        files, _, _ = self.dataset.places(np.arange(len(self.dataset)))
+        return np.unique(files, return_index=True)[1]
 
 
-class EndlessBatches:
-    """Epoch after epoch of a loader; remembers where it is."""
+def joined(bodies: Sequence[BodyGraph]) -> BodyGraph:
+    """Graphs of one body each as one graph, with what they know of their bodies at rest."""
+    device = bodies[0].rest.device
+    nodes = np.array([len(b.rest) for b in bodies])
+    first = np.cumsum(nodes) - nodes
 
-    def __init__(self, windows: StepWindows, loader: TrajectoryLoader) -> None:
-        self._windows, self._loader = windows, loader
-        self._epoch: Iterator[Any] | None = None
-        self._number = 0
+    def each(values: Numbers, counts: Sequence[int] | Numbers) -> Tensor:
+        return torch.from_numpy(np.repeat(values, counts)).to(device, non_blocking=True)
 
-    def __len__(self) -> int:
-        """Batches of an epoch."""
-        return len(self._loader)
-
-    def __next__(self) -> StepBatch:
-        """The next batch."""
-        while True:
-            if self._epoch is None:
-                self._epoch = iter(self._loader)
-            found = next(self._epoch, None)
-            if found is not None:
-                return self._windows.step_batch(found)
-            self._number += 1
-            self._loader.set_epoch(self._number)
-            self._epoch = None
-
-    def state_dict(self) -> dict[str, int]:
-        """Where it is; numbers only."""
-        return self._loader.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Go on where a state was taken."""
-        self._loader.load_state_dict(dict(state))
-        self._number, self._epoch = state["epoch"], None
-
-
-def _fits(size: int, device: torch.device) -> bool:
-    """Whether so many bytes may be kept on a device."""
-    if device.type == "cuda":
-        return size < _SHARE_OF_DEVICE * torch.cuda.mem_get_info(device)[0]
-    return size <= CACHE_BYTES
+    edges, cells = (
+        torch.cat([getattr(b, name) for b in bodies], dim)
+        for name, dim in (("edge_index", 1), ("cells", 0))
+    )
+    found = BodyGraph(
+        **{name: torch.cat([getattr(b, name) for b in bodies]) for name in _BODY},
+        edge_index=edges + each(first, [b.edge_index.shape[1] for b in bodies]),
+        cells=cells + each(first, [len(b.cells) for b in bodies])[:, None],
+        graph=each(np.arange(len(bodies)), nodes),
+    )
+    known = {name: torch.cat([getattr(b, name) for b in bodies]) for name in _AT_REST}
+    vars(found).update(known)
+    return found

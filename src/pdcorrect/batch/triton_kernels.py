@@ -1,7 +1,11 @@
-"""One kernel for all that a function does at a point.
+"""What is written for Triton by hand, each for what was measured without it.
 
-The functions are a thousand operations long, and nothing but arithmetic: what `torch.compile` does
-to find out what may be fused takes far longer than Triton needs for the same lines written out.
+`at_points` makes one kernel of all that a function does at a point: a thousand operations, and
+nothing but arithmetic.  `torch.compile` takes a minute and more to find out what may be fused;
+Triton compiles the same lines written out in a second or two.
+
+`tall_product` multiplies matrices by one to four columns, in which the libraries' products reach
+half of a GPU's memory bandwidth.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ class Operation:
     Attributes
     ----------
     name : str
-        "constant", "+", "<", "where", ...; see `pdcorrect.batch.point_kernel`.
+        "constant", "+", "<", "where", ...; see `pdcorrect.batch.triton_kernels`.
     operands : tuple
         Numbers of earlier lines; of a constant its value.
     """
@@ -94,6 +98,19 @@ class Program:
         return x if isinstance(x, Value) else self.add("constant", float(x))
 
 
+def _do(name: str, *operands: Any) -> Value:
+    program = next(x.program for x in operands if isinstance(x, Value))
+    return program.add(name, *(program.value(x).line for x in operands))
+
+
+Operator = Callable[["Value", Any], "Value"]
+
+
+def _operators(sign: str) -> tuple[Operator, Operator]:
+    """What x sign y does, for its left and for its right operand."""
+    return lambda x, y: _do(sign, x, y), lambda y, x: _do(sign, x, y)
+
+
 class Value:
     """A number at each point, of which only the line of the program is known that computes it."""
 
@@ -119,55 +136,22 @@ class Value:
     def abs(self) -> Value:
         return _do("abs", self)
 
-    def __abs__(self) -> Value:
-        return self.abs()
-
     def __neg__(self) -> Value:
         return _do("*", self, -1.0)
 
-    def __add__(self, other: Any) -> Value:
-        return _do("+", self, other)
-
-    def __radd__(self, other: Any) -> Value:
-        return _do("+", other, self)
-
-    def __sub__(self, other: Any) -> Value:
-        return _do("-", self, other)
-
-    def __rsub__(self, other: Any) -> Value:
-        return _do("-", other, self)
-
-    def __mul__(self, other: Any) -> Value:
-        return _do("*", self, other)
-
-    def __rmul__(self, other: Any) -> Value:
-        return _do("*", other, self)
-
-    def __truediv__(self, other: Any) -> Value:
-        return _do("/", self, other)
-
-    def __rtruediv__(self, other: Any) -> Value:
-        return _do("/", other, self)
+    __abs__ = abs
+    __add__, __radd__ = _operators("+")
+    __sub__, __rsub__ = _operators("-")
+    __mul__, __rmul__ = _operators("*")
+    __truediv__, __rtruediv__ = _operators("/")
+    __lt__, __gt__ = _operators("<")[0], _operators(">")[0]
+    __le__, __ge__ = _operators("<=")[0], _operators(">=")[0]
+    __and__, _ = _operators("&")
 
     def __pow__(self, exponent: int) -> Value:
         if exponent != 2:
             raise NotImplementedError(f"power {exponent} in a function of points")
         return self * self
-
-    def __lt__(self, other: Any) -> Value:
-        return _do("<", self, other)
-
-    def __le__(self, other: Any) -> Value:
-        return _do("<=", self, other)
-
-    def __gt__(self, other: Any) -> Value:
-        return _do(">", self, other)
-
-    def __ge__(self, other: Any) -> Value:
-        return _do(">=", self, other)
-
-    def __and__(self, other: Value) -> Value:
-        return _do("&", self, other)
 
     def __bool__(self) -> bool:
         raise NotImplementedError("a decision in a function of points: expected torch.where")
@@ -176,11 +160,6 @@ class Value:
         raise NotImplementedError("equality in a function of points: expected < or >")
 
     __hash__ = object.__hash__
-
-
-def _do(name: str, *operands: Any) -> Value:
-    program = next(x.program for x in operands if isinstance(x, Value))
-    return program.add(name, *(program.value(x).line for x in operands))
 
 
 def _clamp(x: Value, *, min: Number) -> Value:
@@ -330,3 +309,65 @@ def as_function(text: str, name: str, language: Any = None) -> Callable[..., Non
     exec(compile(text, file, "exec"), space)
     found: Callable[..., None] = space[name]
     return found
+
+
+_MOST_COLUMNS = 4
+_ROWS, _COLUMNS, _WARPS = 8, 256, 4
+
+
+def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
+    """(K, n, n) @ (K, n, m) -> (K, n, m)."""
+    count, size, _ = matrices.shape
+    few = columns.shape[2] <= _MOST_COLUMNS
+    if not (few and matrices.is_cuda and matrices.dtype == torch.float32 and size >= _COLUMNS):
+        return matrices @ columns
+    import triton
+
+    columns = columns.contiguous()
+    out = torch.empty_like(columns)
+    grid = (triton.cdiv(size, _ROWS), count)
+    _tall_kernel()[grid](
+        matrices, columns, out, size, M=columns.shape[2], ROWS=_ROWS, COLUMNS=_COLUMNS,
+        num_warps=_WARPS,
+    )  # fmt: skip
+    return out
+
+
+@cache
+def _tall_kernel() -> Any:
+    import triton
+    import triton.language as tl
+
+    @triton.jit
+    def kernel(a, x, y, n, M: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):  # type: ignore[no-untyped-def]
+        k = tl.program_id(1).to(tl.int64)
+        row = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
+        rows = (k * n + row.to(tl.int64)) * n
+        s0 = tl.zeros((ROWS, COLUMNS), tl.float32)
+        s1 = tl.zeros((ROWS, COLUMNS), tl.float32)
+        s2 = tl.zeros((ROWS, COLUMNS), tl.float32)
+        s3 = tl.zeros((ROWS, COLUMNS), tl.float32)
+        for begin in range(0, n, COLUMNS):
+            col = begin + tl.arange(0, COLUMNS)
+            inside = col < n
+            mask = (row[:, None] < n) & inside[None, :]
+            block = tl.load(a + rows[:, None] + col[None, :], mask=mask, other=0.0)
+            place = x + (k * n + col) * M
+            s0 += block * tl.load(place, mask=inside, other=0.0)[None, :]
+            if M > 1:
+                s1 += block * tl.load(place + 1, mask=inside, other=0.0)[None, :]
+            if M > 2:
+                s2 += block * tl.load(place + 2, mask=inside, other=0.0)[None, :]
+            if M > 3:
+                s3 += block * tl.load(place + 3, mask=inside, other=0.0)[None, :]
+        target = y + (k * n + row) * M
+        fits = row < n
+        tl.store(target, tl.sum(s0, axis=1), mask=fits)
+        if M > 1:
+            tl.store(target + 1, tl.sum(s1, axis=1), mask=fits)
+        if M > 2:
+            tl.store(target + 2, tl.sum(s2, axis=1), mask=fits)
+        if M > 3:
+            tl.store(target + 3, tl.sum(s3, axis=1), mask=fits)
+
+    return kernel

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from pdcorrect.batch import correction, point_kernel, points, viscosity
-from pdcorrect.batch.point_kernel import Program
+from pdcorrect.batch import correction, points, triton_kernels, viscosity
+from pdcorrect.batch.triton_kernels import Program
 from pdcorrect.errors import MissingExtraError
 from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF
 
@@ -68,7 +68,7 @@ class Interpreted:
     """A kernel that is launched as Triton's are."""
 
     def __init__(self, function, sizes, dtype):
-        self._text = point_kernel.kernel_source(Program.of(function, sizes, dtype), "kernel")
+        self._text = triton_kernels.kernel_source(Program.of(function, sizes, dtype), "kernel")
 
     def __getitem__(self, grid):
         return partial(self._launch, grid)
@@ -76,18 +76,18 @@ class Interpreted:
     def _launch(self, grid, *arguments, BLOCK, num_warps):
         given = [Pointer(x) if torch.is_tensor(x) else whole(x) for x in arguments]
         for block in range(*grid):
-            point_kernel.as_function(self._text, "kernel", language(block))(*given, BLOCK=BLOCK)
+            triton_kernels.as_function(self._text, "kernel", language(block))(*given, BLOCK=BLOCK)
 
 
 @pytest.fixture
 def interpreted(monkeypatch):
     """`points` uses kernels, which torch runs; results are poisoned before."""
-    monkeypatch.setattr(point_kernel, "_kernel", Interpreted)
+    monkeypatch.setattr(triton_kernels, "_kernel", Interpreted)
     monkeypatch.setattr(torch.cuda, "device", lambda device: contextlib.nullcontext())
 
     def computed(function, inputs, sizes, cell_by_cell=False):
         out = [x.fill_(math.nan) for x in points._room(inputs[0], sizes, cell_by_cell)]
-        point_kernel.at_points(function, inputs, out)
+        triton_kernels.at_points(function, inputs, out)
         return out
 
     monkeypatch.setattr(points, "computed", computed)
@@ -167,13 +167,13 @@ def test_kernels_on_a_gpu_compute_what_torch_does(model, first):
 
 
 def test_no_points_are_no_work():
-    point_kernel.at_points(None, [torch.zeros(9, 0, 8)], [torch.zeros(1, 0, 8)])
+    triton_kernels.at_points(None, [torch.zeros(9, 0, 8)], [torch.zeros(1, 0, 8)])
 
 
 def test_without_triton_it_is_told_what_brings_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "triton", None)
     with pytest.raises(MissingExtraError, match="expected a PyTorch for CUDA on Linux"):
-        point_kernel._kernel.__wrapped__(points._volume_ratio, (9,), torch.float64)
+        triton_kernels._kernel.__wrapped__(points._volume_ratio, (9,), torch.float64)
 
 
 def test_not_a_number_stays_one(interpreted):
@@ -183,7 +183,7 @@ def test_not_a_number_stays_one(interpreted):
     x = torch.tensor([[[1.0, math.nan, 2.0, -3.0]]])
     y = torch.tensor([[[2.0, 1.0, math.nan, -4.0]]])
     found, expected = (torch.zeros(3, 1, 4) for _ in range(2))
-    point_kernel.at_points(extremes, [x, y], [found])
+    triton_kernels.at_points(extremes, [x, y], [found])
     torch.stack([z for row in extremes(x, y) for z in row], out=expected)
     torch.testing.assert_close(found, expected, rtol=0, atol=0, equal_nan=True)
 
@@ -191,7 +191,7 @@ def test_not_a_number_stays_one(interpreted):
 @pytest.mark.parametrize("other", [torch.zeros(9, 3, 8), torch.zeros(9, 2, 8, dtype=torch.float64)])
 def test_tensors_of_other_points_or_types_are_refused(other):
     with pytest.raises(ValueError, match="the same points, type and device"):
-        point_kernel.at_points(points._volume_ratio, [other], [torch.zeros(1, 2, 8)])
+        triton_kernels.at_points(points._volume_ratio, [other], [torch.zeros(1, 2, 8)])
 
 
 def test_numbers_may_lie_anywhere_in_memory(interpreted):
@@ -205,7 +205,7 @@ def test_numbers_may_lie_anywhere_in_memory(interpreted):
     a.copy_(torch.rand(2, 4, 7))
     b.copy_(torch.rand(2, 4, 7))
     before = space.clone()
-    point_kernel.at_points(both, [a, b], [out])
+    triton_kernels.at_points(both, [a, b], [out])
     assert torch.equal(out, torch.stack([a[0] + b[1], a[1] - b[0]]))
     space[4] = before[4]
     assert torch.equal(space, before)
@@ -225,7 +225,7 @@ def test_constants_are_written_as_they_are():
     program = Program.of(numbers, [1], torch.float64)
     constants = [line.operands[0] for line in program.lines if line.name == "constant"]
     assert sorted(map(repr, constants)) == ["-2.0", "0.0", "1e-300", "inf"]
-    text = point_kernel.kernel_source(program, "constants")
+    text = triton_kernels.kernel_source(program, "constants")
     ast.parse(text)
     assert 'float("inf")' in text
     assert "1e-300" in text
