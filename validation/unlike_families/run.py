@@ -26,6 +26,10 @@ RUNS = {
 QUICK, FEW = "arch 0", {"frames": 8}
 """Scene and frames of a quick run."""
 TABLE, TIMES = "Errors, % of the RMS displacement", "Time a frame, ms"
+DRAWN = (
+    *(f"{name}, {n}" for name in ("best coarse", "hex27", "learned") for n in (1, 4)),
+    "learned on 2x2x2, 2",
+)
 OTHERS = "best coarse", "hex27"
 """Beside which the learned element is judged, with as many substeps."""
 FARTHER = 1.1
@@ -163,12 +167,10 @@ def draw(record: common.Record, path: Path) -> None:
     figure, axes = common.panels(12, 3.4, len(FAMILIES), sharey=True)
     rows = {row[0]: row[1:] for row in record.table(TABLE)["rows"]}
     for axis, family in zip(axes, FAMILIES, strict=True):
-        for k, which in enumerate(RUNS):
-            errors = sorted(rows[f"{family} {n}"][k] for n in range(EACH))
-            axis.plot(
-                errors, common.MARKS[k % 7] + "-", color=common.COLOURS[k % 7], label=which,
-                fillstyle="none" if k > 6 else "full",
-            )  # fmt: skip
+        for which, mark, colour in zip(DRAWN, common.MARKS, common.COLOURS, strict=False):
+            column = list(RUNS).index(which)
+            errors = sorted(rows[f"{family} {n}"][column] for n in range(EACH))
+            axis.plot(errors, mark + "-", color=colour, label=which)
         axis.set(title=family, yscale="log", xticks=[])
         common.log_axis(axis.yaxis)
         common.plain(axis, "y")
