@@ -1,4 +1,4 @@
-"""Unrolled steps, teachers, and rollouts of a validation split."""
+"""Unrolled steps, and rollouts of a validation split."""
 
 import itertools
 import shutil
@@ -17,7 +17,6 @@ from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402
 from pdcorrect.training.distributed import joined  # noqa: E402
-from pdcorrect.training.recipe import Rate  # noqa: E402
 from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, SceneGroups, grouped  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
@@ -223,63 +222,6 @@ def test_stages_share_the_groups_that_are_alike(folder, tmp_path, monkeypatch):
     )
     Training(settings, folder, tmp_path / "out").run()
     assert len(made) == len({tuple(names) for names in made}) == 1
-
-
-# --- teachers ----------------------------------------------------------------------------
-
-
-def test_a_teacher_is_asked_about_the_states_that_the_learner_meets(group, folder):
-    settings = samples.config(samples.unrolled(batch=3))
-    learner, teacher = (samples.fitted(folder, settings) for _ in range(2))
-    with torch.no_grad():
-        for weight in teacher.network.parameters():
-            weight.add_(0.05 * torch.randn_like(weight))
-    stage, frames = settings.stages[0], np.array([5, 6, 7])
-    same = unroll(group, learner, started(group, frames), 2, stage, teacher=learner)
-    assert same.losses.tolist() == [0.0, 0.0, 0.0]
-    found = unroll(group, learner, started(group, frames), 1, stage, teacher=teacher)
-    layer = group.layer(learner, False)
-    before = started(group, frames)
-    assert layer.watch is None
-    layer.watch = (views := []).append
-    _, _, own = layer(before.positions, before.velocities, group.times(frames), before.correction)
-    layer.watch = None
-    (view,) = views
-    apart = layer.padded(own - teacher.of_view(view)).square().sum(dim=2)
-    expected = group.sums(apart) / (group.counts * group.errors.one_step)
-    torch.testing.assert_close(found.losses, expected)
-    assert (found.losses > 0).all()
-
-
-def test_what_a_teacher_knows_is_learned(folder, tmp_path):
-    settings = samples.config(samples.one_step(iterations=40, rate=Rate(peak=3e-3)))
-    Training(settings, folder, tmp_path / "teacher").run()
-    stage = samples.unrolled(
-        iterations=30, start="pool", teacher=str(tmp_path / "teacher" / "model"),
-        rate=Rate(peak=3e-3),
-    )  # fmt: skip
-    told = []
-    training = Training(
-        samples.config(stage, report_every=10, seed=1), folder, tmp_path / "learner",
-        on_report=lambda _, row: told.append(row),
-    )  # fmt: skip
-    training.run()
-    losses = [row["loss"] for row in told if "loss" in row]
-    assert losses[-1] < 0.5 * losses[0]
-
-
-def test_a_teacher_of_another_kind_is_refused(folder, tmp_path):
-    samples_of = samples.config(samples.one_step(iterations=1), base="best")
-    Training(samples_of, folder, tmp_path / "best").run()
-    stage = samples.unrolled(teacher=str(tmp_path / "best" / "model"))
-    missing = samples.unrolled(teacher=str(tmp_path / "nowhere"))
-    for settings, words in (
-        (samples.config(stage), '"best".*"plain"'),
-        (samples.config(missing), "nowhere"),
-    ):
-        with pytest.raises(InputError, match=words):
-            Training(settings, folder, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
 
 
 # --- validation --------------------------------------------------------------------------

@@ -6,7 +6,7 @@ result = hybrid(state)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -329,8 +329,6 @@ class HybridLayer(WithNodes, nn.Module):
     ----------
     steps : PDLayer
         The coarse step; its ``statuses`` are those of the last call.
-    watch : callable or None
-        Called with what the network is shown, a `FeatureView`, scenes that failed as at rest.
 
     Raises
     ------
@@ -359,7 +357,6 @@ class HybridLayer(WithNodes, nn.Module):
         super().__init__()
         self._hybrid = BatchParts(stepper, corrector, velocity)
         self.corrector, self.through_solver = corrector, through_solver
-        self.watch: Callable[[FeatureView], None] | None = None
         self.steps = PDLayer(stepper, on_failure=on_failure)
 
     def forward(
@@ -410,7 +407,7 @@ class HybridLayer(WithNodes, nn.Module):
         seen, known = self._at_rest_unless(ok, before, previous)
         guess, ok = hybrid.placement == "guess", by_scene(ok)
         proposed = None if guess else torch.where(ok, after.positions, seen.positions)
-        correction = self._asked(hybrid.view(seen, proposed, known))
+        correction = self.corrector.of_view(hybrid.view(seen, proposed, known))
         correction = torch.where(at_nodes, correction, 0.0)
         if guess:
             return after, correction
@@ -432,11 +429,11 @@ class HybridLayer(WithNodes, nn.Module):
         known = known if previous is None else [*known, previous]
         sound = self.bodies.sound(torch.cat(known, dim=1))
         seen, given = self._at_rest_unless(sound, before, previous)
-        correction = self._asked(hybrid.view(seen, None, given))
+        correction = self.corrector.of_view(hybrid.view(seen, None, given))
         answered = sound & self.bodies.sound(correction)
         if not torch.equal(answered, sound):
             seen, given = self._at_rest_unless(answered, before, previous)
-            correction = self._asked(hybrid.view(seen, None, given))
+            correction = self.corrector.of_view(hybrid.view(seen, None, given))
         at_nodes = self.bodies.by_node(answered)[:, None]
         after = self._step(before, nodes.forces(torch.where(at_nodes, correction, torch.nan)))
         ok = self._converged()
@@ -445,11 +442,6 @@ class HybridLayer(WithNodes, nn.Module):
         _without_derivatives(seen.velocities, ~by_scene(ok))
         _without_derivatives(given, ~at_nodes)
         return after, torch.where(at_nodes, correction, 0.0)
-
-    def _asked(self, view: FeatureView) -> Tensor:
-        if self.watch is not None:
-            self.watch(view)
-        return self.corrector.of_view(view)
 
     def _converged(self) -> Tensor:
         """Whether each scene's last step did, (B,) bool."""

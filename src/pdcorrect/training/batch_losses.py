@@ -95,13 +95,12 @@ def make_source(
     windows: StepWindows,
     groups: SceneGroups,
     world: ProcessGroup,
-    teacher: Corrector | None = None,
 ) -> Source:
     """Where the losses of stage ``number`` of a training come from."""
     stage, seed = config.stages[number], _seed(config.seed, number)
     if stage.kind == "one-step":
         return OneStepBatches(windows, stage, seed, world)
-    return UnrolledBatches(groups, stage, seed=seed, teacher=teacher)
+    return UnrolledBatches(groups, stage, seed=seed)
 
 
 def _seed(*names: int) -> int:

@@ -1,4 +1,4 @@
-"""Models that a training goes on with or learns from, and the data sets that its own comes from."""
+"""The model that a training goes on with, and the data sets that its own comes from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from pdcorrect._config import as_toml
-from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import JOINT, LoadedModel, load_model
 from pdcorrect.errors import InputError
 from pdcorrect.training.recipe import TrainingConfig
@@ -31,47 +30,19 @@ def load_start(config: TrainingConfig, device: torch.device) -> LoadedModel | No
         return None
     model = load_model(config.start_from, device)
     own, wanted = (c.model_dump() for c in (model.corrector.config, config.architecture()))
-    _check_alike(f"start_from = {config.start_from!r}", model, config, own, wanted)
-    return model
-
-
-def load_teachers(config: TrainingConfig, device: torch.device) -> dict[str, Corrector]:
-    """The teachers of a training's stages by what names them.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, it does not correct states, or its base model or velocity is
-        another one than the training's.
-    FileFormatError
-        If a file is damaged.
-    """
-    found: dict[str, Corrector] = {}
-    for name in dict.fromkeys(s.teacher for s in config.stages if s.teacher is not None):
-        model = load_model(name, device)
-        placement = {"placement": model.corrector.config.placement}
-        _check_alike(f"teacher = {name!r}", model, config, placement, {"placement": "state"})
-        found[name] = model.corrector.requires_grad_(False)
-    return found
-
-
-def _check_alike(
-    what: str,
-    model: LoadedModel,
-    config: TrainingConfig,
-    own: dict[str, Any],
-    wanted: dict[str, Any],
-) -> None:
-    """Refuse a model of other settings, or whose corrections are of another kind."""
-    own = {"base": model.base, "velocity": model.velocity, **own}
-    wanted = {"base": config.base, "velocity": "recomputed", **wanted}
+    own |= {"base": model.base, "velocity": model.velocity}
+    wanted |= {"base": config.base, "velocity": "recomputed"}
     unlike = [name for name in own if own[name] != wanted[name]]
     if unlike:
         found, expected = (
             ", ".join(f"{name} = {as_toml(each[name])}" for name in unlike)
             for each in (own, wanted)
         )
-        raise InputError(f"{what}: that model has {found}: expected {expected}, as here.")
+        raise InputError(
+            f"start_from = {config.start_from!r}: that model has {found}: expected {expected}, as "
+            "here."
+        )
+    return model
 
 
 @dataclass(frozen=True)

@@ -184,10 +184,6 @@ class Stage(Strict):
         Of "unrolled": share of the states of the reference that are those at rest, before the first
         step; the others are of any frame.  For loads that act in the first steps only, as kicks,
         which are seldom met otherwise.
-    teacher
-        Of "unrolled", without derivatives through the solver: a model, by folder or name
-        (`pdcorrect.load_model`), whose corrections of the states that this one meets are to be
-        learned; the reference then only says which rollouts are lost.
     seconds, iterations, epochs
         Exactly one; epochs only of "one-step".
     batch
@@ -204,7 +200,6 @@ class Stage(Strict):
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
     at_rest: Share = 0.0
-    teacher: ModelName | None = None
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
     epochs: PositiveCount | None = None
@@ -224,19 +219,13 @@ class Stage(Strict):
             told = {
                 "steps": self.steps != (1,), "through_solver": self.through_solver,
                 "start": self.start != "reference", "at_rest": self.at_rest > 0.0,
-                "teacher": self.teacher is not None, "loss.ahead": self.loss.ahead is not None,
+                "loss.ahead": self.loss.ahead is not None,
             }  # fmt: skip
         else:
             told = {"epochs": self.epochs is not None, "noise": self.noise.tau > 0.0}
         for name, given in told.items():
             if given:
                 raise ValueError(f"{name} has no meaning in a stage of kind {self.kind!r}")
-        absolute, ahead = self.loss.kind == "absolute", self.loss.ahead is not None
-        if self.teacher is not None and (self.through_solver or absolute or ahead):
-            raise ValueError(
-                "teacher: its corrections are learned step by step, over the base model's error: "
-                "expected through_solver = false and a relative loss without loss.ahead"
-            )
         return self
 
     def horizon(self, progress: float) -> int:
@@ -302,8 +291,6 @@ class TrainingConfig(TomlConfig):
     def _possible(self) -> TrainingConfig:
         placement = self.corrector.config().placement
         for k, stage in enumerate(self.stages):
-            if placement != "state" and stage.teacher is not None:
-                raise ValueError(f"stages[{k}]: a teacher teaches corrections of states only")
             if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
                 raise ValueError(
                     f"stages[{k}]: a correction of forces is only learned through the solver: "

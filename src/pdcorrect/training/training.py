@@ -29,7 +29,7 @@ from pdcorrect.training.batch_losses import Source, make_source
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
-from pdcorrect.training.models import Lineage, load_start, load_teachers
+from pdcorrect.training.models import Lineage, load_start
 from pdcorrect.training.optimisation import Optimiser, rate_at
 from pdcorrect.training.progress import HistoryFile, Progress, check_same
 from pdcorrect.training.recipe import Stage, TrainingConfig
@@ -79,7 +79,7 @@ class Training:
         files of the data sets are missing, or do not have what the configuration wants; if one
         has a validation split and another has none, or their settings or time steps differ; if the
         model to start from is missing, or of another architecture or base, or its ranges stay and
-        the data have another time step; if a teacher is.
+        the data have another time step.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -117,11 +117,8 @@ class Training:
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
         )
         start = load_start(config, self.device)
-        self._teachers = load_teachers(config, self.device)
         if start is not None:
             self._identity["start"] = weights_digest(str(config.start_from))
-        if self._teachers:
-            self._identity["teachers"] = {name: weights_digest(name) for name in self._teachers}
         found = self._checkpoint(resume)
         _check_alike(self._recordings)
         self._lineage = Lineage.of(config, start, self._recordings)
@@ -176,10 +173,7 @@ class Training:
     def _run_stage(self, stage: Stage) -> bool:
         """One stage, or what is left of it; whether it came to its end."""
         at = self.progress
-        source = make_source(
-            at.stage, self.config, self._windows, self._groups, self.world,
-            self._teachers.get(stage.teacher or ""),
-        )  # fmt: skip
+        source = make_source(at.stage, self.config, self._windows, self._groups, self.world)
         optimiser = self._optimiser(stage, source)
         shown = self.corrector if stage.ema is None else self._averaged
         while (share := stage.share_done(len(source), at.iteration, at.stage_seconds)) < 1.0:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from pdcorrect.batch.states import in_one
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import FeatureView
 from pdcorrect.training.losses import body_losses, mean_of, network_precision
 from pdcorrect.training.recipe import Stage
 from pdcorrect.training.scenes import Frames, SceneGroup, SceneGroups
@@ -69,8 +68,6 @@ class UnrolledBatches:
     groups : SceneGroups
     stage : Stage
     seed : int
-    teacher : Corrector, optional
-        Whose corrections of the same states are to be learned.
 
     Attributes
     ----------
@@ -83,15 +80,8 @@ class UnrolledBatches:
         If no simulation is long enough for the stage.
     """
 
-    def __init__(
-        self,
-        groups: SceneGroups,
-        stage: Stage,
-        *,
-        seed: int = 0,
-        teacher: Corrector | None = None,
-    ) -> None:
-        self._groups, self._stage, self._teacher = groups, stage, teacher
+    def __init__(self, groups: SceneGroups, stage: Stage, *, seed: int = 0) -> None:
+        self._groups, self._stage = groups, stage
         self._chosen = groups.of(stage.batch, max(stage.steps))
         self._seed = (seed, groups.rank)
         self._pool: dict[int, Rollouts] = {}
@@ -107,7 +97,7 @@ class UnrolledBatches:
         number = self._turn(iteration)
         group = self._groups(self._chosen[number])
         start = self._start(number, group, steps, rng)
-        found = unroll(group, corrector, start, steps, self._stage, self._teacher)
+        found = unroll(group, corrector, start, steps, self._stage)
         self.failed += int((~found.alive).sum())
         if self._stage.start == "pool":
             lost = group.lost(found.end.positions, found.end.frames)
@@ -169,15 +159,9 @@ def unroll(
     start: Rollouts,
     steps: int,
     stage: Stage,
-    teacher: Corrector | None = None,
 ) -> Unrolled:
-    """Step a group and compare each frame with the reference.
-
-    With a teacher its correction of each step is compared with that of the teacher, over d(1).
-    """
+    """Step a group and compare each frame with the reference."""
     layer = group.layer(corrector, stage.through_solver)
-    views: list[FeatureView] = []
-    layer.watch = None if teacher is None else views.append
     positions, velocities, correction = start.positions, start.velocities, start.correction
     frames, ages = start.frames, start.ages
     total = torch.zeros(len(group), dtype=torch.float64, device=group.device)
@@ -195,28 +179,14 @@ def unroll(
         positions = torch.where(at, positions, truth)
         velocities = torch.where(at, velocities, 0.0)
         added: Tensor | float = 0.0
-        if teacher is None:
-            errors, scale = positions - truth, group.errors.after(group.on_device(ages))
-            if stage.loss.ahead is not None:
-                wrong = torch.where(at, velocities - group.states(frames)[1], 0.0)
-                added = stage.loss.ahead * group.vibrations.ahead(errors, wrong)
-                added = added / group.errors.largest
-        else:
-            errors = torch.where(
-                at, layer.padded(correction - _taught(teacher, views.pop(), stage)), 0.0
-            )
-            scale = group.errors.after(1)
+        errors, scale = positions - truth, group.errors.after(group.on_device(ages))
+        if stage.loss.ahead is not None:
+            wrong = torch.where(at, velocities - group.states(frames)[1], 0.0)
+            added = stage.loss.ahead * group.vibrations.ahead(errors, wrong)
+            added = added / group.errors.largest
         total = total + body_losses(stage.loss, errors, group.sums, group.counts, scale, added)
-    layer.watch = None
     end = Rollouts(positions.detach(), velocities.detach(), correction.detach(), frames, ages)
     return Unrolled(torch.where(living, total / steps, 0.0), living.cpu().numpy(), end)
-
-
-@torch.no_grad()
-def _taught(teacher: Corrector, view: FeatureView, stage: Stage) -> Tensor:
-    """The teacher's corrections (n, 3), m, of what the learner was shown."""
-    with network_precision(teacher, stage.amp):
-        return teacher.of_view(view)
 
 
 def _mixed(group: SceneGroup, before: Rollouts, drawn: Rollouts, anew: Flags) -> Rollouts:
