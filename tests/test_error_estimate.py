@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 import pdcorrect as pc
 from conftest import beam, cross
-from pdcorrect.fem.element_network import MODEL
+from pdcorrect.fem.element_network import MODEL, write_network
 
 
 def rms(x):
@@ -64,7 +64,7 @@ def test_of_statics_and_finer_meshes_and_files(tmp_path):
     again = pc.error_estimate(pc.load_trajectory(tmp_path / "run.h5"))
     assert (again == pc.error_estimate(coarse)).all()
     weights = {name: (0.5 * array).astype(array.dtype) for name, array in load_file(MODEL).items()}
-    save_file(weights, tmp_path / "tuned.safetensors")
+    write_network(tmp_path / "tuned.safetensors", weights)
     tuned = {"solver": {"weights": tmp_path / "tuned.safetensors"}}
     known = pc.rollout(pc.Newton(pc.discretise(pc.learned_coarse(scene))))
     told = pc.learned_coarse(scene).with_changes(**tuned).to_toml()
