@@ -5,7 +5,7 @@
 A synthetic data set in a temporary folder: 20 beams of 43 x 2 x 2 cells (396 nodes, 1 830
 directed edges), 5 simulations of 60 steps each, in batches of 32.  "files" is the first epoch,
 which opens and decodes every file (the system may still hold them in its memory); "memory"
-is the best of three epochs after it.  Worker processes persist; each decodes for itself.
+is the best of three epochs after it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from machine_file import add
 
-from pdcorrect.data.reader import ShardShuffle, TrajectoryDataset, TrajectoryLoader
+from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
 from pdcorrect.fem.mesh import voxel_mesh
 
@@ -58,18 +58,11 @@ def epoch(loader: TrajectoryLoader) -> float:
     return count / (time.perf_counter() - started)
 
 
-def measure(folder: Path, workers: int) -> dict[str, Any]:
+def measure(folder: Path) -> dict[str, Any]:
     """The first epoch and the best of three after it."""
-    dataset = TrajectoryDataset(folder, "training")
-    options = {"num_workers": workers, "persistent_workers": workers > 0}
-    loader = TrajectoryLoader(dataset, BATCH, ShardShuffle(dataset), **options)
-    first = epoch(loader)
-    rest = []
-    for number in range(1, 4):
-        loader.set_epoch(number)
-        rest.append(epoch(loader))
+    loader = TrajectoryLoader(TrajectoryDataset(folder, "training"), BATCH)
+    first, *rest = (epoch(loader) for _ in range(4))
     return {
-        "workers": workers,
         "files_samples_per_second": round(first),
         "memory_samples_per_second": round(max(rest)),
     }
@@ -83,9 +76,9 @@ def main() -> None:
         for number in range(MESHES):
             write_shard(folder / "training" / f"mesh-{number:04d}.h5", shard(number))
         sizes = [path.stat().st_size for path in folder.glob("*/*.h5")]
-        rows = [measure(folder, workers) for workers in (0, 1, 2)]
+        row = measure(folder)
     add(
-        "reading", rows,
+        "reading", [row],
         graphs=MESHES * SIMULATIONS * STEPS, file_megabytes=round(sum(sizes) / 1e6, 1),
     )  # fmt: skip
 

@@ -65,7 +65,7 @@ def dataset_card(folder: str | Path, info: DatasetInfo) -> str:
             f"{folder}: no {MANIFEST}: expected a complete data set. Start generate again, which "
             "computes what is missing and writes it."
         ) from None
-    made_with = read_shard(all_shards(folder)[0], simulations=(), verify=False).provenance
+    made_with = read_shard(all_shards(folder)[0], runs=()).provenance
     return card_text(config, info, made_with, content_hash)
 
 

@@ -176,11 +176,11 @@ def networks() -> Rows:
 def reading() -> Rows:
     """Graph samples a second read from a data set."""
     rows = [
-        [str(row["workers"]), str(row["files_samples_per_second"]),
-         str(row["memory_samples_per_second"])]
+        [str(row["files_samples_per_second"]), str(row["memory_samples_per_second"])]
         for row in results_of(INTEL, "reading")
-    ]  # fmt: skip
-    return ("loader's workers", "first epoch", "from memory"), rows
+        if not row.get("workers")  # earlier records have rows of a loader with worker processes
+    ]
+    return ("first epoch", "from memory"), rows
 
 
 def tables() -> Iterable[tuple[str, Any]]:

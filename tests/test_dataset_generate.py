@@ -280,7 +280,7 @@ def test_folders_of_other_configurations_and_files_of_others_are_never_overwritt
     (foreign / "config.toml").write_text(other.to_toml())
     with pytest.raises(InputError, match=r"mesh-0000\.h5"):
         generate(other, foreign)
-    monkeypatch.setattr("pdcorrect.data.checksum.VERSION", 0)
+    monkeypatch.setattr("pdcorrect.data.shard_reader.VERSION", 0)
     with pytest.raises(FileFormatError, match="version 1"):
         generate(config, folder)
 

@@ -1,9 +1,10 @@
-"""`TrajectoryDataset`: windows of a data set's simulations for PyTorch Geometric."""
+"""Windows of a data set's simulations for PyTorch Geometric, one by one and in batches."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -11,148 +12,63 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
-from pdcorrect.data.samples import (
-    DecodedShard,
-    GraphSizes,
-    MeshSample,
-    PackedBatch,
-    WindowPlace,
-    batch_of,
-    decode,
-    decoded_bytes,
-    graph_sizes,
-    joined_along,
-    joined_fields,
-    window_numbers,
-)
-from pdcorrect.data.schema import REFERENCE
+from pdcorrect.data.schema import REFERENCE, Simulation
 from pdcorrect.data.shard_reader import ShardHeader, read_header, read_shard
 from pdcorrect.errors import InputError, require_extra
+from pdcorrect.fem.graph import mesh_edges, node_means, velocities
 
 require_extra("torch_geometric", "learn")
 
 import torch  # noqa: E402
 from torch import Tensor  # noqa: E402
-from torch.utils.data import BatchSampler, DataLoader, Sampler, SequentialSampler  # noqa: E402
-from torch_geometric.data import Batch, Dataset  # noqa: E402
+from torch_geometric.data import Batch, Data, Dataset  # noqa: E402
 
-
-class ShardShuffle(Sampler[int]):
-    """Windows in random order within random blocks of files.
-
-    Each epoch shuffles the files, gives every rank an equal share of their windows (the
-    last few, fewer than ranks, are left out), and shuffles the windows within blocks of
-    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone:
-    without `set_epoch` every epoch has the same.
-
-    Parameters
-    ----------
-    dataset : TrajectoryDataset
-    seed : int
-    block : int, optional
-        Files; by default as many as fit into the data set's cache.
-    rank, world_size : int
-        Of distributed training.
-
-    Attributes
-    ----------
-    epoch : int
-    position : int
-        Windows of the epoch that were given out.
-    start : int
-        Where the next iteration begins.
-
-    Raises
-    ------
-    InputError
-        If there is no such rank, or there are fewer windows than ranks.
-    """
-
-    def __init__(
-        self,
-        dataset: TrajectoryDataset,
-        *,
-        seed: int = 0,
-        block: int | None = None,
-        rank: int = 0,
-        world_size: int = 1,
-    ) -> None:
-        if not 0 <= rank < world_size:
-            raise InputError(f"rank = {rank} of {world_size}: expected 0 to {world_size - 1}.")
-        self._owners = dataset.shard_numbers()
-        if len(self._owners) < world_size:
-            raise InputError(f"{len(self._owners)} windows for {world_size} ranks: expected more.")
-        self.seed, self.rank, self.world_size = seed, rank, world_size
-        self.block = _fitting(dataset) if block is None else block
-        self.epoch = self.position = self.start = 0
-
-    def __len__(self) -> int:
-        """Windows of a rank's epoch."""
-        return len(self._owners) // self.world_size
-
-    def __iter__(self) -> Iterator[int]:
-        """What is left of the epoch."""
-        self.position, self.start = self.start, 0
-        for window in self.order()[self.position :].tolist():
-            self.position += 1
-            yield window
-
-    def order(self) -> NDArray[np.int64]:
-        """All windows of the rank's epoch, (len(self),)."""
-        shards = np.unique(self._owners)
-        rank_of = np.empty(shards[-1] + 1, dtype=np.int64)
-        rank_of[self._random().permutation(shards)] = np.arange(len(shards))
-        places = rank_of[self._owners]
-        windows = np.argsort(places, kind="stable")
-        own = windows[self.rank * len(self) : (self.rank + 1) * len(self)]
-        _, turn = np.unique(places[own], return_inverse=True)
-        noise = self._random(1 + self.rank).permutation(len(own))
-        return own[np.lexsort([noise, turn // self.block])]
-
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next iteration; the same epoch again changes nothing."""
-        if epoch != self.epoch:
-            self.epoch, self.position, self.start = epoch, 0, 0
-
-    def state_dict(self) -> dict[str, int]:
-        """Where the epoch is; numbers only.
-
-        A loader with workers asks for windows before it hands them out: use
-        `TrajectoryLoader.state_dict` there.
-        """
-        names = ("seed", "epoch", "position", "block", "rank", "world_size")
-        return {name: getattr(self, name) for name in names} | {"windows": len(self._owners)}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Let the next iteration begin where ``state`` was taken.
-
-        Raises
-        ------
-        InputError
-            If it was taken with other windows, seed, block or ranks, whose order differs.
-        """
-        here = self.state_dict()
-        for name in here.keys() - {"epoch", "position"}:
-            if state.get(name) != here[name]:
-                raise InputError(
-                    f"the state has {name} = {state.get(name)}, the sampler {here[name]}: expected "
-                    "the same, for the order of windows depends on it."
-                )
-        self.epoch = state["epoch"]
-        self.position = self.start = state["position"]
-
-    def _random(self, stream: int = 0) -> np.random.Generator:
-        return np.random.default_rng((self.seed, self.epoch, stream))
-
-
-def _fitting(dataset: TrajectoryDataset) -> int:
-    """Files that the data set's cache holds, at least one."""
-    sizes = np.sort(dataset.shard_bytes())[::-1]
-    return max(1, int(np.searchsorted(np.cumsum(sizes), dataset.cache_bytes, side="right")))
-
-
+Numbers = NDArray[np.int64]
 CACHE_BYTES = 4 * 2**30
 """Default bound of the decoded files that a process keeps, bytes."""
+_MODULI = ("young", "poisson", "density")
+_WHOLE = ("file", "mesh", "simulation", "frame")
+_OF_WINDOWS = (*_WHOLE, "time", "time_step")
+"""One number a window."""
+_INDICES = ("cells", "edge_index")
+
+
+class MeshSample(Data):
+    """A window of a simulation on its mesh; batching renumbers ``cells`` like ``edge_index``."""
+
+    def __inc__(self, key: str, value: Any, *args: Any, **kwargs: Any) -> Any:
+        """By how much the next graph's values are raised."""
+        return self.num_nodes if key == "cells" else super().__inc__(key, value, *args, **kwargs)
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedMotion:
+    """Tensors of a simulation, frame first; ``steps`` and ``rollouts`` by the name of the field."""
+
+    positions: Tensor
+    velocities: Tensor
+    steps: dict[str, Tensor]
+    rollouts: dict[str, Tensor]
+
+    def window(self, frame: int, length: int) -> dict[str, Tensor]:
+        """Node by node what happens in ``length`` steps from a frame, as views."""
+        last = frame + length
+        ahead = {"targets": self.positions[frame + 1 : last + 1]}
+        ahead |= {name: values[frame:last] for name, values in self.steps.items()}
+        ahead |= {name: values[frame : last + 1] for name, values in self.rollouts.items()}
+        return {
+            "positions": self.positions[frame],
+            "velocities": self.velocities[frame],
+            **{name: values.transpose(0, 1) for name, values in ahead.items()},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedShard:
+    """Tensors of a file: the fields of all its samples, and its simulations."""
+
+    mesh: dict[str, Tensor]
+    motions: list[DecodedMotion]
 
 
 class TrajectoryDataset(Dataset):  # type: ignore[misc]
@@ -197,9 +113,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     runs : sequence of str
         Runs whose own rollouts are given.
     cache_bytes : int
-        Bound of the decoded files kept by each process that reads (each worker of a loader,
-        or the main process).  While a file is read, and if a single one is larger, it is
-        exceeded by that file.
+        Of the decoded files that are kept, by `shard_bytes`; the last one read always is.
     dtype : torch.dtype
         Of everything but indices and masks.
     skip_damaged : bool
@@ -264,7 +178,10 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
                 f"{names}, {split}: no simulation has {window} steps, the longest {longest}: "
                 "expected a smaller window."
             )
-        self._shards = RecentlyUsed(self._load, cache_bytes)
+        self._kept: OrderedDict[int, DecodedShard] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": OrderedDict()}
 
     def len(self) -> int:
         """Number of windows."""
@@ -272,36 +189,50 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def get(self, idx: int) -> MeshSample:
         """Window ``idx``; its tensors are copies."""
-        place = self._place(idx)
-        shard = place.shard
-        fields = {
-            **place.motion.window(place.frame, self.window), **window_numbers([place], self.dtype),
-            **shard.nodal, **shard.cellwise, "cells": shard.cells, "edge_index": shard.edge_index,
-        }  # fmt: skip
-        copies = {name: values.clone().contiguous() for name, values in fields.items()}
-        return MeshSample(num_nodes=len(shard.nodal["rest"]), **copies)
+        ((file, simulation, frame),) = zip(*self._places(np.array([idx])), strict=True)
+        fields = self._window(int(file), int(simulation), int(frame))
+        return MeshSample(
+            num_nodes=len(fields["rest"]),
+            **{
+                name: self._numbers(name, [value]) if name in _OF_WINDOWS
+                else value.clone(memory_format=torch.contiguous_format)
+                for name, value in fields.items()
+            },
+        )  # fmt: skip
 
-    def batch(self, indices: Sequence[int] | NDArray[np.int64]) -> Batch:
+    def batch(self, indices: Sequence[int] | Numbers) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
-        parts, sizes = self._collect(indices)
-        values = {name: torch.cat(found, joined_along(name)) for name, found in parts.items()}
-        return batch_of(values, sizes)
+        places = zip(*(values.tolist() for values in self.places(indices)), strict=True)
+        windows = [self._window(*place) for place in places]
+        nodes, cells, edges = (
+            _ends([w[name].shape[-1] for w in windows])
+            for name in ("mass", "cell_young", "edge_index")
+        )
+        graphs, offsets = torch.arange(len(nodes)), nodes[:-1]
+        batch = Batch(_base_cls=MeshSample)
+        slices, raised = {}, {}
+        for name in windows[0]:
+            parts = [w[name] for w in windows]
+            slices[name], raised[name] = nodes, torch.zeros_like(offsets)
+            if name in _OF_WINDOWS:
+                batch[name], slices[name] = self._numbers(name, parts), graphs
+                continue
+            if name in _INDICES:
+                parts = [x + first for x, first in zip(parts, offsets.tolist(), strict=True)]
+                raised[name] = offsets
+            if name.startswith("cell"):
+                slices[name] = cells
+            if name == "edge_index":
+                batch[name], slices[name] = torch.cat(parts, 1), edges
+            else:
+                batch[name] = torch.cat(parts)
+        store = batch._store
+        store._num_nodes, store.num_nodes = nodes.diff().tolist(), int(nodes[-1])
+        store.batch, store.ptr = torch.repeat_interleave(graphs[:-1], nodes.diff()), nodes
+        batch._num_graphs, batch._slice_dict, batch._inc_dict = len(windows), slices, raised
+        return batch
 
-    def packed(self, indices: Sequence[int]) -> PackedBatch:
-        """The same for another process."""
-        return PackedBatch.join(*self._collect(indices))
-
-    def _collect(
-        self, indices: Sequence[int] | NDArray[np.int64]
-    ) -> tuple[dict[str, list[Tensor]], GraphSizes]:
-        chosen = self.indices()
-        places = [self._place(chosen[int(i)]) for i in indices]
-        sizes = graph_sizes(places)
-        return joined_fields(places, sizes, self.window, self.dtype), sizes
-
-    def places(
-        self, indices: Sequence[int] | NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def places(self, indices: Sequence[int] | Numbers) -> tuple[Numbers, Numbers, Numbers]:
         """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,).
 
         Raises
@@ -312,26 +243,27 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
-        if len(numbers) and not 0 <= numbers.min() <= numbers.max() < self.len():
-            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
-        rows = np.searchsorted(self._starts, numbers, side="right") - 1
-        files, simulations = self._owners[rows].T
-        return files, simulations, numbers - self._starts[rows]
+        return self._places(numbers)
 
     def decoded(self, file: int) -> DecodedShard:
         """A file's tensors, which are kept as far as memory allows."""
-        return self._shards[file]
+        if file not in self._kept:
+            self._kept[file] = self._load(file)
+            sizes = self.shard_bytes()
+            while len(self._kept) > 1 and sizes[list(self._kept)].sum() > self.cache_bytes:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(file)
+        return self._kept[file]
 
     def forget(self) -> None:
         """Drop all decoded files from memory."""
-        self._shards = RecentlyUsed(self._load, self.cache_bytes)
+        self._kept.clear()
 
-    def shard_numbers(self) -> NDArray[np.int64]:
+    def shard_numbers(self) -> Numbers:
         """For each window the number of its file in the split, (len(self),)."""
-        every = np.repeat(self._owners[:, 0], np.diff(self._starts))
-        return every[np.asarray(self.indices(), dtype=np.int64)]
+        return self.places(range(len(self)))[0]
 
-    def shard_bytes(self) -> NDArray[np.int64]:
+    def shard_bytes(self) -> Numbers:
         """What each file takes in memory, about, bytes."""
         width = torch.empty((), dtype=self.dtype).element_size()
         arrays = 3 + (self.base is not None) + len(self.runs)
@@ -340,146 +272,66 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             for h in self.headers
         ])  # fmt: skip
 
-    def _place(self, idx: int) -> WindowPlace:
-        if not 0 <= idx < self.len():
-            raise IndexError(f"window {idx}: expected 0 to {self.len() - 1}")
-        row = int(np.searchsorted(self._starts, idx, side="right")) - 1
-        number, simulation = self._owners[row].tolist()
-        shard = self._shards[number]
-        return WindowPlace(
-            number, self.headers[number], shard, simulation, shard.motions[simulation],
-            idx - int(self._starts[row]),
-        )  # fmt: skip
+    def _places(self, numbers: Numbers) -> tuple[Numbers, Numbers, Numbers]:
+        if len(numbers) and not 0 <= numbers.min() <= numbers.max() < self.len():
+            raise IndexError(f"windows {numbers}: expected 0 to {self.len() - 1}")
+        rows = np.searchsorted(self._starts, numbers, side="right") - 1
+        files, simulations = self._owners[rows].T
+        return files, simulations, numbers - self._starts[rows]
+
+    def _window(self, file: int, simulation: int, frame: int) -> dict[str, Any]:
+        """The fields of a sample: views of tensors, and numbers."""
+        shard, header = self.decoded(file), self.headers[file]
+        return {
+            **shard.motions[simulation].window(frame, self.window), **shard.mesh,
+            "file": file, "mesh": header.number, "simulation": simulation, "frame": frame,
+            "time": frame * header.time_step, "time_step": header.time_step,
+        }  # fmt: skip
+
+    def _numbers(self, name: str, values: Sequence[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.int64 if name in _WHOLE else self.dtype)
 
     def _load(self, number: int) -> DecodedShard:
         wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))
         if self.base is not None:
             wanted[self.base] = (*wanted.get(self.base, ()), "predictions")
         wanted[REFERENCE] = ("positions", "velocities")
-        shard = read_shard(self.headers[number].path, runs=wanted, verify=False)
-        return decode(shard, self.base, self.runs, self.dtype)
-
-
-class RecentlyUsed:
-    """Decoded files by number; the least recently used go first when they exceed ``limit`` bytes.
-
-    The one asked for last always stays, however large.  A pickled copy is empty.
-    """
-
-    def __init__(self, load: Callable[[int], DecodedShard], limit: int) -> None:
-        self.load, self.limit = load, limit
-        self.bytes = 0
-        self._files: OrderedDict[int, DecodedShard] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __contains__(self, number: int) -> bool:
-        return number in self._files
-
-    def __getitem__(self, number: int) -> DecodedShard:
-        if number in self._files:
-            self._files.move_to_end(number)
-            return self._files[number]
-        found = self.load(number)
-        self._files[number] = found
-        self.bytes += decoded_bytes(found)
-        while self.bytes > self.limit and len(self._files) > 1:
-            _, oldest = self._files.popitem(last=False)
-            self.bytes -= decoded_bytes(oldest)
-        return found
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "bytes": 0, "_files": OrderedDict()}
-
-
-class TrajectoryLoader(DataLoader[Any]):
-    """Batches of a `TrajectoryDataset`, and where an epoch is.
-
-    Parameters
-    ----------
-    dataset : TrajectoryDataset
-    batch_size : int
-    sampler : ShardShuffle, optional
-        Windows in order without.
-    drop_last : bool
-        Leave out a last batch that is smaller.
-    assemble : callable, optional
-        Makes a batch, which knows its ``num_graphs``, of the numbers of its windows;
-        `TrajectoryDataset.batch` by default.  Without worker processes.
-    **options
-        Of ``torch.utils.data.DataLoader``, such as ``num_workers``, ``persistent_workers``,
-        ``multiprocessing_context`` and ``pin_memory``.
-    """
-
-    def __init__(
-        self,
-        dataset: TrajectoryDataset,
-        batch_size: int,
-        sampler: ShardShuffle | None = None,
-        *,
-        drop_last: bool = False,
-        assemble: Callable[[Sequence[int]], Any] | None = None,
-        **options: Any,
-    ) -> None:
-        self.shuffle, self.windows = sampler, batch_size
-        order = SequentialSampler(dataset) if sampler is None else sampler
-        self._position = 0 if sampler is None else sampler.position
-        super().__init__(
-            _Batches(dataset, assemble or dataset.batch),
-            batch_size=None,
-            sampler=BatchSampler(order, batch_size, drop_last),
-            collate_fn=_unchanged,
-            **options,
+        shard = read_shard(self.headers[number].path, runs=wanted)
+        cells, moduli = shard.cells.astype(np.int64), {n: getattr(shard, n) for n in _MODULI}
+        mesh = {
+            "rest": shard.points, "free": shard.free, "mass": shard.mass,
+            **{name: node_means(x, cells, len(shard.points)) for name, x in moduli.items()},
+            **{f"cell_{name}": x for name, x in moduli.items()},
+            "cells": cells, "edge_index": mesh_edges(cells),
+        }  # fmt: skip
+        step = float(shard.attributes["time_step"])
+        return DecodedShard(
+            {name: self._tensor(values) for name, values in mesh.items()},
+            [self._motion(simulation, step) for simulation in shard.simulations],
         )
 
-    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
-        """One epoch, or what is left of it."""
-        done = 0 if self.shuffle is None else self.shuffle.start
-        for found in super().__iter__():
-            batch = found.batch() if isinstance(found, PackedBatch) else found
-            done += batch.num_graphs
-            self._position = done
-            yield batch
+    def _motion(self, simulation: Simulation, step: float) -> DecodedMotion:
+        reference = simulation.runs[REFERENCE]
+        positions: Any = reference.positions
+        if reference.velocities is None:
+            speeds = velocities(positions[:-1], step)
+        else:
+            speeds = reference.velocities[:-1]
+        steps = {"forces": self._tensor(simulation.forces)}
+        if self.base is not None:
+            steps["predictions"] = self._tensor(simulation.runs[self.base].predictions)
+        rollouts = {f"run_{n}": self._tensor(simulation.runs[n].positions) for n in self.runs}
+        return DecodedMotion(self._tensor(positions), self._tensor(speeds), steps, rollouts)
 
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the order of the next epoch; the same epoch again changes nothing."""
-        self._sampler().set_epoch(epoch)
-        self._position = self._sampler().position
-
-    def state_dict(self) -> dict[str, int]:
-        """Where the epoch is, after the last batch that was handed out.
-
-        Batches that workers have prepared ahead do not count.
-        """
-        return {**self._sampler().state_dict(), "position": self._position}
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Let the next epoch begin after the batch at which ``state`` was taken."""
-        self._sampler().load_state_dict(state)
-        self._position = self._sampler().position
-
-    def _sampler(self) -> ShardShuffle:
-        if self.shuffle is None:
-            raise InputError("the loader reads in order: expected one with a ShardShuffle.")
-        return self.shuffle
+    def _tensor(self, values: Any) -> Tensor:
+        """Floats in the data set's type."""
+        found = torch.from_numpy(values)
+        return found.to(self.dtype) if found.is_floating_point() else found
 
 
-class _Batches(torch.utils.data.Dataset[Any]):
-    """Lists of indices -> batches, from a worker packed."""
-
-    def __init__(
-        self, dataset: TrajectoryDataset, assemble: Callable[[Sequence[int]], Any]
-    ) -> None:
-        self.dataset, self.assemble = dataset, assemble
-
-    def __getitem__(self, indices: list[int]) -> Any:
-        in_worker = torch.utils.data.get_worker_info() is not None
-        return self.dataset.packed(indices) if in_worker else self.assemble(indices)
-
-
-def _unchanged(batch: Any) -> Any:
-    return batch
+def _ends(sizes: Sequence[int]) -> Tensor:
+    """Zero and the running sums."""
+    return torch.from_numpy(np.cumsum([0, *sizes]))
 
 
 def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> None:
@@ -494,3 +346,111 @@ def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> N
                 f"{header.path}: simulation {k} has no positions of run "
                 f"{min(set(runs) - rollouts)!r}: expected some of {', '.join(sorted(rollouts))}."
             )
+
+
+class TrajectoryLoader:
+    """Batches of windows in random order, epoch after epoch.
+
+    Each epoch shuffles the files, gives every rank an equal share of their windows (the
+    last few, fewer than ranks, are left out), and shuffles the windows within blocks of
+    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone.
+
+    Parameters
+    ----------
+    dataset : TrajectoryDataset
+    batch_size : int
+    seed : int
+    block : int, optional
+        Files; by default as many as fit into the data set's cache.
+    rank, world_size : int
+        Of distributed training.
+
+    Attributes
+    ----------
+    epoch : int
+        Of the next batch.
+    position : int
+        Windows of the epoch that were given out.
+
+    Raises
+    ------
+    InputError
+        If there is no such rank, or there are fewer windows than ranks.
+    """
+
+    def __init__(
+        self,
+        dataset: TrajectoryDataset,
+        batch_size: int,
+        *,
+        seed: int = 0,
+        block: int | None = None,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        if not 0 <= rank < world_size:
+            raise InputError(f"rank = {rank} of {world_size}: expected 0 to {world_size - 1}.")
+        self._owners = dataset.shard_numbers()
+        if len(self._owners) < world_size:
+            raise InputError(f"{len(self._owners)} windows for {world_size} ranks: expected more.")
+        if block is None:
+            sizes = np.cumsum(np.sort(dataset.shard_bytes())[::-1])
+            block = max(1, int(np.searchsorted(sizes, dataset.cache_bytes, side="right")))
+        self.dataset, self.batch_size = dataset, batch_size
+        self.seed, self.block, self.rank, self.world_size = seed, block, rank, world_size
+        self.epoch = self.position = 0
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        return -(-(len(self._owners) // self.world_size) // self.batch_size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """What is left of the epoch; the next iteration is of the next one."""
+        order = self.order()
+        while self.position < len(order):
+            chosen = order[self.position : self.position + self.batch_size]
+            self.position += len(chosen)
+            yield self.dataset.batch(chosen)
+        self.set_epoch(self.epoch + 1)
+
+    def order(self) -> Numbers:
+        """All windows of the rank's epoch."""
+        shards, share = np.unique(self._owners), len(self._owners) // self.world_size
+        rank_of = np.empty(shards[-1] + 1, dtype=np.int64)
+        rank_of[self._random().permutation(shards)] = np.arange(len(shards))
+        places = rank_of[self._owners]
+        windows = np.argsort(places, kind="stable")
+        own = windows[self.rank * share : (self.rank + 1) * share]
+        _, turn = np.unique(places[own], return_inverse=True)
+        noise = self._random(1 + self.rank).permutation(len(own))
+        return own[np.lexsort([noise, turn // self.block])]
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to the beginning of an epoch; the same epoch again changes nothing."""
+        if epoch != self.epoch:
+            self.epoch, self.position = epoch, 0
+
+    def state_dict(self) -> dict[str, int]:
+        """Where the epoch is, after the last batch that was handed out; numbers only."""
+        names = ("seed", "epoch", "position", "block", "rank", "world_size")
+        return {name: getattr(self, name) for name in names} | {"windows": len(self._owners)}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Go on from where ``state`` was taken.
+
+        Raises
+        ------
+        InputError
+            If it was taken with other windows, seed, block or ranks, whose order differs.
+        """
+        here = self.state_dict()
+        for name in here.keys() - {"epoch", "position"}:
+            if state.get(name) != here[name]:
+                raise InputError(
+                    f"the state has {name} = {state.get(name)}, the loader {here[name]}: expected "
+                    "the same, for the order of windows depends on it."
+                )
+        self.epoch, self.position = state["epoch"], state["position"]
+
+    def _random(self, stream: int = 0) -> np.random.Generator:
+        return np.random.default_rng((self.seed, self.epoch, stream))

@@ -1,7 +1,6 @@
 """What a file of a data set holds: one mesh with its material, and its simulations.
 
-The layout of the HDF5 file, version 1 (``docs/datasets.md``), after its seal
-(`pdcorrect.data.checksum`)::
+The layout of the HDF5 file, version 1 (``docs/datasets.md``)::
 
     /                     attributes: format, version, dataset, split, number, setting,
                           config_hash, time_step, tolerance, content_hash
@@ -23,7 +22,16 @@ The layout of the HDF5 file, version 1 (``docs/datasets.md``), after its seal
     cost/KKKK             attributes: seconds by run; not part of the hash
 
 Arrays without a type are float32 or, by choice, float64.  A run has positions,
-predictions or both.
+predictions or both.  In front, in the room that HDF5 leaves to others, the user block, are
+three lines of text, padded with zeros::
+
+    pdcorrect-dataset 1
+    bytes 10485760
+    sha256 0f3c...
+
+the format's version, the size of the whole file, and the SHA-256 of the first two lines
+and of everything after the user block.  A damaged file is thus found out before HDF5,
+which some damage makes crash, sees any of it.
 """
 
 from __future__ import annotations
@@ -41,9 +49,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._files import part_of_process, replacing
-from pdcorrect.data.checksum import FORMAT, USER_BLOCK, VERSION, seal
 from pdcorrect.errors import InputError, OutputError
 
+FORMAT, VERSION = "pdcorrect-dataset", 1
+USER_BLOCK = 512
+"""Bytes."""
 REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"
 """Runs: the truth, and the coarse models, see `pdcorrect.fem.problem`."""
 CONVERGED = "time-converged"
@@ -222,6 +232,15 @@ def write_shard(
     return found
 
 
+def seal(image: memoryview) -> None:
+    """Write the user block of a file that is whole but for it, in place."""
+    lead = f"{FORMAT} {VERSION}\nbytes {len(image)}\n".encode()
+    digest = hashlib.sha256(lead)
+    digest.update(image[USER_BLOCK:])
+    text = lead + f"sha256 {digest.hexdigest()}\n".encode()
+    image[:USER_BLOCK] = text.ljust(USER_BLOCK, b"\0")
+
+
 def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     for name, wanted in ATTRIBUTES.items():
@@ -251,7 +270,7 @@ def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
 
 
 def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) -> None:
-    """One compressed chunk with a checksum of its own, for readers that skip the file's."""
+    """One compressed chunk; its checksum is for programs that do not know the file's."""
     group.create_dataset(
         name, data=np.asarray(values, dtype=dtype), chunks=values.shape, compression="gzip",
         shuffle=True, fletcher32=True,

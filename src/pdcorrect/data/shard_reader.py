@@ -1,32 +1,34 @@
-"""Reading the files of a data set; every fault becomes one sentence that names the file.
-
-Files are opened, read and closed at once: nothing here keeps a handle.
-"""
+"""Reading the files of a data set; every fault becomes one sentence that names the file."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import os
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
 
-from pdcorrect.data.checksum import check_seal
 from pdcorrect.data.schema import (
     ATTRIBUTES,
+    FORMAT,
     HASH,
     MESH,
     MOTION,
     STATISTICS,
+    USER_BLOCK,
+    VERSION,
     Array,
     Run,
     Shard,
     Simulation,
 )
-from pdcorrect.errors import FileFormatError
+from pdcorrect.errors import FileFormatError, FileVersionError
 
 Lengths = dict[int | str, int]
 """Of the axes that were met so far: N, C, and of a simulation T and T+1."""
@@ -98,44 +100,33 @@ def _with(simulation: h5py.Group, name: str) -> frozenset[str]:
 def read_shard(
     path: str | Path,
     *,
-    simulations: Collection[int] | None = None,
     runs: Collection[str] | Mapping[str, Collection[str]] | None = None,
-    verify: bool = True,
 ) -> Shard:
-    """Read a file of a data set.
+    """Read a file of a data set, and find every changed byte by its checksum.
 
     Parameters
     ----------
     path : path
-    simulations : collection of int, optional
-        Numbers of those to read, in this order; all by default.
     runs : collection of str, or mapping of str to collections of str, optional
         Names of those to read, as far as they are there; with names of arrays, such as
         "predictions", only these of each.  All by default.
-    verify : bool
-        Compare the file with its checksum, which reads all of it and finds every changed
-        byte.  Without, only its size and version are compared, and what is read has HDF5's
-        checksums.
-
-    Returns
-    -------
-    Shard
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is damaged, is something else or lacks a simulation that
-        is asked for; the message names the file and the reason.
+        If the file cannot be read, is damaged or something else; names the file and the reason.
     """
-    with _opened(Path(path), verify) as file:
+    with _opened(Path(path), verify=True) as file:
         lengths: Lengths = {}
         arrays = {name: _array(file, at, shape, lengths) for name, (at, _, shape) in MESH.items()}
         _check_cells(arrays["cells"], lengths["N"])
-        chosen = range(len(file["simulations"])) if simulations is None else simulations
+        count = len(file["simulations"])
         return Shard(
             attributes={name: kind(file.attrs[name]) for name, kind in ATTRIBUTES.items()},
             **arrays,
-            simulations=tuple(_simulation(file, f"{k:04d}", runs, dict(lengths)) for k in chosen),
+            simulations=tuple(
+                _simulation(file, f"{k:04d}", runs, dict(lengths)) for k in range(count)
+            ),
             provenance={name: str(text) for name, text in file["provenance"].attrs.items()},
             content_hash=str(file.attrs[HASH]),
         )
@@ -148,7 +139,7 @@ def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
         raise FileFormatError(f"{path}: there is no such file.")
     try:
         with path.open("rb") as stream:
-            check_seal(stream, verify)
+            _check_seal(stream, verify)
             with h5py.File(stream, "r") as file:
                 yield file
     except FileFormatError as error:
@@ -156,6 +147,35 @@ def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
         reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
         raise FileFormatError(f"{path}: cannot be read ({reason}).") from error
+
+
+_SEAL = re.compile(
+    rb"(?P<lead>pdcorrect-dataset (?P<version>\d{1,9})\nbytes (?P<size>\d{1,18})\n)"
+    rb"sha256 (?P<sum>[0-9a-f]{64})\n\0*"
+)
+
+
+def _check_seal(file: IO[bytes], verify: bool) -> None:
+    """Compare an open file's size and version with its user block, if asked to all its bytes."""
+    block, size = file.read(USER_BLOCK), os.fstat(file.fileno()).st_size
+    found = _SEAL.fullmatch(block) if len(block) == USER_BLOCK else None
+    if found is None:
+        cut = 0 < size < USER_BLOCK and block.startswith(FORMAT.encode()[:size])
+        what = "truncated" if cut else "no file of a data set, or damaged at its beginning"
+        raise FileFormatError(f"{what}: expected {FORMAT!r} and a checksum in front")
+    if int(found["size"]) != size:
+        what = "truncated" if size < int(found["size"]) else "damaged"
+        raise FileFormatError(f"{what}: expected {int(found['size'])} bytes, got {size}")
+    if verify:
+        digest = hashlib.file_digest(file, lambda: hashlib.sha256(found["lead"]))  # type: ignore[arg-type]
+        if digest.hexdigest() != found["sum"].decode():
+            raise FileFormatError(
+                "damaged: its checksum (SHA-256) is not the one in front; copy or generate it again"
+            )
+    if int(found["version"]) != VERSION:
+        raise FileVersionError(
+            f"format version {int(found['version'])}: this pdcorrect reads version {VERSION}"
+        )
 
 
 def _simulation(
@@ -204,10 +224,7 @@ def _array(group: h5py.Group, name: str, shape: tuple[int | str, ...], lengths: 
     """A dataset, finite and of a given shape, in which a new letter stands for any length."""
     dataset = group[name]
     place = dataset.name.lstrip("/")
-    try:
-        values = np.asarray(dataset[()])
-    except OSError as error:
-        raise FileFormatError(f"{place} is damaged ({error})") from None
+    values = np.asarray(dataset[()])
     if values.ndim == len(shape):
         lengths |= {n: m for n, m in zip(shape, values.shape, strict=True) if n not in lengths}
     expected = tuple(lengths.get(n, n) if isinstance(n, str) else n for n in shape)

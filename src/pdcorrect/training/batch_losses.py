@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.data.reader import ShardShuffle
+from pdcorrect.data.reader import TrajectoryLoader
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses, network_precision
 from pdcorrect.training.recipe import Stage, TrainingConfig
@@ -39,9 +39,9 @@ class OneStepBatches:
 
     def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
         self._windows, self._stage, self._seed = windows, stage, (seed, world.rank)
-        self._shuffle = ShardShuffle(
-            windows.dataset, seed=seed, block=len(windows.dataset.headers), rank=world.rank,
-            world_size=world.size,
+        self._shuffle = TrajectoryLoader(
+            windows.dataset, stage.batch, seed=seed, block=len(windows.dataset.headers),
+            rank=world.rank, world_size=world.size,
         )  # fmt: skip
         self._order = self._shuffle.order()
         self._generator = torch.Generator(windows.device)

@@ -97,7 +97,7 @@ def load_recordings(
     found = []
     for path in _paths(folder, split, without):
         runs = dict.fromkeys(_runs(base), ("positions", "predictions"))
-        shard = read_shard(path, verify=False, runs=runs)
+        shard = read_shard(path, runs=runs)
         _check_complete(path, shard, base, scenes)
         for number, simulation in enumerate(shard.simulations):
             found.append(_recording(path, shard, simulation, number, split, base))
@@ -120,7 +120,7 @@ def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
     """
     known: dict[Path, list[Problem]] = {}
     for path in dict.fromkeys(recording.path for recording in recordings):
-        known[path] = rebuilt_problems(read_shard(path, verify=False, runs=(base,)), path, base)
+        known[path] = rebuilt_problems(read_shard(path, runs=(base,)), path, base)
     return [known[recording.path][recording.number] for recording in recordings]
 
 
