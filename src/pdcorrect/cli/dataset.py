@@ -107,12 +107,13 @@ def info(
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
     from rich.console import Console
 
-    from pdcorrect.data.summary import dataset_files, dataset_info
+    from pdcorrect.data.folder import all_shards
+    from pdcorrect.data.summary import dataset_info
 
-    with progress_bar("reading", len(dataset_files(folder)), unit="files", apart=True) as advance:
+    with progress_bar("reading", len(all_shards(folder)), unit="files", apart=True) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
     console = Console(width=None if sys.stdout.isatty() else 200, markup=False)
-    console.print(found.tables())
+    console.print(*found.tables())
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:

@@ -1,4 +1,4 @@
-"""What a data set contains, in numbers: sizes, ranges, motions, errors of the runs, cost."""
+"""What a data set contains, in numbers: sizes, ranges, errors of the runs, cost."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdcorrect.data.folder import Damage, all_shards, read_files
+from pdcorrect.data.folder import Damage, all_shards, read_files, splits_of
 from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.table import Table
 
 Range = tuple[float, float]
 
@@ -40,8 +40,8 @@ class RunInfo:
         The same in m.
     step_error : float or None
         RMS distance from the reference after one step from each of its frames, mean, m.
-    omega, worst_omega : float or None
-        Share of the plain run's squared error that it removes, per cent: mean and least.
+    omega : float or None
+        Share of the plain run's squared error that it removes, per cent, mean.
     seconds : float
         Cost, of single steps too.
     """
@@ -52,7 +52,6 @@ class RunInfo:
     rms_error: float | None
     step_error: float | None
     omega: float | None
-    worst_omega: float | None
     seconds: float
 
 
@@ -64,17 +63,17 @@ class SplitInfo:
     ----------
     meshes, simulations, frames, bytes : int
         Frames over all simulations, without the rest shape.
-    nodes, cells, young, poisson, density : (smallest, largest)
+    nodes, young, poisson, density : (smallest, largest)
         Of its meshes; Pa, dimensionless, kg/m3.
-    displacement, speed, force : (smallest, largest)
-        Of the simulations' largest values, m, m/s (from frame to frame), N.
+    displacement : (smallest, largest)
+        Of the simulations' largest ones, m.
     rejection_rate : float
         Rejected draws over all draws.
+    rejections : mapping of str to int
+        Rejected draws by "run, reason".
     runs : mapping of str to RunInfo
     seconds : float
         Cost of all runs.
-    rejections : mapping of str to int
-        Rejected draws by "run, reason".
     """
 
     meshes: int
@@ -82,17 +81,14 @@ class SplitInfo:
     frames: int
     bytes: int
     nodes: Range
-    cells: Range
     young: Range
     poisson: Range
     density: Range
     displacement: Range
-    speed: Range
-    force: Range
     rejection_rate: float
+    rejections: Mapping[str, int]
     runs: Mapping[str, RunInfo]
     seconds: float
-    rejections: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -117,25 +113,35 @@ class DatasetInfo:
         """All numbers, in SI units and per cent."""
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
-    def tables(self) -> RenderableType:
-        """For rich's console."""
-        from rich.console import Group
-
-        return Group(_size_table(self), _run_table(self), _rejection_table(self))
-
-
-def dataset_files(folder: str | Path) -> list[Path]:
-    """Files of the meshes in a folder, at least one.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
-    found = all_shards(folder)
-    if not found:
-        raise InputError(f"{folder}: holds no files of a data set: expected SPLIT/mesh-0000.h5 ...")
-    return found
+    def tables(self) -> Iterable[Table]:
+        """Sizes, runs and rejected loads, for rich's console."""
+        several = [("all", self.whole)] if len(self.splits) > 1 else []
+        splits = [*self.splits.items(), *several]
+        yield _table(
+            f"{self.name}: sizes, materials, and largest displacements of the simulations",
+            ("split", "meshes", "simulations", "frames", "MB", "nodes", "E, kPa", "ν",
+             "density, kg/m3", "displacement, mm", "loads rejected, %"),
+            ((
+                name, *map(str, (split.meshes, split.simulations, split.frames)),
+                _text(split.bytes, 1e-6), _between(split.nodes), _between(split.young, 1e-3),
+                _between(split.poisson), _between(split.density),
+                _between(split.displacement, 1e3), _text(split.rejection_rate, 100.0),
+            ) for name, split in splits),
+        )  # fmt: skip
+        yield _table(
+            "runs: mean distance from the reference; Omega, % of the plain run's squared error; "
+            "cost",
+            ("split", "run", "simulations", "error, %", "RMS, mm", "one step, mm", "Omega",
+             "iterations", "s"),
+            ((
+                name, label, str(run.simulations), _text(run.relative_error, 100.0),
+                _text(run.rms_error, 1e3), _text(run.step_error, 1e3), _text(run.omega),
+                _text(run.iterations), _text(run.seconds or None),
+            ) for name, split in splits for label, run in split.runs.items()),
+        )  # fmt: skip
+        if self.whole.rejections:
+            rows = ((n, why, str(k)) for n, s in splits for why, k in s.rejections.items())
+            yield _table("loads rejected", ("split", "reason", "draws"), rows)
 
 
 def dataset_info(
@@ -163,55 +169,44 @@ def dataset_info(
     """
 
     def read(path: Path) -> _Numbers:
-        found = _of_mesh(read_shard(path), path.stat().st_size)
+        found = _of_mesh(read_shard(path), path)
         if on_file:
             on_file(path)
         return found
 
     damaged: Damage = {}
-    meshes = read_files(dataset_files(folder), read, damaged if skip_damaged else None)
-    splits = {
-        name: _summary([mesh for mesh in meshes if mesh["split"] == name])
-        for name in dict.fromkeys(mesh["split"] for mesh in meshes)
-    }
+    names = splits_of(folder)
+    meshes = read_files(all_shards(folder), read, damaged if skip_damaged else None)
+    parts = {name: [mesh for mesh in meshes if mesh["split"] == name] for name in names}
+    splits = {name: _summary(part) for name, part in parts.items() if part}
     left_out = {f"{p.parent.name}/{p.name}": text for p, text in damaged.items()}
     return DatasetInfo(Path(folder).resolve().name, _summary(meshes), splits, left_out)
 
 
-# --- one file ----------------------------------------------------------------------------
-
 _Numbers = dict[str, Any]
 """Of a file, a simulation or a run, by the names in `SplitInfo` and `RunInfo`."""
-_OF_MOTIONS = ("displacement", "speed", "force")
 
 
-def _of_mesh(shard: Shard, size: int) -> _Numbers:
-    step = float(shard.attributes["time_step"])
+def _of_mesh(shard: Shard, path: Path) -> _Numbers:
     return {
-        "split": str(shard.attributes["split"]),
-        "bytes": size,
-        "simulations": [_of_simulation(simulation, step) for simulation in shard.simulations],
-        "ranges": {
-            "nodes": _range(len(shard.points)), "cells": _range(len(shard.cells)),
-            "young": _range(shard.young), "poisson": _range(shard.poisson),
-            "density": _range(shard.density),
-        },
-    }  # fmt: skip
+        "split": path.parent.name,
+        "bytes": path.stat().st_size,
+        "simulations": list(map(_of_simulation, shard.simulations)),
+        "nodes": len(shard.points),
+        **{n: _range(getattr(shard, n)) for n in ("young", "poisson", "density")},
+    }
 
 
-def _of_simulation(simulation: Simulation, step: float) -> _Numbers:
+def _of_simulation(simulation: Simulation) -> _Numbers:
     run = simulation.runs.get(REFERENCE)
     if run is None or run.positions is None:
         raise InputError(f"a simulation has no rollout {REFERENCE!r}: expected one of each.")
     reference = run.positions.astype(np.float64)
-    speeds = np.linalg.norm(np.diff(reference, axis=0), axis=2) / step
     return {
         "frames": simulation.steps,
         "rejected": simulation.rejected,
         "seconds": simulation.seconds,
         "displacement": largest_displacement(reference),
-        "speed": speeds.max(),
-        "force": np.linalg.norm(simulation.forces.astype(np.float64), axis=2).max(),
         "runs": {name: _of_run(simulation, name, reference) for name in simulation.runs},
     }
 
@@ -237,9 +232,6 @@ def _of_run(simulation: Simulation, name: str, reference: Any) -> _Numbers:
     return found
 
 
-# --- summing up --------------------------------------------------------------------------
-
-
 def _summary(meshes: Sequence[_Numbers]) -> SplitInfo:
     motions = [motion for mesh in meshes for motion in mesh["simulations"]]
     names = sorted(
@@ -252,12 +244,12 @@ def _summary(meshes: Sequence[_Numbers]) -> SplitInfo:
         simulations=len(motions),
         frames=sum(motion["frames"] for motion in motions),
         bytes=sum(mesh["bytes"] for mesh in meshes),
-        **{n: _range([mesh["ranges"][n] for mesh in meshes]) for n in meshes[0]["ranges"]},
-        **{n: _range([motion[n] for motion in motions]) for n in _OF_MOTIONS},
+        **{n: _range([m[n] for m in meshes]) for n in ("nodes", "young", "poisson", "density")},
+        displacement=_range([motion["displacement"] for motion in motions]),
         rejection_rate=len(reasons) / (len(reasons) + len(motions)),
+        rejections=dict(sorted(Counter(reasons).items())),
         runs={name: _run_info(name, motions) for name in names},
         seconds=sum(sum(motion["seconds"].values()) for motion in motions),
-        rejections=dict(sorted(Counter(reasons).items())),
     )
 
 
@@ -267,28 +259,16 @@ def _range(values: Any) -> Range:
 
 def _run_info(name: str, motions: Sequence[_Numbers]) -> RunInfo:
     runs = [motion["runs"][name] for motion in motions if name in motion["runs"]]
-
-    def mean(what: str) -> float | None:
+    means = {}
+    for what in ("iterations", "relative_error", "rms_error", "step_error", "omega"):
         values = [run[what] for run in runs if what in run]
-        return float(np.mean(values)) if values else None
-
+        means[what] = float(np.mean(values)) if values else None
     keys = (name, f"{name} steps")
-    return RunInfo(
-        simulations=len(runs),
-        iterations=mean("iterations"),
-        relative_error=mean("relative_error"),
-        rms_error=mean("rms_error"),
-        step_error=mean("step_error"),
-        omega=mean("omega"),
-        worst_omega=min((run["omega"] for run in runs if "omega" in run), default=None),
-        seconds=sum(motion["seconds"].get(key, 0.0) for motion in motions for key in keys),
-    )
+    seconds = sum(motion["seconds"].get(key, 0.0) for motion in motions for key in keys)
+    return RunInfo(simulations=len(runs), seconds=seconds, **means)
 
 
-# --- tables ------------------------------------------------------------------------------
-
-
-def _table(title: str, *headings: str) -> Any:
+def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -296,60 +276,16 @@ def _table(title: str, *headings: str) -> Any:
         title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD,
         padding=(0, 1, 0, 0), pad_edge=False,
     )  # fmt: skip
-    for number, heading in enumerate(headings):
-        left = number == 0 or heading in ("run", "reason")
+    for heading in headings:
+        left = heading in ("split", "run", "reason")
         table.add_column(heading, justify="left" if left else "right", no_wrap=True)
-    return table
-
-
-def _splits(info: DatasetInfo) -> Iterable[tuple[str, SplitInfo]]:
-    """Splits, and the whole where there are several."""
-    return [*info.splits.items(), *([("all", info.whole)] if len(info.splits) > 1 else [])]
-
-
-def _size_table(info: DatasetInfo) -> Any:
-    table = _table(
-        f"{info.name}: sizes, materials, and largest values of each simulation", "split", "meshes",
-        "simulations", "frames", "MB", "nodes", "cells", "E, kPa", "ν", "density, kg/m3",
-        "displacement, mm", "speed, m/s", "force, N",
-    )  # fmt: skip
-    for name, split in _splits(info):
-        table.add_row(
-            name, str(split.meshes), str(split.simulations), str(split.frames),
-            _text(split.bytes, 1e-6), _between(split.nodes), _between(split.cells),
-            _between(split.young, 1e-3), _between(split.poisson), _between(split.density),
-            _between(split.displacement, 1e3), _between(split.speed), _between(split.force),
-        )  # fmt: skip
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
 def _between(values: Range, factor: float = 1.0) -> str:
     return " - ".join(dict.fromkeys(f"{factor * value:.4g}" for value in values))
-
-
-def _run_table(info: DatasetInfo) -> Any:
-    table = _table(
-        "runs: mean distance from the reference; Omega, % of the plain run's squared error; cost",
-        "split", "run", "simulations", "error, %", "RMS, mm", "one step, mm", "Omega", "worst",
-        "iterations", "s",
-    )  # fmt: skip
-    for name, split in _splits(info):
-        for label, run in split.runs.items():
-            table.add_row(
-                name, label, str(run.simulations), _text(run.relative_error, 100.0),
-                _text(run.rms_error, 1e3), _text(run.step_error, 1e3), _text(run.omega),
-                _text(run.worst_omega), _text(run.iterations), _text(run.seconds or None),
-            )  # fmt: skip
-    return table
-
-
-def _rejection_table(info: DatasetInfo) -> Any:
-    table = _table("loads rejected", "split", "of drawn, %", "draws", "reason")
-    for name, split in _splits(info):
-        table.add_row(name, _text(split.rejection_rate, 100.0), "", "")
-        for reason, count in split.rejections.items():
-            table.add_row("", "", str(count), reason)
-    return table
 
 
 def _text(value: float | None, factor: float = 1.0) -> str:
