@@ -1,6 +1,7 @@
 """Generation: what is computed, that it does not depend on who computes, and interruptions."""
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -161,14 +162,12 @@ class Failing(OneByOne):
         super().__init__("pd", 1e-4)
         self.times = times
 
-    def rollouts(self, jobs, steps, divisor=1):
-        from dataclasses import replace
-
-        found = super().rollouts(jobs, steps, divisor)
-        if jobs[0].problem.refine == 1 or self.times <= 0:
+    def rollouts(self, problems, steps, divisor=1):
+        found = super().rollouts(problems, steps, divisor)
+        if problems[0].refine == 1 or self.times <= 0:
             return found
         self.times -= 1
-        return [replace(found[0], failure="step 1: broke"), *found[1:]]
+        return [dataclasses.replace(found[0], failure="step 1: broke"), *found[1:]]
 
 
 def test_a_rejected_load_is_noted_and_drawn_again():

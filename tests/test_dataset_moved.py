@@ -11,10 +11,10 @@ import pdcorrect as pc
 from conftest import CLAMPED, GRAVITY, box_mesh
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import shard_from_trajectories
-from pdcorrect.data.importing import discretise_stored, portable
+from pdcorrect.data.importing import portable
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
-from pdcorrect.data.simulate import rebuilt_problems
+from pdcorrect.data.simulate import discretise_stored, rebuilt_problems
 from pdcorrect.errors import MeshError
 from pdcorrect.scene import trained_coarse
 
@@ -111,7 +111,7 @@ def test_scenes_with_an_absolute_path_are_read_and_those_taken_out_ask_for_their
     scene = pc.Scene.from_toml(shard.simulations[0].scene_toml)
     with pytest.raises(MeshError, match=r"bracket\.vtu"):
         pc.discretise(scene)
-    fine = discretise_stored(scene, shard.points, shard.cells, refine=2)
+    fine = discretise_stored(scene, shard, refine=2)
     assert len(fine.cells) == 8 * len(shard.cells)
 
 

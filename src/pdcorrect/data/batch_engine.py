@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pdcorrect.batch.states import BatchResult, BatchState
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.data.engines import MOST_ITERATIONS, Job, Steps
+from pdcorrect.data.engines import MOST_ITERATIONS, Steps, failure_of
 from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State
 
@@ -37,22 +37,19 @@ class Batched:
     A rollout of one problem is computed twice, since kernels are compiled anew for a batch of one.
     """
 
-    solver = "pd"
-
     def __init__(
         self, device: str, tolerance: float, most: int = 1024, adds_up: bool = False
     ) -> None:
         self._device, self._tolerance, self._most = device, tolerance, most
         self._adds_up = adds_up
 
-    def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
-        """See `Engine`."""
-        if len(jobs) == 1:
-            found = self.rollouts([*jobs, *jobs], steps, divisor)[0]
+    def rollouts(self, problems: Sequence[Problem], steps: int, divisor: int = 1) -> list[Steps]:
+        if len(problems) == 1:
+            found = self.rollouts([*problems, *problems], steps, divisor)[0]
             return [replace(found, seconds=2.0 * found.seconds)]
         started = time.perf_counter()
-        stepper = self._stepper([job.problem for job in jobs], divisor)
-        rest, log = stepper.rest_state(), _BatchLog(stepper, jobs)
+        stepper = self._stepper(problems, divisor)
+        rest, log = stepper.rest_state(), _BatchLog(stepper, problems)
         state = stepper.initial_state()
         for _ in range(steps):
             for _ in range(divisor):
@@ -60,32 +57,26 @@ class Batched:
                 log.note(result)
                 state = log.without_failed(result.state, rest)
             log.frame(state)
-        return log.steps(time.perf_counter() - started)
+        return log.steps(steps, time.perf_counter() - started)
 
-    def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
-        """See `Engine`."""
+    def predictions(
+        self, problems: Sequence[Problem], states: Sequence[Sequence[State]]
+    ) -> list[Steps]:
         started = time.perf_counter()
-        frames = max(map(len, states))
-        at_once = max(1, min(frames, self._most // len(jobs)))
-        every = [job for job in jobs for _ in range(at_once)]
-        stepper = self._stepper([job.problem for job in every], 1)
-        parts: list[list[Steps]] = [[] for _ in jobs]
+        frames = len(states[0])
+        at_once = max(1, min(frames, self._most // len(problems)))
+        every = [problem for problem in problems for _ in range(at_once)]
+        stepper = self._stepper(every, 1)
+        log = _BatchLog(stepper, every, at_once)
         for first in range(0, frames, at_once):
             numbers = [min(first + k, frames - 1) for k in range(at_once)]
-            log = _BatchLog(stepper, every)
             result = stepper(stepper.state([s[k] for s in states for k in numbers]))
             log.note(result)
             log.frame(result.state)
-            found = log.steps(0.0)
-            for i, part in enumerate(parts):
-                part += found[i * at_once : (i + 1) * at_once][: frames - first]
-        seconds = (time.perf_counter() - started) / len(jobs)
-        return [_joined(part, seconds) for part in parts]
+        return log.steps(frames, time.perf_counter() - started)
 
     def describe(self) -> dict[str, str]:
-        """See `Engine`."""
-        kind = torch.device(self._device).type
-        return {"solver": self.solver, "engine": f"batches on {kind}"}
+        return {"solver": "pd", "engine": f"batches on {torch.device(self._device).type}"}
 
     def _stepper(self, problems: Sequence[Problem], divisor: int) -> BatchStepper:
         if torch.device(self._device).type == "cuda":
@@ -101,24 +92,25 @@ class Batched:
 
 
 class _BatchLog:
-    """Statistics and chosen nodes of steps that are taken together."""
+    """Statistics and coarse nodes of B steps that are taken together, ``at_once`` of a problem."""
 
-    def __init__(self, stepper: BatchStepper, jobs: Sequence[Job]) -> None:
-        self._stepper, self._jobs = stepper, jobs
-        count = len(jobs)
-        most = max(len(job.nodes) for job in jobs)
-        chosen = np.zeros((count, most), dtype=np.int64)
-        for i, job in enumerate(jobs):
-            chosen[i, : len(job.nodes)] = job.nodes
+    def __init__(
+        self, stepper: BatchStepper, problems: Sequence[Problem], at_once: int = 1
+    ) -> None:
+        self._at_once = at_once
+        self._nodes = [problem.mesh.coarse_nodes for problem in problems]
+        chosen = np.zeros((len(problems), max(map(len, self._nodes))), dtype=np.int64)
+        for row, nodes in zip(chosen, self._nodes, strict=True):
+            row[: len(nodes)] = nodes
         self._chosen = torch.as_tensor(chosen, device=stepper.device)[..., None].expand(-1, -1, 3)
+        self._failed = np.zeros(len(problems), dtype=bool)
         self._frames: list[tuple[Any, ...]] = []
-        self.failures = [""] * count
         self._begin()
 
     def _begin(self) -> None:
-        count = len(self._jobs)
-        self._iterations = np.zeros(count, dtype=np.int64)
-        self._estimates, self._ratios = np.zeros(count), np.full(count, np.inf)
+        count = len(self._nodes)
+        self._iterations, self._estimates = np.zeros(count, dtype=np.int64), np.zeros(count)
+        self._ratios, self._failures = np.full(count, np.inf), np.full(count, "", dtype=object)
 
     def note(self, result: BatchResult) -> None:
         """A step inside a frame."""
@@ -127,54 +119,37 @@ class _BatchLog:
         ratios = result.smallest_volume_ratios
         self._ratios = np.fmin(self._ratios, ratios)
         for i, (status, ratio) in enumerate(zip(result.statuses, ratios.tolist(), strict=True)):
-            if not self.failures[i] and not (status.ok and ratio > 0.0):
-                what = "a cell is inverted" if status.ok else status.value
-                self.failures[i] = f"step {len(self._frames) + 1}: {what}"
+            self._failures[i] = self._failures[i] or failure_of(status, ratio)
+        self._failed |= self._failures != ""
 
     def without_failed(self, state: BatchState, rest: BatchState) -> BatchState:
         """The state with scenes that failed put back to rest, where they cost little."""
-        if not any(self.failures):
+        if not self._failed.any():
             return state
-        failed = torch.tensor([bool(f) for f in self.failures], device=state.positions.device)
-        return state.where(~failed, rest)
+        return state.where(torch.from_numpy(~self._failed).to(state.positions.device), rest)
 
     def frame(self, state: BatchState) -> None:
         """The end of a frame."""
         positions, velocities = (self._at_nodes(x) for x in (state.positions, state.velocities))
-        self._frames.append(
-            (positions, velocities, self._iterations, self._estimates, self._ratios)
-        )
+        self._frames.append((
+            positions, velocities, self._iterations, self._estimates, self._ratios, self._failures
+        ))  # fmt: skip
         self._begin()
 
     def _at_nodes(self, x: Tensor) -> np.ndarray:
         return x.gather(1, self._chosen).to("cpu", torch.float64).numpy()
 
-    def steps(self, seconds: float) -> list[Steps]:
-        """The scenes' steps, apart; each is charged an equal share of the time."""
-        stacked = [np.stack(column) for column in zip(*self._frames, strict=True)]
-        positions, velocities, iterations, estimates, ratios = stacked
-        return [
-            Steps(
-                positions[:, i, : len(job.nodes)],
-                velocities[:, i, : len(job.nodes)],
-                iterations[:, i],
-                estimates[:, i],
-                ratios[:, i],
-                self.failures[i],
-                seconds / len(self._jobs),
-            )
-            for i, job in enumerate(self._jobs)
-        ]
-
-
-def _joined(parts: Sequence[Steps], seconds: float) -> Steps:
-    """Single steps from successive frames as one record."""
-    numbered = ((k, s.failure) for k, s in enumerate(parts) if s.failure)
-    failure = next((f"step {k + 1}: {text.split(': ', 1)[1]}" for k, text in numbered), "")
-    arrays = {
-        name: np.concatenate([getattr(s, name) for s in parts])
-        for name in (
-            "positions", "velocities", "iterations", "error_estimates", "smallest_volume_ratios",
-        )
-    }  # fmt: skip
-    return Steps(**arrays, failure=failure, seconds=seconds)
+    def steps(self, count: int, seconds: float) -> list[Steps]:
+        """``count`` steps of each problem, which is charged an equal share of the time."""
+        nodes, columns = self._nodes[:: self._at_once], []
+        for column in zip(*self._frames, strict=True):
+            apart = np.stack(column)  # (frames, problems * at_once, ...)
+            apart = apart.reshape(len(apart), len(nodes), self._at_once, *apart.shape[2:])
+            flat = apart.swapaxes(0, 1).reshape(len(nodes), -1, *apart.shape[3:])
+            columns.append(flat[:, :count])
+        out = []
+        for own, positions, velocities, *numbers, failures in zip(nodes, *columns, strict=True):
+            told = (f"step {k + 1}: {text}" for k, text in enumerate(failures) if text)
+            x, v = positions[:, : len(own)], velocities[:, : len(own)]
+            out.append(Steps(x, v, *numbers, next(told, ""), seconds / len(nodes)))
+        return out

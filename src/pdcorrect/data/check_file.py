@@ -16,9 +16,8 @@ import numpy as np
 
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.engines import MOST_ITERATIONS, step_forces
-from pdcorrect.data.importing import INTEGRATOR
 from pdcorrect.data.plan import MeshPlan, draw_scene
-from pdcorrect.data.schema import REFERENCE, Array, Run, Shard, Simulation
+from pdcorrect.data.schema import INTEGRATOR, REFERENCE, Array, Run, Shard
 from pdcorrect.data.simulate import lacking, rebuilt_problems, unlike_arrays, unlike_loads
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians, shape_derivatives
@@ -45,10 +44,24 @@ def file_faults(shard: Shard) -> Iterator[str]:
     for name in ("young", "density", "mass"):
         if getattr(shard, name).min() <= 0:
             yield f"{name} is {getattr(shard, name).min():g} somewhere: expected more than 0"
-    cell = cell_size(shard)
+    low, high = shard.poisson.min(), shard.poisson.max()
+    if low < 0 or high >= 0.5:
+        yield f"poisson is from {low:g} to {high:g}: expected 0 or more and less than 0.5"
+    if float(shard.attributes["time_step"]) <= 0:
+        yield f"time_step is {shard.attributes['time_step']}: expected more than 0"
+    cell, cells = cell_size(shard), shard.cells.astype(np.int64)
+    limit = float(shard.attributes["tolerance"]) * cell * (1 + _SLACK)
     for k, simulation in enumerate(shard.simulations):
-        for message in _simulation_faults(shard, simulation, cell):
-            yield f"simulation {k:04d}: {message}"
+        reference = simulation.runs.get(REFERENCE)
+        if reference is None or reference.positions is None:
+            yield f"simulation {k:04d}: there is no rollout {REFERENCE!r}"
+        for name, run in simulation.runs.items():
+            for message in (
+                *_statistics_faults(run, limit),
+                *_motion_faults(shard, run, cell),
+                *_volume_faults(run, cells),
+            ):
+                yield f"simulation {k:04d}: {name}: {message}"
 
 
 def cell_size(shard: Shard) -> float:
@@ -57,57 +70,59 @@ def cell_size(shard: Shard) -> float:
     return float(np.cbrt(volumes.mean()))
 
 
-def _simulation_faults(shard: Shard, simulation: Simulation, cell: float) -> Iterator[str]:
-    reference = simulation.runs.get(REFERENCE)
-    if reference is None or reference.positions is None:
-        yield f"there is no rollout {REFERENCE!r}"
-    yield from volume_faults(shard, simulation)
-    for name, run in simulation.runs.items():
-        for message in _run_faults(shard, run, cell):
-            yield f"{name}: {message}"
-
-
-def _run_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
+def _statistics_faults(run: Run, limit: float) -> Iterator[str]:
+    """What a run says of itself: error estimates above the limit (m), inverted cells."""
     errors = run.statistics.get("error_estimates")
-    limit = float(shard.attributes["tolerance"]) * cell
-    if errors is not None and errors.max() > limit * (1 + _SLACK):
+    if errors is not None and errors.max() > limit:
         yield (
             f"the solver's error estimate is {errors.max():.3g} m after step "
             f"{errors.argmax() + 1}: expected at most {limit:.3g} m"
         )
+    ratios = run.statistics.get("smallest_volume_ratios")
+    if ratios is not None and ratios.min() <= 0:
+        yield f"det F is {ratios.min():.3g} after step {ratios.argmin() + 1}"
+
+
+def _motion_faults(shard: Shard, run: Run, cell: float) -> Iterator[str]:
+    """What does not start at rest, and held components that move."""
     if run.positions is not None:
-        away = _distance(run.positions[:1], shard.points)
+        away = float(np.abs(run.positions[0] - shard.points).max())
         if away > _rounding(run.positions, shard.points, cell):
             yield f"frame 0 is {away:.3g} m off the rest shape"
-    if run.velocities is not None:
-        yield from _speed_faults(run.velocities, shard.free)
     for name in ("positions", "predictions"):
         values = getattr(run, name)
-        if values is None or shard.free.all():
+        if values is None:
             continue
-        away = _distance(values, shard.points, ~shard.free)
-        if away > _rounding(values, shard.points, cell):
-            yield f"held nodes are up to {away:.3g} m off their place in its {name}"
-
-
-def _speed_faults(velocities: Array, free: Array) -> Iterator[str]:
-    """Velocities (m/s) at the start, and of what is held."""
-    if velocities[0].any():
-        yield f"its velocities are up to {np.abs(velocities[0]).max():.3g} m/s in frame 0"
-    held = np.abs(velocities[:, ~free])
-    if held.any():
-        yield f"held nodes have velocities of up to {held.max():.3g} m/s"
-
-
-def _distance(values: Array, points: Array, where: Array | None = None) -> float:
-    """Largest difference of a component from its rest position, m."""
-    moved = np.abs(values - points)
-    return float(moved.max() if where is None else moved[:, where].max())
+        moved = np.where(shard.free, 0.0, np.abs(values - shard.points))
+        row, node, axis = np.unravel_index(moved.argmax(), moved.shape)
+        if moved.max() > _rounding(values, shard.points, cell):
+            yield (
+                f"node {node} is held in {'xyz'[axis]} and {moved.max():.3g} m off its place in "
+                f"row {row} of its {name}: expected clamps that do not move"
+            )
+    if run.velocities is not None:
+        if run.velocities[0].any():
+            yield f"its velocities are up to {np.abs(run.velocities[0]).max():.3g} m/s in frame 0"
+        held = np.abs(run.velocities[:, ~shard.free])
+        if held.any():
+            yield f"held nodes have velocities of up to {held.max():.3g} m/s"
 
 
 def _rounding(values: Array, points: Array, cell: float) -> float:
     """How far stored positions may be off for being rounded, m."""
     return float(4 * np.finfo(values.dtype).eps * np.abs(points).max() + 1e-9 * cell)
+
+
+def _volume_faults(run: Run, cells: Array) -> Iterator[str]:
+    """Cells whose centre a run turns inside out, on the coarse nodes of what is stored."""
+    slopes = shape_derivatives(_CENTRE)[:, 0]  # (3, 8)
+    for name in ("positions", "predictions"):
+        for row, frame in enumerate(() if (x := getattr(run, name)) is None else x):
+            a, b, c = np.matmul(slopes, frame[cells]).transpose(1, 0, 2)
+            volumes = np.einsum("ni,ni->n", a, np.cross(b, c))
+            if volumes.min() <= 0:
+                yield f"cell {volumes.argmin()} is inside out in row {row} of its {name}"
+                break
 
 
 def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator[str]:
@@ -162,34 +177,6 @@ def _same(found: Any, wanted: Any) -> bool:
     return bool(found == wanted)
 
 
-def volume_faults(shard: Shard, simulation: Simulation) -> Iterator[str]:
-    """Cells that a run turns inside out: by its statistics, and by det F at their centres.
-
-    The latter on the coarse nodes, of what is stored; det F at quadrature points, and on the
-    mesh of the reference, is in the statistics alone.
-    """
-    cells = shard.cells.astype(np.int64)
-    for name, run in simulation.runs.items():
-        ratios = run.statistics.get("smallest_volume_ratios")
-        if ratios is not None and ratios.min() <= 0:
-            yield f"{name}: det F is {ratios.min():.3g} after step {ratios.argmin() + 1}"
-        for what, values in (("positions", run.positions), ("predictions", run.predictions)):
-            if values is None:
-                continue
-            inverted = np.array([_central(frame, cells).min() <= 0 for frame in values])
-            if inverted.any():
-                first = inverted.argmax()
-                yield f"{name}: a cell is inside out in its {what}, first in row {first}"
-
-
-def _central(positions: Array, cells: Array) -> Array:
-    """Determinants of the trilinear map at the cells' centres, (C,), m3."""
-    slopes = shape_derivatives(_CENTRE)[:, 0]  # (3, 8)
-    a, b, c = np.matmul(slopes, positions[cells]).transpose(1, 0, 2)
-    found: Array = np.einsum("ni,ni->n", a, np.cross(b, c))
-    return found
-
-
 def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:
     """Steps of the coarse models that come out otherwise when they are taken again.
 
@@ -222,11 +209,11 @@ def _repeated(
         max_iterations=MOST_ITERATIONS, recover=False,
     )  # fmt: skip
     for k, (simulation, problem) in enumerate(zip(shard.simulations, problems, strict=True)):
-        run, reference = simulation.runs[name], simulation.runs.get(REFERENCE)
-        pairs = {"positions": (run.positions, run.positions)}
-        if reference is not None:
-            pairs["predictions"] = (reference.positions, run.predictions)
-        for what, (starts, ends) in pairs.items():
+        run, reference = simulation.runs[name], simulation.runs[REFERENCE].positions
+        for what, starts, ends in (
+            ("positions", run.positions, run.positions),
+            ("predictions", reference, run.predictions),
+        ):
             if starts is None or ends is None:
                 continue
             spacing = np.finfo(starts.dtype).eps * np.abs(starts).max()

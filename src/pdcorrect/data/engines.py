@@ -1,8 +1,4 @@
-"""Who computes the runs of a data set: `OneByOne` on the CPU, `Batched` (a module of its own).
-
-An engine takes problems that may share meshes and materials, and gives, for each, a
-rollout or single steps from given states, on chosen nodes only.
-"""
+"""Who computes the runs of a data set: `OneByOne` on the CPU, `Batched` (a module of its own)."""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.state import State, StepResult
+from pdcorrect.state import State, Status, StepResult
 
 MOST_ITERATIONS = 300
 """Of projective dynamics in a step, without fallbacks; a load that takes more is rejected.
@@ -33,11 +29,11 @@ SolverName = Literal["pd", "newton"]
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What came of T steps, on K of a problem's nodes.
+    """What came of T steps, on the N coarse nodes of a problem.
 
     Attributes
     ----------
-    positions, velocities : (T, K, 3)
+    positions, velocities : (T, N, 3)
         After each step, m and m/s.  Steps after a failure are missing.
     iterations, error_estimates, smallest_volume_ratios : (T,)
         Error estimates in m; det F at quadrature points.
@@ -56,21 +52,22 @@ class Steps:
     seconds: float
 
 
-@dataclass(frozen=True, eq=False)
-class Job:
-    """A problem to be stepped, and the nodes whose motion is wanted."""
-
-    problem: Problem
-    nodes: NDArray[np.int64]
+def failure_of(status: Status, ratio: float) -> str:
+    """Why a step with this smallest volume ratio is of no use; empty if it is fine."""
+    if not status.ok:
+        return status.value
+    return "" if ratio > 0.0 else "a cell is inverted"
 
 
 class Engine(Protocol):
-    """Computes runs."""
+    """Computes runs of problems that may share meshes and materials."""
 
-    def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
+    def rollouts(self, problems: Sequence[Problem], steps: int, divisor: int = 1) -> list[Steps]:
         """Each problem from rest, ``steps`` time steps, each cut into ``divisor`` ones."""
 
-    def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
+    def predictions(
+        self, problems: Sequence[Problem], states: Sequence[Sequence[State]]
+    ) -> list[Steps]:
         """One step from each state of each problem, as long as they all succeed."""
 
     def describe(self) -> dict[str, str]:
@@ -83,7 +80,7 @@ class OneByOne:
     Parameters
     ----------
     solver : {"pd", "newton"}
-        "pd" without fallbacks and with at most `MOST_ITERATIONS`.
+        "pd" without fallbacks and with at most `MOST_ITERATIONS`, unless it may ``recover``.
     tolerance : float
         Of the coarse cell size.
     adds_up : bool
@@ -91,36 +88,40 @@ class OneByOne:
         add up.
     """
 
-    def __init__(self, solver: SolverName, tolerance: float, adds_up: bool = False) -> None:
+    def __init__(
+        self, solver: SolverName, tolerance: float, adds_up: bool = False, *, recover: bool = False
+    ) -> None:
         self._solver, self._tolerance, self._adds_up = solver, tolerance, adds_up
+        self._options: dict[str, Any] = (
+            {} if recover else {"max_iterations": MOST_ITERATIONS, "recover": False}
+        )
 
-    def rollouts(self, jobs: Sequence[Job], steps: int, divisor: int = 1) -> list[Steps]:
-        """See `Engine`."""
-        return self._run(jobs, [[None] * steps for _ in jobs], divisor)
+    def rollouts(self, problems: Sequence[Problem], steps: int, divisor: int = 1) -> list[Steps]:
+        return self._run(problems, [[None] * steps for _ in problems], divisor)
 
-    def predictions(self, jobs: Sequence[Job], states: Sequence[Sequence[State]]) -> list[Steps]:
-        """See `Engine`."""
-        return self._run(jobs, states, 1)
+    def predictions(
+        self, problems: Sequence[Problem], states: Sequence[Sequence[State]]
+    ) -> list[Steps]:
+        return self._run(problems, states, 1)
+
+    def describe(self) -> dict[str, str]:
+        return {"solver": self._solver, "engine": "one by one on the CPU"}
 
     def _run(
-        self, jobs: Sequence[Job], starts: Sequence[Sequence[State | None]], divisor: int
+        self, problems: Sequence[Problem], starts: Sequence[Sequence[State | None]], divisor: int
     ) -> list[Steps]:
         """Frames of each problem, from given states or, where None, from the one before."""
         steppers: dict[int, Any] = {}
         out = []
-        for job, states in zip(jobs, starts, strict=True):
+        for problem, states in zip(problems, starts, strict=True):
             began = time.perf_counter()
-            stepper = self._stepper(steppers, job.problem, divisor)
-            frames, failure = _frames(stepper, job, states, divisor)
-            columns = [np.stack(column) for column in zip(*frames, strict=True)]
-            positions, velocities, iterations, errors, ratios = columns
+            stepper = self._stepper(steppers, problem, divisor)
+            frames, failure = _frames(stepper, problem, states, divisor)
+            columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
+            positions, velocities, *numbers = columns
             seconds = time.perf_counter() - began
-            out.append(Steps(positions, velocities, iterations, errors, ratios, failure, seconds))
+            out.append(Steps(positions, velocities, *numbers, failure, seconds))
         return out
-
-    def describe(self) -> dict[str, str]:
-        """See `Engine`."""
-        return {"solver": self._solver, "engine": "one by one on the CPU"}
 
     def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:
         """One stepper, without loads, for all problems on the same mesh."""
@@ -132,9 +133,8 @@ class OneByOne:
                 known[key] = Newton(unloaded, tolerance, time_step=step)
             else:
                 known[key] = ProjectiveDynamics(
-                    unloaded, tolerance, time_step=step, max_iterations=MOST_ITERATIONS,
-                    recover=False,
-                )  # fmt: skip
+                    unloaded, tolerance, time_step=step, **self._options
+                )
         return known[key]
 
 
@@ -146,25 +146,22 @@ def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Arr
 
 
 def _frames(
-    stepper: ImplicitStepper, job: Job, starts: Sequence[State | None], divisor: int
+    stepper: ImplicitStepper, problem: Problem, starts: Sequence[State | None], divisor: int
 ) -> tuple[list[tuple[Any, ...]], str]:
     """The columns of `Steps` frame by frame, up to the first failure, and that one."""
     frames: list[tuple[Any, ...]] = []
-    state, failure = job.problem.initial_state(), ""
+    nodes, state, failure = problem.mesh.coarse_nodes, problem.initial_state(), ""
     for start in starts:
         state = state if start is None else start
         iterations, error, ratio = 0, 0.0, np.inf
         for _ in range(divisor):
-            result: StepResult = stepper(state, step_forces(stepper, job.problem, state))
+            result: StepResult = stepper(state, step_forces(stepper, problem, state))
             state = result.state
             iterations += result.iterations
             error = max(error, result.error_estimate)
             ratio = min(ratio, result.stats["smallest_volume_ratio"])
-            if not failure and not (result.status.ok and ratio > 0.0):
-                what = "a cell is inverted" if result.status.ok else result.status.value
-                failure = f"step {len(frames) + 1}: {what}"
-        positions, velocities = state.positions[job.nodes], state.velocities[job.nodes]
-        frames.append((positions, velocities, iterations, error, ratio))
+            failure = failure or failure_of(result.status, ratio)
+        frames.append((state.positions[nodes], state.velocities[nodes], iterations, error, ratio))
         if failure:
-            break
-    return frames, failure
+            return frames, f"step {len(frames)}: {failure}"
+    return frames, ""

@@ -29,15 +29,10 @@ SIMULATOR = "pdcorrect"
 
 @contextlib.contextmanager
 def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
-    """A new folder in ``target`` to write to, whose files are moved there in the end.
+    """A new folder in ``target``, from which files are moved there when all are written.
 
-    If writing fails, ``target`` is as it was before.
-
-    Raises
-    ------
-    OutputError
-        If files are there already, or, whatever ``overwrite``, others that would be taken for
-        parts of the same export, or if some cannot be moved.
+    Refuses files that are there already and, whatever ``overwrite``, others that would be taken
+    for parts of the same export; then, and after other errors, ``target`` is as it was before.
     """
     existed = target.is_dir()
     staging = target / "export.part"
@@ -55,11 +50,12 @@ def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
         others = [path for path in sorted(target.glob("*.h5")) if path.name not in names]
         if "meta.json" in names and others:
             raise OutputError(f"{others[0]}: is of another export: expected an empty folder.")
-        try:
-            for name in names:
-                (staging / name).replace(target / name)
-        except OSError as error:
-            raise OutputError(f"{target}: cannot be written ({error.strerror}).") from None
+        for name in names:
+            (staging / name).replace(target / name)
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written ({error.strerror or error}).") from None
     finally:
         shutil.rmtree(staging, ignore_errors=True)
         if not existed:
@@ -218,20 +214,17 @@ def export_vtu(
 def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
     """One file of the MeshGraphNet layout; returns its description."""
     first: dict[str, Any] = {}
-    try:
-        with h5py.File(path, "w") as file:
-            for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
-                fields = _fields(where, shard, simulation, base)
-                meta = _meta(fields, float(shard.attributes["time_step"]))
-                first = first or meta
-                if meta != first:
-                    raise InputError(
-                        f"{where}: {simulation.steps} steps of {shard.attributes['time_step']} s, "
-                        f"unlike the first simulation of {split}: expected the same in a split."
-                    )
-                _write_group(file.create_group(str(number)), fields, simulation.steps + 1)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None
+    with h5py.File(path, "w") as file:
+        for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
+            fields = _fields(where, shard, simulation, base)
+            meta = _meta(fields, float(shard.attributes["time_step"]))
+            first = first or meta
+            if meta != first:
+                raise InputError(
+                    f"{where}: {simulation.steps} steps of {shard.attributes['time_step']} s, "
+                    f"unlike the first simulation of {split}: expected the same in a split."
+                )
+            _write_group(file.create_group(str(number)), fields, simulation.steps + 1)
     return first
 
 

@@ -105,7 +105,7 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
     published = PUBLISHED[family]
     fine = published.fine if nodes == published.coarse else (0, sys.maxsize)
     levels: dict[int, list[Size]] = {}
-    for size in _SIZES[family]():
+    for size in _sizes(family):
         count = _count(family, size, 1)
         if nodes[0] <= count <= nodes[1] and fine[0] <= _count(family, size, 4) <= fine[1]:
             levels.setdefault(count, []).append(size)
@@ -117,25 +117,19 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
     return tuple(tuple(levels[count]) for count in sorted(levels))
 
 
-def _beam_sizes() -> Iterator[Size]:
-    """Length."""
-    return ((length,) for length in range(4, 57))
-
-
-def _cross_sizes() -> Iterator[Size]:
-    """Length, number of branches, cells by which they stick out: less than the length."""
-    every = product(range(4, 41), (2, 4), range(1, 9))
-    return (size for size in every if size[2] < size[0])
-
-
-def _weight_sizes() -> Iterator[Size]:
-    """Lengths of the supports and the pendulum, width and height of its inflated part."""
+def _sizes(family: FamilyName) -> Iterator[Size]:
+    """Beam: length.  Cross: length, number of branches, cells by which they stick out, less than
+    the length.  Weight: lengths of the supports and the pendulum, width and height of its
+    inflated part, which is shorter than the pendulum.
+    """
+    if family == "beam":
+        return ((length,) for length in range(4, 57))
+    if family == "cross":
+        arms = product(range(4, 41), (2, 4), range(1, 9))
+        return (size for size in arms if size[2] < size[0])
     second = (0, *range(6, 17, 2))
     every = product(range(6, 21), second, range(4, 21), (4, 6), (2, 3, 4))
     return (size for size in every if size[4] < size[2])
-
-
-_SIZES = {"beam": _beam_sizes, "cross": _cross_sizes, "weight": _weight_sizes}
 
 
 def _count(family: FamilyName, size: Size, k: int) -> int:
@@ -153,23 +147,12 @@ def _count(family: FamilyName, size: Size, k: int) -> int:
 
 def _place(family: FamilyName, sizes: tuple[Size, ...], rng: np.random.Generator) -> Design:
     size = sizes[int(rng.integers(len(sizes)))]
-    return _PLACES[family](size, rng)
-
-
-def _beam(size: Size, rng: np.random.Generator) -> Design:
-    return _straight("beam", size, {})
-
-
-def _cross(size: Size, rng: np.random.Generator) -> Design:
-    length, arms, out = size
-    start = int(rng.integers(1, length - 2))
-    branches = {"arms": arms, "arm_start": start, "arm_width": 2, "arm_length": out}
-    return _straight("cross", size, branches)
-
-
-def _straight(family: FamilyName, size: Size, branches: Shape) -> Design:
-    """Held at x = 0 and loaded on its last two cells."""
-    length = size[0]
+    if family == "weight":
+        return _weight(size, rng)
+    length, branches = size[0], {}
+    if family == "cross":
+        start = int(rng.integers(1, length - 2))
+        branches = {"arms": size[1], "arm_start": start, "arm_width": 2, "arm_length": size[2]}
     tip: Box = ((length - 2.0, 0.0, 0.0), (float(length), 2.0, 2.0))
     clamp: Box = ((0.0, 0.0, 0.0), (0.0, 2.0, 2.0))
     shape = {"shape": family, "cells": [length, 2, 2], **branches}
@@ -194,6 +177,3 @@ def _weight(size: Size, rng: np.random.Generator) -> Design:
     top = float(-below)
     inflated: Box = ((left - half, -half, top - high), (right + half, 2.0 + half, top))
     return Design(shape, tuple(ends), inflated, (0.0, 0.0, -1.0), _count("weight", size, 1))
-
-
-_PLACES = {"beam": _beam, "cross": _cross, "weight": _weight}

@@ -34,18 +34,21 @@ def folders_of(data: Folders) -> tuple[Path, ...]:
     found = tuple(map(Path, data))
     if not found:
         raise InputError("no data set: expected the folder of one or more.")
-    known: set[Path] = set()
-    for folder in found:
-        if folder.resolve() in known:
+    for k, folder in enumerate(found):
+        if folder.resolve() in [other.resolve() for other in found[:k]]:
             raise InputError(f"{folder}: expected each data set once.")
-        known.add(folder.resolve())
     return found
 
 
 def all_shards(folder: str | Path) -> list[Path]:
     """Files of meshes, by split and number; only their names count."""
+
+    def place(path: Path) -> tuple[int, str, int]:
+        split = path.parent.name
+        return _FIRST.index(split) if split in _FIRST else 3, split, shard_number(path)
+
     found = (path for path in Path(folder).glob(f"*/mesh-*{SUFFIX}") if _NAME.fullmatch(path.name))
-    return sorted(found, key=lambda path: (*_rank(path.parent.name), shard_number(path)))
+    return sorted(found, key=place)
 
 
 def shard_number(path: Path) -> int:
@@ -97,10 +100,6 @@ def _names(path: Path) -> set[str]:
     split = path.parent
     name = f"{split.name}/{path.stem}"
     return {name, f"{split.parent.resolve().name}/{name}"}
-
-
-def _rank(split: str) -> tuple[int, str]:
-    return (_FIRST.index(split) if split in _FIRST else len(_FIRST)), split
 
 
 Damage = dict[Path, str]
@@ -161,7 +160,7 @@ def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
     if not (folder / CONFIG).exists():
         return []
     plans = make_plan(DatasetConfig.load(folder / CONFIG))
-    paths = [folder / f"{p.name}{SUFFIX}" for p in plans if split in (None, p.split)]
+    paths = [plan.path(folder) for plan in plans if split in (None, plan.split)]
     return [path for path in paths if not path.exists()]
 
 

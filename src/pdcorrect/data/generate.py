@@ -20,20 +20,19 @@ from pdcorrect.data.plan import MeshPlan, make_plan
 from pdcorrect.data.schema import CONFIG, MANIFEST
 from pdcorrect.data.shard_reader import read_header
 from pdcorrect.data.simulate import lacking, work_per_node
-from pdcorrect.data.workers import ONE_WORKER, Workers, computed, shard_path
+from pdcorrect.data.workers import ONE_WORKER, Workers, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _LONGEST = 4
 """Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
 
 OnBegin = Callable[[int, int, Sequence[str]], None]
-"""Called once before anything is computed with how many simulations of how many are there, and
-with the names of files that are damaged and will be computed again.
+"""Called before anything is computed: how many simulations of how many are there, and the names
+of damaged files that will be computed again.
 """
-
 OnFile = Callable[[str, int, int, int], None]
 """Called with a finished file's name, how many simulations of how many are there now, and how
-many of them are new since the generation was started.
+many of them are new.
 """
 
 
@@ -56,10 +55,9 @@ class Generated:
         return all(self.simulations[name][0] == self.simulations[name][1] for name in self.asked)
 
     def __str__(self) -> str:
-        counts = {name: f"{there} of {n}" for name, (there, n) in self.simulations.items()}
         if all(there == total for there, total in self.simulations.values()):
             return "complete"
-        told = ", ".join(f"{name} {count}" for name, count in counts.items())
+        told = ", ".join(f"{name} {k} of {total}" for name, (k, total) in self.simulations.items())
         return f"{told} simulations are there; the same command goes on"
 
 
@@ -113,7 +111,7 @@ def generate(
     missing = [plan for plan in chosen if hashes[plan.name] is None]
     total, left = (sum(plan.simulations for plan in part) for part in (chosen, missing))
     if on_begin:
-        on_begin(total - left, total, [p.name for p in missing if shard_path(folder, p).exists()])
+        on_begin(total - left, total, [p.name for p in missing if p.path(folder).exists()])
     deadline = None if seconds is None else time.monotonic() + seconds
     begun = left
     for unit in computed(config, folder, _units(config, missing, workers), workers, deadline):
@@ -145,7 +143,7 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     InputError
         If there is a whole file of something else.
     """
-    path = shard_path(folder, plan)
+    path = plan.path(folder)
     if not path.exists():
         return None
     try:
@@ -213,8 +211,9 @@ def _units(
             count, work = 0, 0.0
         units[-1].append(plan)
         count, work = count + plan.simulations, work + own
-    return sorted(units, key=lambda unit: -sum(_work(config, plan) for plan in unit))
+    return sorted(units, key=lambda unit: -work(config, unit))
 
 
-def _work(config: DatasetConfig, plan: MeshPlan) -> float:
-    return plan.simulations * plan.design.nodes * work_per_node(config, plan)
+def work(config: DatasetConfig, unit: Sequence[MeshPlan]) -> float:
+    """About how much it is to compute some meshes: steps of nodes."""
+    return sum(p.simulations * p.design.nodes * work_per_node(config, p) for p in unit)

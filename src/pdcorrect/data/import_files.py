@@ -10,10 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.importing import INTEGRATOR, ImportedMotion, check_element, shard_from_arrays
-from pdcorrect.data.schema import CONFIG, SUFFIX, Shard, write_shard
+from pdcorrect.data.importing import (
+    ImportedMotion,
+    check_integrator,
+    coarse_problem,
+    shard_from_arrays,
+    shard_of,
+)
+from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Shard, write_shard
+from pdcorrect.data.simulate import arrays_of
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.fem.problem import discretise
+from pdcorrect.fem.problem import Problem
 from pdcorrect.io.trajectory import load_trajectory
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
@@ -52,24 +59,45 @@ def shard_from_trajectories(
     InputError
         If a run has no scene, another material than it, another integrator than backward
         Euler or does not start at rest, the coarse model has an element with nodes besides the
-        corners of the cells, the runs differ in mesh, material, clamps or time step,
-        a coarse run also in loads from its reference, or a check of `shard_from_arrays` fails.
+        corners of the cells, the runs' scenes differ in a section but the loads of different
+        simulations, or in times, or a check of `shard_from_arrays` fails.
     """
     references = [reference] if isinstance(reference, Trajectory) else list(reference)
     rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())
-    if not references:
-        raise InputError("no simulations: expected at least one reference.")
     if rollouts and len(rollouts) != len(references):
         raise InputError(
             f"{len(references)} references and {len(rollouts)} coarse runs: expected as many."
         )
-    shards = [
-        _shard_of_run(run, rollouts[k] if rollouts else None, dataset, split, number, best)
-        for k, run in enumerate(references)
-    ]
-    for k, shard in enumerate(shards[1:], start=1):
-        _check_same_body(k, shard, shards[0])
-    return replace(shards[0], simulations=tuple(s for one in shards for s in one.simulations))
+    if not references:
+        raise InputError("no simulations: expected at least one reference.")
+    name = "the coarse run" if rollouts else "the reference"
+    scenes = [_scene("the reference", run) for run in references]
+    for k, run in enumerate(rollouts):
+        own = _scene(name, run)
+        _check_same("the reference and the coarse run", scenes[k], own, (*_BODY, "loads"))
+        _check_times(run, references[k])
+        scenes[k] = own
+    problem = coarse_problem(name, scenes[0], _step(references[0]))
+    problems, motions = [], []
+    for k, (run, scene) in enumerate(zip(references, scenes, strict=True)):
+        _check_same(f"simulations 0 and {k}", scenes[0], scene, (*_BODY, "solver"))
+        if not np.isclose(_step(run), problem.time_step, rtol=1e-6):
+            raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")
+        loaded = problem.with_loads(scene.loads)
+        told = loaded.scene.with_changes(name=scene.name, time={"frames": scene.time.frames})
+        problems.append(replace(loaded, scene=told))
+        rollout = _restricted(rollouts[k], problem) if rollouts else None
+        motions.append(ImportedMotion(restrict(run, problem).positions, coarse=rollout))
+    return shard_of(arrays_of(problem), motions, problems, dataset, split, number, best)
+
+
+def _restricted(coarse: Trajectory, problem: Problem) -> Array:
+    if len(coarse.points) != len(problem.positions):
+        raise InputError(
+            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
+            f"{len(problem.positions)}: expected a run with --refine 1."
+        )
+    return restrict(coarse, problem).positions
 
 
 def import_trajectories(
@@ -137,8 +165,8 @@ def import_trajectories(
 
 _NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
 _MOTION = ("reference", "forces", "coarse", "predictions")
-_BODY = ("body", "material", "materials", "clamps", "loads", "damping")
-"""Sections of a scene in which a reference and its coarse run must agree."""
+_BODY = ("body", "material", "materials", "clamps", "damping")
+"""Sections of a scene in which all simulations of a file agree."""
 
 
 def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool) -> Shard:
@@ -177,36 +205,6 @@ def _names_of(number: int, arrays: Mapping[str, Array]) -> dict[str, str]:
     return {}
 
 
-def _shard_of_run(
-    run: Trajectory,
-    coarse: Trajectory | None,
-    dataset: str,
-    split: str,
-    number: int,
-    best: bool,
-) -> Shard:
-    scene = _scene("the reference", run)
-    if coarse is not None:
-        scene = _scene_of_coarse(coarse, run, scene)
-    check_element("the reference" if coarse is None else "the coarse run", scene)
-    problem = discretise(scene)
-    step = _uniform_step(run)
-    if coarse is not None and len(coarse.points) != len(problem.positions):
-        raise InputError(
-            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
-            f"{len(problem.positions)}: expected a run with --refine 1."
-        )
-    rollout = None if coarse is None else restrict(coarse, problem).positions
-    motion = ImportedMotion(restrict(run, problem).positions, coarse=rollout)
-    materials = problem.materials
-    return shard_from_arrays(
-        problem.mesh.positions, problem.mesh.cells, [motion],
-        free=problem.free[: len(problem.mesh.positions)], young=materials.young,
-        poisson=materials.poisson, density=materials.density, time_step=step,
-        dataset=dataset, split=split, number=number, scene=scene, best=best,
-    )  # fmt: skip
-
-
 def _scene(name: str, run: Trajectory) -> Scene:
     """The scene of a run that a file of a data set can be made of."""
     if not run.scene_toml:
@@ -220,12 +218,8 @@ def _scene(name: str, run: Trajectory) -> Scene:
             "the scene's; for others use shard_from_arrays."
         )
     scene = Scene.from_toml(run.scene_toml)
-    for found in (scene.time.integrator, run.attributes.get("integrator", INTEGRATOR)):
-        if found != INTEGRATOR:
-            raise InputError(
-                f"{name} has the integrator {found!r}: expected {INTEGRATOR!r}, for the velocities "
-                "of a data set are backward differences of its positions."
-            )
+    check_integrator(name, scene.time.integrator)
+    check_integrator(name, str(run.attributes.get("integrator", INTEGRATOR)))
     if run.times[0] != 0 or run.velocities[0].any():
         raise InputError(
             f"{name} starts at {run.times[0]:g} s with velocities up to "
@@ -234,15 +228,13 @@ def _scene(name: str, run: Trajectory) -> Scene:
     return scene
 
 
-def _scene_of_coarse(coarse: Trajectory, run: Trajectory, reference: Scene) -> Scene:
-    """The scene of a coarse run, if it simulates the same as the reference."""
-    scene = _scene("the coarse run", coarse)
-    for section in _BODY:
-        if getattr(scene, section) != getattr(reference, section):
-            raise InputError(
-                f"the scenes of the reference and the coarse run differ in {section}: expected "
-                f"equal {', '.join(_BODY)}."
-            )
+def _check_same(names: str, one: Scene, other: Scene, sections: Sequence[str]) -> None:
+    for section in sections:
+        if getattr(one, section) != getattr(other, section):
+            raise InputError(f"the scenes of {names} differ in {section}: expected equal ones.")
+
+
+def _check_times(coarse: Trajectory, run: Trajectory) -> None:
     if coarse.times.shape != run.times.shape or not np.allclose(
         coarse.times, run.times, rtol=1e-6, atol=0
     ):
@@ -250,24 +242,10 @@ def _scene_of_coarse(coarse: Trajectory, run: Trajectory, reference: Scene) -> S
             f"the coarse run has {len(coarse)} steps up to {coarse.times[-1]:g} s, the reference "
             f"{len(run)} up to {run.times[-1]:g} s: expected equal times."
         )
-    return scene
 
 
-def _uniform_step(run: Trajectory) -> float:
-    if len(run) < 1:
-        raise InputError("the reference has no steps: expected at least one.")
+def _step(run: Trajectory) -> float:
     steps = np.diff(run.times)
-    if not np.allclose(steps, steps[0], rtol=1e-6, atol=0):
-        raise InputError("the reference's frames are not equally far apart in time.")
+    if not len(steps) or not np.allclose(steps, steps[0], rtol=1e-6, atol=0):
+        raise InputError("the reference: expected one step or more, equally far apart in time.")
     return float((run.times[-1] - run.times[0]) / len(run))
-
-
-def _check_same_body(k: int, shard: Shard, first: Shard) -> None:
-    for name in ("points", "cells", "free", "young", "poisson", "density"):
-        if not np.array_equal(getattr(shard, name), getattr(first, name)):
-            raise InputError(
-                f"simulations 0 and {k} differ in {name}: expected one mesh, material and clamps "
-                "in a file."
-            )
-    if not np.isclose(shard.attributes["time_step"], first.attributes["time_step"], rtol=1e-6):
-        raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")

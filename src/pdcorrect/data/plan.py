@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,11 +22,11 @@ from pdcorrect.data.configuration import (
     DatasetConfig,
     ExtraSplit,
     FamilyName,
-    MaterialRange,
     MotionRange,
     Split,
 )
 from pdcorrect.data.families import PUBLISHED, Box, Design, draw, extreme
+from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
 
@@ -74,6 +75,10 @@ class MeshPlan:
         """Of its file, without suffix, relative to the data set's folder."""
         return f"{self.split}/mesh-{self.number:04d}"
 
+    def path(self, folder: Path) -> Path:
+        """Of its file."""
+        return folder / f"{self.name}{SUFFIX}"
+
 
 def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     """All meshes of a data set, no body twice.
@@ -98,41 +103,31 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
     return plans
 
 
-def _family(config: DatasetConfig, split: Split) -> FamilyName:
-    return (split.family if isinstance(split, ExtraSplit) else None) or config.family
-
-
-def _nodes(config: DatasetConfig, family: FamilyName) -> tuple[int, int]:
-    return config.coarse_nodes or PUBLISHED[family].coarse
-
-
 def _split(
     config: DatasetConfig, name: str, split: Split, number: int, known: set[str]
 ) -> Iterator[MeshPlan]:
     extra = split if isinstance(split, ExtraSplit) else ExtraSplit(name=name, **dict(split))
-    family = _family(config, split)
-    nodes = _nodes(config, family)
+    family = extra.family or config.family
+    nodes = config.coarse_nodes or PUBLISHED[family].coarse
     for i in range(split.meshes):
         stream = (config.seed, number, i)
         rng = np.random.default_rng(stream)
         ends = name == TRAINING and split.meshes > 1
         design = _new_design(family, nodes, i if ends else 2, rng, known)
-        young, poisson, density = _material(config.material, extra, rng)
+        low, high = extra.young or config.material.young
+        young = float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        poisson = float(rng.uniform(*(extra.poisson or config.material.poisson)))
+        density = float(rng.uniform(*config.material.density))
         first, last = (split.simulations * k // split.meshes for k in (i, i + 1))
         yield MeshPlan(
-            split=name,
-            number=i,
-            design=design,
-            young=young,
-            poisson=poisson,
-            density=density,
+            name, i, design, young, poisson, density,
             simulations=last - first,
             step=config.step * extra.step_factor,
             frames=config.frames * extra.frames_factor,
             refine=extra.refine or config.reference.refine,
             strength_factor=extra.strength_factor,
             stream=stream,
-        )
+        )  # fmt: skip
 
 
 def _new_design(
@@ -147,15 +142,6 @@ def _new_design(
         f"coarse_nodes = {as_toml(nodes)}: {_DRAWS} bodies of family {family!r} were drawn "
         f"that {len(known)} meshes have already. Ask for fewer meshes or a wider range."
     )
-
-
-def _material(
-    material: MaterialRange, extra: ExtraSplit, rng: np.random.Generator
-) -> tuple[float, float, float]:
-    low, high = extra.young or material.young
-    young = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    poisson = float(rng.uniform(*(extra.poisson or material.poisson)))
-    return young, poisson, float(rng.uniform(*material.density))
 
 
 def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
@@ -252,11 +238,8 @@ def _impulse(
 ) -> dict[str, Any]:
     """A force on the loaded part in a random direction, for a short time."""
     direction = _direction(rng)
-    force = _part_mass(config, mesh) * _strength(motion, mesh, rng) / motion.duration
-    return {
-        **_part_load(config, mesh.design.loaded, force * direction),
-        "window": [0.0, motion.duration],
-    }
+    load = _part_load(config, mesh, _strength(motion, mesh, rng), direction, motion.duration)
+    return {**load, "window": [0.0, motion.duration]}
 
 
 def _stretch(
@@ -267,11 +250,8 @@ def _stretch(
     across = rng.normal(size=3)
     across -= axis * (across @ axis)
     across *= rng.uniform(*motion.transverse) / np.linalg.norm(across)
-    force = _part_mass(config, mesh) * _strength(motion, mesh, rng)
-    return {
-        **_part_load(config, mesh.design.loaded, force * (axis + across)),
-        "ramp": motion.duration,
-    }
+    load = _part_load(config, mesh, _strength(motion, mesh, rng), axis + across)
+    return {**load, "ramp": motion.duration}
 
 
 def _body_force(
@@ -288,16 +268,19 @@ _LOADS = {
 }  # fmt: skip
 
 
-def _part_mass(config: DatasetConfig, mesh: MeshPlan) -> float:
-    """Density times the volume of the loaded part, kg."""
+def _part_load(
+    config: DatasetConfig,
+    mesh: MeshPlan,
+    strength: float,
+    direction: np.ndarray,
+    duration: float = 1.0,
+) -> dict[str, Any]:
+    """The loaded part's mass times strength over duration, over its nodes or its volume."""
     low, high = np.array(mesh.design.loaded)
-    return float(mesh.density * np.prod(config.cell_size * (high - low)))
-
-
-def _part_load(config: DatasetConfig, part: Box, force: np.ndarray) -> dict[str, Any]:
-    """A force (N) spread over a block: equally over its coarse nodes, or over its volume."""
-    nodal = config.setting == "as-published"
+    mass = float(mesh.density * np.prod(config.cell_size * (high - low)))
     return {
-        "kind": "force", "force": force.tolist(), "region": _region(part, config.cell_size),
-        "distribution": "nodal" if nodal else "consistent",
-    }  # fmt: skip
+        "kind": "force",
+        "force": (mass * strength / duration * direction).tolist(),
+        "region": _region(mesh.design.loaded, config.cell_size),
+        "distribution": "nodal" if config.setting == "as-published" else "consistent",
+    }

@@ -58,6 +58,8 @@ REFERENCE, PLAIN, BEST, TOTAL_MASS = "reference", "plain", "best", "total-mass"
 """Runs: the truth, and the coarse models, see `pdcorrect.fem.problem`."""
 CONVERGED = "time-converged"
 """Run: the reference with smaller time steps."""
+INTEGRATOR = "backward-euler"
+"""The one that velocities and predictions of a data set suppose."""
 SUFFIX = ".h5"
 CONFIG, MANIFEST = "config.toml", "manifest.json"
 """Files of a data set besides those of its meshes."""
@@ -70,7 +72,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One model's answer, on the coarse nodes.
+    """One model's answer on the coarse nodes, see the layout.
 
     Attributes
     ----------
@@ -79,10 +81,8 @@ class Run:
     predictions : (T, N, 3) or None
         Positions after one step from each frame of the reference but the last, m.
     statistics : mapping of str to (T,) arrays
-        Of the rollout, or of the predictions where there is none: ``iterations``,
-        ``error_estimates`` (m) and ``smallest_volume_ratios`` (det F at quadrature points).
+        Of the rollout, or of the predictions where there is none, see `STATISTICS`.
     attributes : mapping of str to str, int or float
-        Solver, refine, element, mass, time_step, ...
     velocities : (T+1, N, 3) or None
         Of the rollout, m/s, where they are not the differences of its positions.
     """
@@ -103,13 +103,10 @@ class Simulation:
     forces : (T, N, 3)
         Nodal forces of the plain coarse model, N.
     runs : mapping of str to Run
-        "reference" and others.
     scene_toml : str
         Of the plain coarse model; empty for imported data.
     attempt : int
-        How many draws were rejected before.
-    rejected : tuple of str
-        Why, one each.
+        How many draws were rejected before, and ``rejected`` why.
     seconds : mapping of str to float
         Cost by run.
     """
@@ -129,19 +126,9 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False)
 class Shard:
-    """One file: a mesh, its material, its simulations.
+    """One file: a mesh, its material, its simulations, by their names in the layout.
 
-    Attributes
-    ----------
-    attributes : mapping
-        dataset, split, number, setting, config_hash, time_step (s), tolerance (of the
-        cell size).
-    points, cells, free, mass, young, poisson, density
-        See the layout.
-    simulations : tuple of Simulation
-    provenance : mapping of str to str
-    content_hash : str
-        Of the file that it was read from, without provenance and cost; else empty.
+    ``content_hash`` is that of the file that it was read from, else empty.
     """
 
     attributes: Mapping[str, str | int | float]

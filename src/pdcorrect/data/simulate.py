@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,22 +18,23 @@ from pdcorrect.data.configuration import (
     VALIDATION,
     DatasetConfig,
 )
-from pdcorrect.data.engines import Engine, Job, Steps
-from pdcorrect.data.importing import discretise_stored
+from pdcorrect.data.engines import Engine, Steps
 from pdcorrect.data.plan import MeshPlan, draw_scene
 from pdcorrect.data.schema import (
     BEST,
     CONVERGED,
     PLAIN,
     REFERENCE,
+    STATISTICS,
     TOTAL_MASS,
     Run,
     Shard,
     Simulation,
 )
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.problem import BASES, Problem, discretise
-from pdcorrect.scene import Scene, best_coarse, trained_coarse
+from pdcorrect.scene import MeshFile, Scene, best_coarse, trained_coarse
 from pdcorrect.state import State
 
 
@@ -153,48 +154,25 @@ class Engines:
 
 
 @dataclass(eq=False)
-class _Meshed:
-    """A mesh plan with its discretisations, one for each model."""
-
-    plan: MeshPlan
-    models: dict[str, Model]
-    problems: dict[str, Problem]
-
-    @classmethod
-    def create(cls, config: DatasetConfig, plan: MeshPlan) -> _Meshed:
-        scene = draw_scene(config, plan, 0)
-        wanted = models(config, plan)
-        problems: dict[str, Problem] = {}
-        known: dict[tuple[int, bool], Problem] = {}
-        for name, model in wanted.items():
-            key = (model.refine, model.best)
-            if key not in known:
-                known[key] = discretise(
-                    _better(scene, config.setting) if model.best else scene, model.refine
-                )
-            problems[name] = known[key]
-            if model.heavy:
-                whole = float(problems[REFERENCE].mass.sum())
-                problems[name] = problems[name].with_total_mass(whole)
-        return cls(plan, wanted, problems)
-
-
-@dataclass(eq=False)
 class _Draft:
     """A simulation in the making.
 
     Attributes
     ----------
+    plan : MeshPlan
+    models, problems : dict of str to Model and to Problem
+        Of the mesh by run, without this simulation's loads.
     number : int
         On its mesh.
     scene : Scene
         Of the attempt under way.
-    steps : dict of str to Steps
-        Rollouts of the attempt by run.
-    predictions : dict of str to Steps
+    steps, predictions : dict of str to Steps
+        Of the attempt by run.
     """
 
-    meshed: _Meshed
+    plan: MeshPlan
+    models: dict[str, Model]
+    problems: dict[str, Problem]
     number: int
     scene: Scene
     attempt: int = 0
@@ -209,13 +187,12 @@ class _Draft:
 
     def wants(self, name: str) -> bool:
         """Whether a run belongs to this simulation."""
-        model = self.meshed.models.get(name)
-        return model is not None and (not model.sample or self.number == 0)
+        model = self.models.get(name)
+        return model is not None and not (model.sample and self.number)
 
-    def job(self, name: str) -> Job:
-        """A run under this simulation's load."""
-        problem = self.meshed.problems[name].with_loads(self.scene.loads)
-        return Job(problem, problem.mesh.coarse_nodes)
+    def loaded(self, name: str) -> Problem:
+        """A run's problem under this simulation's load."""
+        return self.problems[name].with_loads(self.scene.loads)
 
     def keep(self, kept: dict[str, Steps], name: str, steps: Steps) -> None:
         """Note a run, or why it is of no use."""
@@ -231,15 +208,15 @@ class _Draft:
         ConvergenceError
             If there were too many.
         """
-        plan, attempt = self.meshed.plan, self.attempt + 1
+        attempt = self.attempt + 1
         if attempt == MOST_ATTEMPTS:
             raise ConvergenceError(
-                f"{plan.name}, simulation {self.number}: {attempt} loads were drawn and all "
+                f"{self.plan.name}, simulation {self.number}: {attempt} loads were drawn and all "
                 f"rejected, the last one by {self.rejected[-1]}. Ask for weaker loads or stiffer "
                 "materials."
             )
-        scene = draw_scene(config, plan, self.number, attempt)
-        return _Draft(self.meshed, self.number, scene, attempt, self.rejected)
+        scene = draw_scene(config, self.plan, self.number, attempt)
+        return replace(self, scene=scene, attempt=attempt, steps={}, predictions={})
 
 
 def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines) -> list[Shard]:
@@ -259,105 +236,101 @@ def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines)
     ConvergenceError
         If a simulation is rejected `MOST_ATTEMPTS` times.
     """
-    meshes = [_Meshed.create(config, plan) for plan in plans]
-    waiting = [
-        _Draft(mesh, number, draw_scene(config, mesh.plan, number))
-        for mesh in meshes
-        for number in range(mesh.plan.simulations)
-    ]
+    waiting: list[_Draft] = []
+    for plan in plans:
+        wanted = models(config, plan)
+        problems = _problems(config, plan, wanted)
+        for k in range(plan.simulations):
+            waiting.append(_Draft(plan, wanted, problems, k, draw_scene(config, plan, k)))
     finished: dict[tuple[str, int], _Draft] = {}
     while waiting:
         _attempt(waiting, engines)
-        fine = [draft for draft in waiting if draft.alive]
-        finished |= {(draft.meshed.plan.name, draft.number): draft for draft in fine}
+        finished |= {(draft.plan.name, draft.number): draft for draft in waiting if draft.alive}
         waiting = [draft.again(config) for draft in waiting if not draft.alive]
     return [
-        _shard(
-            config,
-            mesh,
-            [finished[mesh.plan.name, k] for k in range(mesh.plan.simulations)],
-            engines,
-        )
-        for mesh in meshes
+        _shard(config, [finished[plan.name, k] for k in range(plan.simulations)], engines)
+        for plan in plans
     ]
+
+
+def _problems(
+    config: DatasetConfig, plan: MeshPlan, wanted: Mapping[str, Model]
+) -> dict[str, Problem]:
+    """A mesh's discretisations by run; of models that differ in their steps only one is made."""
+    scene = draw_scene(config, plan, 0)
+    made: dict[tuple[int, bool], Problem] = {}
+    found: dict[str, Problem] = {}
+    for name, model in wanted.items():
+        key = (model.refine, model.best)
+        if key not in made:
+            chosen = _better(scene, config.setting) if model.best else scene
+            made[key] = discretise(chosen, model.refine)
+        found[name] = made[key]
+        if model.heavy:
+            found[name] = made[key].with_total_mass(float(found[REFERENCE].mass.sum()))
+    return found
 
 
 def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
     """Compute all runs, the cheapest first; a draft that fails takes no further part."""
-    names = {name: model for d in drafts for name, model in d.meshed.models.items()}
+    names = {name: model for draft in drafts for name, model in draft.models.items()}
+
+    def wanted(name: str) -> list[_Draft]:
+        return [d for d in drafts if d.alive and d.wants(name)]
+
     for name in sorted(names, key=lambda n: (names[n].refine, names[n].divisor)):
-        chosen = [d for d in drafts if d.alive and d.wants(name)]
-        if not chosen:
-            continue
-        for draft, steps in zip(chosen, _rollouts(chosen, name, engines), strict=True):
+        chosen = wanted(name)
+        for draft, steps in zip(chosen, _rollouts(chosen, name, names[name], engines), strict=True):
             draft.keep(draft.steps, name, steps)
     for name in (n for n, model in names.items() if model.predict):
-        chosen = [d for d in drafts if d.alive]
-        if not chosen:
-            continue
-        states = [_states(d.steps[REFERENCE], d.meshed) for d in chosen]
-        found = engines.models.predictions([d.job(name) for d in chosen], states)
-        for draft, steps in zip(chosen, found, strict=True):
-            draft.keep(draft.predictions, name, steps)
+        if chosen := wanted(name):
+            problems, states = [d.loaded(name) for d in chosen], [_states(d) for d in chosen]
+            found = engines.models.predictions(problems, states)
+            for draft, steps in zip(chosen, found, strict=True):
+                draft.keep(draft.predictions, name, steps)
 
 
-def _rollouts(drafts: Sequence[_Draft], name: str, engines: Engines) -> list[Steps]:
+def _rollouts(drafts: Sequence[_Draft], name: str, model: Model, engines: Engines) -> list[Steps]:
     """One run of some drafts; each by the engine that its mesh needs."""
-    jobs = [draft.job(name) for draft in drafts]
-    model, frames = drafts[0].meshed.models[name], drafts[0].meshed.plan.frames
-    chosen = [engines.of(model, job.problem) for job in jobs]
+    problems = [draft.loaded(name) for draft in drafts]
+    chosen = [engines.of(model, problem) for problem in problems]
     found: dict[int, Steps] = {}
     for engine in {id(each): each for each in chosen}.values():
         own = [i for i, each in enumerate(chosen) if each is engine]
-        steps = engine.rollouts([jobs[i] for i in own], frames, model.divisor)
+        frames = drafts[0].plan.frames
+        steps = engine.rollouts([problems[i] for i in own], frames, model.divisor)
         found |= dict(zip(own, steps, strict=True))
-    return [found[i] for i in range(len(jobs))]
+    return [found[i] for i in range(len(problems))]
 
 
-def _states(reference: Steps, meshed: _Meshed) -> list[State]:
+def _states(draft: _Draft) -> list[State]:
     """The reference's frames but the last, on the coarse nodes (Algorithms 1 and 2)."""
-    first = meshed.problems[PLAIN].initial_state()
+    reference, step = draft.steps[REFERENCE], draft.plan.step
     later = zip(reference.positions[:-1], reference.velocities[:-1], strict=True)
-    return [first, *(State(p, v, (t + 1) * meshed.plan.step) for t, (p, v) in enumerate(later))]
+    first = draft.problems[PLAIN].initial_state()
+    return [first, *(State(p, v, (t + 1) * step) for t, (p, v) in enumerate(later))]
 
 
-def _shard(
-    config: DatasetConfig, meshed: _Meshed, drafts: Sequence[_Draft], engines: Engines
-) -> Shard:
-    plan, plain = meshed.plan, meshed.problems[PLAIN]
+def _shard(config: DatasetConfig, drafts: Sequence[_Draft], engines: Engines) -> Shard:
+    plan, plain = drafts[0].plan, drafts[0].problems[PLAIN]
     return Shard(
         attributes={
-            "dataset": config.name,
-            "split": plan.split,
-            "number": plan.number,
-            "setting": config.setting,
-            "config_hash": config.hash(),
-            "time_step": plan.step,
+            "dataset": config.name, "split": plan.split, "number": plan.number,
+            "setting": config.setting, "config_hash": config.hash(), "time_step": plan.step,
             "tolerance": config.tolerance,
         },
-        points=plain.positions,
-        cells=plain.cells,
-        free=plain.free,
-        mass=plain.mass,
-        young=plain.materials.young,
-        poisson=plain.materials.poisson,
-        density=plain.materials.density,
-        simulations=tuple(
-            _simulation(draft, engines, config.setting == "converged") for draft in drafts
-        ),
-    )
+        **arrays_of(plain),
+        simulations=tuple(_simulation(draft, engines, config.setting) for draft in drafts),
+    )  # fmt: skip
 
 
-def _simulation(draft: _Draft, engines: Engines, velocities: bool) -> Simulation:
-    plan, plain = draft.meshed.plan, draft.job(PLAIN).problem
+def _simulation(draft: _Draft, engines: Engines, setting: str) -> Simulation:
+    plain, plan = draft.loaded(PLAIN), draft.plan
     times = plan.step * np.arange(plan.frames + 1)
-    every = [*draft.steps.items(), *((n + " steps", s) for n, s in draft.predictions.items())]
+    every = [*draft.steps.items(), *((f"{n} steps", s) for n, s in draft.predictions.items())]
     return Simulation(
         forces=np.stack([plain.external_forces(*span) for span in pairwise(times)]),
-        runs={
-            name: _run(draft, name, engines, velocities and name == REFERENCE)
-            for name in draft.steps
-        },
+        runs={name: _run(draft, name, engines, setting) for name in draft.steps},
         scene_toml=draft.scene.to_toml(),
         attempt=draft.attempt,
         rejected=draft.rejected,
@@ -365,18 +338,17 @@ def _simulation(draft: _Draft, engines: Engines, velocities: bool) -> Simulation
     )
 
 
-def _run(draft: _Draft, name: str, engines: Engines, velocities: bool) -> Run:
-    steps, predictions = draft.steps[name], draft.predictions.get(name)
-    problem, model = draft.meshed.problems[name], draft.meshed.models[name]
+def _run(draft: _Draft, name: str, engines: Engines, setting: str) -> Run:
+    model, problem, steps = draft.models[name], draft.problems[name], draft.steps[name]
+    predictions = draft.predictions.get(name)
     rest = problem.positions[problem.mesh.coarse_nodes]
+    velocities = None
+    if setting == "converged" and name == REFERENCE:
+        velocities = np.concatenate([np.zeros_like(rest)[None], steps.velocities])
     return Run(
         positions=np.concatenate([rest[None], steps.positions]),
         predictions=None if predictions is None else predictions.positions,
-        statistics={
-            "iterations": steps.iterations,
-            "error_estimates": steps.error_estimates,
-            "smallest_volume_ratios": steps.smallest_volume_ratios,
-        },
+        statistics={key: getattr(steps, key) for key in STATISTICS},
         attributes={
             **engines.of(model, problem).describe(),
             "refine": model.refine,
@@ -384,11 +356,9 @@ def _run(draft: _Draft, name: str, engines: Engines, velocities: bool) -> Run:
             "element": problem.element,
             "mass": problem.mass_rule,
             "total_mass": float(problem.mass.sum()),
-            "time_step": draft.meshed.plan.step / model.divisor,
+            "time_step": draft.plan.step / model.divisor,
         },
-        velocities=(
-            np.concatenate([np.zeros_like(rest)[None], steps.velocities]) if velocities else None
-        ),
+        velocities=velocities,
     )
 
 
@@ -396,12 +366,18 @@ FORCE_ERROR = 1e-5
 """Largest difference of loads from the stored ones, over their largest; those are float32."""
 
 
+def discretise_stored(scene: Scene, shard: Shard, refine: int = 1) -> Problem:
+    """The problem of a scene in a file, on the file's own mesh if its body is a mesh file."""
+    if not isinstance(scene.body, MeshFile):
+        return discretise(scene, refine)
+    mesh = HexMesh.create(shard.points, shard.cells.astype(np.int64))
+    return discretise(scene, refine, mesh=mesh)
+
+
 def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem]:
     """The problem of each simulation of a file, discretised as one of its runs was.
 
-    Bodies from mesh files are discretised on the file's own mesh.
-
-    Problems of one file share mesh, operators and masses.
+    They share mesh, operators and masses.
 
     Parameters
     ----------
@@ -428,7 +404,7 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
             "`pdcorrect dataset generate` made, for it has to be stepped again."
         )
     scenes = [Scene.from_toml(s.scene_toml, f"{path}, a scene") for s in shard.simulations]
-    plain = discretise_stored(scenes[0], shard.points, shard.cells)
+    plain = discretise_stored(scenes[0], shard)
     wrong = unlike_arrays(plain, shard)
     for k, scene in enumerate([] if wrong else scenes):
         step = unlike_loads(plain.with_loads(scene.loads), shard.simulations[k])
@@ -446,37 +422,31 @@ def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem
         better = run == BEST or setting in ("exact", "converged")
         refine = int(stored.attributes.get("refine", 1))
         scene = _better(scenes[0], setting) if better else scenes[0]
-        problem = discretise_stored(scene, shard.points, shard.cells, refine)
-    return [_under(problem, scene) for scene in scenes]
+        problem = discretise_stored(scene, shard, refine)
+    loaded = [(problem.with_loads(scene.loads), scene.name) for scene in scenes]
+    return [replace(p, scene=p.scene.with_changes(name=name)) for p, name in loaded]
 
 
-def _under(problem: Problem, scene: Scene) -> Problem:
-    """The problem under another scene's loads, and by its name."""
-    loaded = problem.with_loads(scene.loads)
-    return replace(loaded, scene=loaded.scene.with_changes(name=scene.name))
+def arrays_of(problem: Problem) -> dict[str, Any]:
+    """The arrays of a `Shard` whose plain coarse model is this problem."""
+    materials = problem.materials
+    return {
+        "points": problem.positions, "cells": problem.cells, "free": problem.free,
+        "mass": problem.mass, "young": materials.young, "poisson": materials.poisson,
+        "density": materials.density,
+    }  # fmt: skip
 
 
 def unlike_arrays(problem: Problem, shard: Shard) -> list[str]:
     """Arrays of a file, and its time step, that are not those of its plain coarse problem."""
-    materials = problem.materials
-    wanted: dict[str, Any] = {
-        "points": problem.positions,
-        "cells": problem.cells,
-        "free": problem.free,
-        "mass": problem.mass,
-        "young": materials.young,
-        "poisson": materials.poisson,
-        "density": materials.density,
-    }
-    found = {name: getattr(shard, name) for name in wanted}
-    wanted["time_step"] = np.array(problem.time_step)
-    found["time_step"] = np.array(shard.attributes["time_step"])
-    return [
+    unlike = [
         name
-        for name, values in wanted.items()
-        if values.shape != found[name].shape
-        or not np.allclose(values, found[name], rtol=1e-9, atol=1e-12)
+        for name, values in arrays_of(problem).items()
+        if values.shape != getattr(shard, name).shape
+        or not np.allclose(values, getattr(shard, name), rtol=1e-9, atol=1e-12)
     ]
+    same = np.isclose(problem.time_step, shard.attributes["time_step"], rtol=1e-9, atol=1e-12)
+    return unlike if same else [*unlike, "time_step"]
 
 
 def unlike_loads(problem: Problem, simulation: Simulation, count: int = 2) -> int | None:

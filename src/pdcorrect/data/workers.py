@@ -7,7 +7,7 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from pdcorrect._files import ctrl_c_ignored
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan
-from pdcorrect.data.schema import SUFFIX, write_shard
+from pdcorrect.data.schema import write_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import InputError, require_extra
 
@@ -41,14 +41,9 @@ def produce(
         shards = simulate(config, plans, engines)
     provenance = _provenance(config, device)
     for plan, shard in zip(plans, shards, strict=True):
-        path = shard_path(folder, plan)
-        write_shard(path, replace(shard, provenance=provenance), config.dtype, overwrite=True)
+        named = replace(shard, provenance=provenance)
+        write_shard(plan.path(folder), named, config.dtype, overwrite=True)
     return plans
-
-
-def shard_path(folder: Path, plan: MeshPlan) -> Path:
-    """Where a mesh's file belongs."""
-    return folder / f"{plan.name}{SUFFIX}"
 
 
 def make_engines(config: DatasetConfig, device: str) -> Engines:
@@ -96,11 +91,8 @@ def _provenance(config: DatasetConfig, device: str) -> dict[str, str]:
     }
 
 
-_PATIENCE = 600
-"""Seconds to wait for the first worker of a scheduler."""
-
-_ANSWER = 10
-"""Seconds to wait for a scheduler's answer."""
+_PATIENCE, _ANSWER = 600, 10
+"""Seconds to wait for the first worker of a scheduler, and for a scheduler's answer."""
 
 
 @dataclass(frozen=True)
@@ -150,20 +142,25 @@ def computed(
     deadline: float | None,
 ) -> Iterator[list[MeshPlan]]:
     """Units in order of completion."""
-    if workers.scheduler is None and min(workers.count, len(units)) < 2:
+
+    def waiting() -> Iterator[list[MeshPlan]]:
+        """Units, until time is up."""
         for unit in units:
             if deadline is not None and time.monotonic() > deadline:
                 return
+            yield unit
+
+    if workers.scheduler is None and min(workers.count, len(units)) < 2:
+        for unit in waiting():
             yield produce(config, folder, unit, workers.device)
         return
-    yield from _distributed(partial(_work, config, folder.resolve()), units, workers, deadline)
+    yield from _distributed(partial(_work, config, folder.resolve()), waiting(), workers)
 
 
 def _distributed(
     work: Callable[[list[MeshPlan], str], list[MeshPlan]],
-    units: Iterable[list[MeshPlan]],
+    waiting: Iterator[list[MeshPlan]],
     workers: Workers,
-    deadline: float | None,
 ) -> Iterator[list[MeshPlan]]:
     """The same on Dask workers: a unit is handed out when a worker is free."""
     distributed = require_extra("distributed", "cluster")
@@ -174,18 +171,15 @@ def _distributed(
             raise InputError(
                 f"--scheduler: no worker joined in {_PATIENCE} s: expected one or more."
             ) from None
-        waiting = iter(units)
         running = distributed.as_completed(raise_errors=True)
 
         def hand_out() -> None:
             """Keep every worker busy, also those that have joined since."""
             while running.count() < sum(client.nthreads().values()):
-                late = deadline is not None and time.monotonic() > deadline
-                unit = None if late else next(waiting, None)
+                unit = next(waiting, None)
                 if unit is None:
                     return
-                call = client.submit(work, unit, workers.device, pure=False)
-                running.add(call)
+                running.add(client.submit(work, unit, workers.device, pure=False))
 
         hand_out()
         for future in running:
@@ -213,10 +207,11 @@ def local_cluster(count: int) -> Any:
     Its workers are named 0, 1, ..., by which each finds a GPU of its own.
     """
     distributed = require_extra("distributed", "cluster")
-    names = {"n_workers": count, "threads_per_worker": 1, "processes": True}
-    quiet = {"silence_logs": logging.CRITICAL}  # errors come with the results
     with ctrl_c_ignored():
-        return distributed.LocalCluster(**names, **quiet, dashboard_address=":0", memory_limit=0)
+        return distributed.LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=":0",
+            memory_limit=0, silence_logs=logging.CRITICAL,  # errors come with the results
+        )  # fmt: skip
 
 
 @contextlib.contextmanager
@@ -240,12 +235,9 @@ def _work(
     config: DatasetConfig, folder: Path, plans: list[MeshPlan], device: str
 ) -> list[MeshPlan]:
     """`produce` on a Dask worker; its name says which GPU of the machine is its own."""
-    if device == "cuda":
-        from distributed import get_worker
-
-        name = str(get_worker().name)
-        if name.isdigit():
-            device = _own_gpu(int(name))
+    name = str(require_extra("distributed", "cluster").get_worker().name)
+    if device == "cuda" and name.isdigit():
+        device = _own_gpu(int(name))
     return produce(config, folder, plans, device)
 
 
@@ -259,18 +251,11 @@ def visible_gpus() -> list[str]:
 
 
 def _own_gpu(worker: int) -> str:
-    """The device of a worker, by its number.
+    """The device of a worker, by its number, beside which its process sees no other.
 
-    Where CUDA has not started yet the process sees no other: kernels that are compiled for the
-    first GPU are then found in the caches by the workers of all others.
+    Kernels that are compiled for the first GPU are then found in the caches by all workers.
     """
-    import torch
-
-    count = torch.cuda.device_count()
-    if count < 2:
-        return "cuda"
-    if not torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
-        os.environ["CUDA_VISIBLE_DEVICES"] = visible_gpus()[worker % count]
-        if torch.cuda.device_count() == 1:
-            return "cuda"
-    return f"cuda:{worker % count}"
+    gpus = visible_gpus()
+    if len(gpus) > 1:
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[worker % len(gpus)]
+    return "cuda"

@@ -22,8 +22,7 @@ from pdcorrect.corrector.model_description import ModelRecord
 from pdcorrect.corrector.model_io import LoadedModel, save_model, weights_digest
 from pdcorrect.data.configuration import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
-from pdcorrect.data.importing import INTEGRATOR
-from pdcorrect.data.schema import SUFFIX
+from pdcorrect.data.schema import INTEGRATOR, SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.training.batch_losses import Source, make_source
 from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
