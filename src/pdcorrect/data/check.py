@@ -31,19 +31,16 @@ from pdcorrect.fem.mesh import HexMesh
 
 _DIGITS = 6
 """Decimals, in cells, to which meshes are compared."""
+_OTHERS = (CONFIG, MANIFEST, "README.md")
+Severity = Literal["error", "warning"]
 
 
-def body_digests(shard: Shard) -> tuple[str, str]:
-    """Equal for equal meshes, and for equal meshes with equal materials.
-
-    Neither the numbering of nodes and cells nor the place in space matters.
-    """
-    scale = 1.0 / cell_size(shard)
-    points = _rounded(scale * (shard.points - shard.points.min(axis=0)))
+def mesh_digest(shard: Shard) -> str:
+    """Equal for equal meshes, whatever the numbering of nodes and cells and the place in space."""
+    points = (shard.points - shard.points.min(axis=0)) / cell_size(shard)
     centres = points[shard.cells].mean(axis=1)
-    shape = _digest(_sorted(points)) + _digest(_sorted(_rounded(centres)))
-    material = np.column_stack([shard.young, shard.poisson, shard.density])
-    return shape, shape + _digest(_sorted(np.hstack([_rounded(centres), material])))
+    rounded = (np.round(values, _DIGITS) + 0.0 for values in (points, centres))  # no minus zero
+    return "".join(_digest(rows[np.lexsort(rows.T)]) for rows in rounded)
 
 
 def load_digest(simulation: Simulation) -> str:
@@ -54,20 +51,8 @@ def load_digest(simulation: Simulation) -> str:
     return _digest(reference.positions[:2])
 
 
-def _rounded(values: Array) -> Array:
-    return np.round(values, _DIGITS) + 0.0  # no minus zero
-
-
-def _sorted(rows: Array) -> Array:
-    return rows[np.lexsort(rows.T)]
-
-
 def _digest(values: Array) -> str:
     return hashlib.sha256(np.ascontiguousarray(values).data).hexdigest()
-
-
-Severity = Literal["error", "warning"]
-_OTHERS = (CONFIG, MANIFEST, "README.md")
 
 
 @dataclass(frozen=True)
@@ -149,8 +134,8 @@ class _Check:
         Of the files that should be there.
     hashes : dict of str to str, or None
         Hashes of the files' contents by the manifest, if there is one.
-    meshes, bodies : dict of str to Path
-        First file with a mesh, and with a mesh and its material, by their digests.
+    meshes : dict of str to Path
+        First file with a mesh, by its digest.
     forces : dict of str to str
         Where forces on a mesh came first.
     origins : dict of str to dict of str to Path
@@ -164,38 +149,22 @@ class _Check:
     plans: dict[Path, MeshPlan] | None = None
     hashes: dict[str, Any] | None = None
     meshes: dict[str, Path] = field(default_factory=dict)
-    bodies: dict[str, Path] = field(default_factory=dict)
     forces: dict[str, str] = field(default_factory=dict)
     origins: dict[str, dict[str, Path]] = field(default_factory=dict)
 
-    def error(self, path: Path, message: str) -> None:
-        """Note an error."""
-        self.findings.append(Finding(path, "error", message))
-
-    def warn(self, path: Path, message: str) -> None:
-        """Note a warning."""
-        self.findings.append(Finding(path, "warning", message))
+    def note(self, path: Path, message: str, severity: Severity = "error") -> None:
+        self.findings.append(Finding(path, severity, message))
 
     def load_config(self, paths: Sequence[Path]) -> None:
         """Read the configuration and derive the files that it asks for; imports have none."""
         path = self.folder / CONFIG
         try:
-            if not path.exists() and self._imported(paths):
+            if not path.exists() and _imported(paths):
                 return
             self.config = DatasetConfig.load(path)
-            plans = make_plan(self.config)
+            self.plans = {plan.path(self.folder): plan for plan in make_plan(self.config)}
         except InputError as error:
-            self.error(path, _reason(path, error))
-            return
-        self.plans = {self.folder / f"{plan.name}{SUFFIX}": plan for plan in plans}
-
-    @staticmethod
-    def _imported(paths: Sequence[Path]) -> bool:
-        """Whether the first file that can be read was imported."""
-        for path in paths:
-            with suppress(InputError):
-                return not read_header(path).config_hash
-        return False
+            self.note(path, _reason(path, error))
 
     def load_manifest(self) -> None:
         """Read the hashes that the manifest lists; unfinished data sets have none."""
@@ -206,45 +175,42 @@ class _Check:
             content = json.loads(path.read_text(encoding="utf-8"))
             self.hashes = dict(content["files"])
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
-            self.error(path, "cannot be read: expected the hashes of all files, as JSON")
+            self.note(path, "cannot be read: expected the hashes of all files, as JSON")
             return
         if self.config is not None and content != manifest_content(self.config, self.hashes):
-            self.error(path, f"is not that of {CONFIG} and of the files it lists")
+            self.note(path, f"is not that of {CONFIG} and of the files it lists")
 
     def files(self, paths: list[Path]) -> None:
         """Files that are missing, and such as do not belong here."""
-        for path in sorted(set(self.plans or ()) - set(paths)):
-            self.error(path, "missing: config.toml asks for it")
-        for path in sorted(path for path in self.folder.rglob("*") if path.is_file()):
-            if path.suffix == ".part":
-                text = "left over from a write that was interrupted; it may be deleted"
-                self.warn(path, text)
-            elif path not in paths and path not in [self.folder / name for name in _OTHERS]:
-                self.warn(path, "not part of the data set")
-        whole = self.plans is not None and set(self.plans) <= set(paths)
-        if whole and not (self.folder / MANIFEST).exists():
-            self.warn(self.folder, f"no {MANIFEST}: start generate again to write it")
+        missing = set(self.plans or ()) - set(paths)
+        for path in sorted(missing):
+            self.note(path, f"missing: {CONFIG} asks for it")
+        known = {*paths, *(self.folder / name for name in _OTHERS)}
+        for path in sorted(set(filter(Path.is_file, self.folder.rglob("*"))) - known):
+            self.note(path, "not part of the data set", "warning")
+        if self.plans is not None and not missing and not (self.folder / MANIFEST).exists():
+            text = f"no {MANIFEST}: start generate again to write it"
+            self.note(self.folder, text, "warning")
 
     def shard(self, path: Path) -> None:
         """Check one file, alone and against those before it."""
         try:
             shard = read_shard(path)
         except InputError as error:
-            self.error(path, _reason(path, error))
+            self.note(path, _reason(path, error))
             return
         found, wanted = shard.attributes["config_hash"], self.config and self.config.hash()
         if wanted is not None and found != wanted:
-            self.error(
-                path, f"of another data set: its config_hash is {found!r}: expected {wanted!r}"
-            )
+            told = f"its config_hash is {found!r}: expected {wanted!r}"
+            self.note(path, f"of another data set: {told}")
             return
         try:
             HexMesh.create(shard.points, shard.cells.astype(np.int64))
         except MeshError as error:
-            self.error(path, f"its mesh cannot be used: {str(error).removesuffix('.')}")
+            self.note(path, f"its mesh cannot be used: {str(error).removesuffix('.')}")
             return
         for message in (*file_faults(shard), *self._config_faults(path, shard)):
-            self.error(path, message)
+            self.note(path, message)
         self._origin(path, shard)
         self._repetitions(path, shard)
 
@@ -253,18 +219,19 @@ class _Check:
         for name, value in {"split": path.parent.name, "number": shard_number(path)}.items():
             if shard.attributes[name] != value:
                 yield f"its {name} is {shard.attributes[name]!r}: expected {value!r}"
-        plan = self.plans.get(path) if self.plans is not None else None
         name = self._short(path).removesuffix(SUFFIX)
         if self.hashes is not None and self.hashes.get(name) != shard.content_hash:
             yield f"its content is not that of which {MANIFEST} has the hash"
-        if self.plans is not None and plan is None:
-            yield "config.toml does not ask for it"
-        if plan is not None and self.config is not None:
-            found = list(plan_faults(self.config, plan, shard))
-            yield from found
-            if not found and self.repeat:
-                limit = float(shard.attributes["tolerance"]) * cell_size(shard)
-                yield from step_faults(path, shard, self.repeat, limit)
+        if self.config is None or self.plans is None:
+            return
+        if path not in self.plans:
+            yield f"{CONFIG} does not ask for it"
+            return
+        found = list(plan_faults(self.config, self.plans[path], shard))
+        yield from found
+        if not found and self.repeat:
+            limit = float(shard.attributes["tolerance"]) * cell_size(shard)
+            yield from step_faults(path, shard, self.repeat, limit)
 
     def _origin(self, path: Path, shard: Shard) -> None:
         """Changes of the code and of the device between files, where they tell."""
@@ -275,32 +242,40 @@ class _Check:
                 continue
             known = self.origins.setdefault(what, {})
             if known and own not in known:
-                self.warn(path, told.format(self._short(next(iter(known.values()))), own))
+                first = self._short(next(iter(known.values())))
+                self.note(path, told.format(first, own), "warning")
             known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
-        """Meshes, materials and loads that came before."""
-        shape, body = body_digests(shard)
-        first, twin = self.meshes.setdefault(shape, path), self.bodies.setdefault(body, path)
-        if first.parent != path.parent and self.plans is None:
-            self.warn(
-                path,
-                f"its mesh is that of {self._short(first)}: figures of this split are of one body "
-                "under other loads, not of unseen bodies",
-            )
-        elif first.parent != path.parent:
-            self.error(path, f"leakage: its mesh is that of {self._short(first)}, in another split")
-        elif twin != path:
-            self.error(path, f"its mesh and material are those of {self._short(twin)}")
+        """Meshes and loads that came before."""
+        shape = mesh_digest(shard)
+        first = self.meshes.setdefault(shape, path)
+        if first.parent != path.parent:
+            told = f"its mesh is that of {self._short(first)}"
+            if self.plans is None:
+                told += (
+                    ": figures of this split are of one body under other loads, not of unseen "
+                    "bodies"
+                )
+                self.note(path, told, "warning")
+            else:
+                self.note(path, f"leakage: {told}, in another split")
         for k, simulation in enumerate(shard.simulations):
-            key = shape + load_digest(simulation)
             here = f"simulation {k:04d} of {self._short(path)}"
-            before = self.forces.setdefault(key, here)
+            before = self.forces.setdefault(shape + load_digest(simulation), here)
             if before != here:
-                self.error(path, f"simulation {k:04d} has the mesh and the forces of {before}")
+                self.note(path, f"simulation {k:04d} has the mesh and the forces of {before}")
 
     def _short(self, path: Path) -> str:
         return path.relative_to(self.folder).as_posix()
+
+
+def _imported(paths: Sequence[Path]) -> bool:
+    """Whether the first file that can be read was imported."""
+    for path in paths:
+        with suppress(InputError):
+            return not read_header(path).config_hash
+    return False
 
 
 def _reason(path: Path, error: InputError) -> str:
