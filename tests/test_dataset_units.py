@@ -30,7 +30,7 @@ def units(batch=40):
 
 
 def work(unit):
-    return generate.work(SHARED, unit)
+    return generate.unit_work(SHARED, unit)
 
 
 def test_every_mesh_is_in_one_unit_of_its_split_and_many_steps_make_small_units():

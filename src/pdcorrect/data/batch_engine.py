@@ -148,8 +148,8 @@ class _BatchLog:
             flat = apart.swapaxes(0, 1).reshape(len(nodes), -1, *apart.shape[3:])
             columns.append(flat[:, :count])
         out = []
-        for own, positions, velocities, *numbers, failures in zip(nodes, *columns, strict=True):
+        for own, x, v, iterations, estimates, ratios, failures in zip(nodes, *columns, strict=True):
             told = (f"step {k + 1}: {text}" for k, text in enumerate(failures) if text)
-            x, v = positions[:, : len(own)], velocities[:, : len(own)]
-            out.append(Steps(x, v, *numbers, next(told, ""), seconds / len(nodes)))
+            x, v, share = x[:, : len(own)], v[:, : len(own)], seconds / len(nodes)
+            out.append(Steps(x, v, iterations, estimates, ratios, next(told, ""), share))
         return out

@@ -118,9 +118,9 @@ class OneByOne:
             stepper = self._stepper(steppers, problem, divisor)
             frames, failure = _frames(stepper, problem, states, divisor)
             columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
-            positions, velocities, *numbers = columns
+            positions, velocities, iterations, errors, ratios = columns
             seconds = time.perf_counter() - began
-            out.append(Steps(positions, velocities, *numbers, failure, seconds))
+            out.append(Steps(positions, velocities, iterations, errors, ratios, failure, seconds))
         return out
 
     def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:

@@ -211,9 +211,9 @@ def _units(
             count, work = 0, 0.0
         units[-1].append(plan)
         count, work = count + plan.simulations, work + own
-    return sorted(units, key=lambda unit: -work(config, unit))
+    return sorted(units, key=lambda unit: -unit_work(config, unit))
 
 
-def work(config: DatasetConfig, unit: Sequence[MeshPlan]) -> float:
+def unit_work(config: DatasetConfig, unit: Sequence[MeshPlan]) -> float:
     """About how much it is to compute some meshes: steps of nodes."""
     return sum(p.simulations * p.design.nodes * work_per_node(config, p) for p in unit)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import h5py
 import numpy as np
@@ -119,13 +119,16 @@ def read_shard(
     with _opened(Path(path), verify=True) as file:
         lengths: Lengths = {}
         arrays = {name: _array(file, at, shape, lengths) for name, (at, _, shape) in MESH.items()}
-        _check_cells(arrays["cells"], lengths["N"])
-        count = len(file["simulations"])
+        low, high, nodes = arrays["cells"].min(), arrays["cells"].max(), lengths["N"]
+        if low < 0 or high >= nodes:
+            told = f"mesh/cells refers to nodes {low} to {high}: expected 0 to {nodes - 1}"
+            raise FileFormatError(told)
         return Shard(
             attributes={name: kind(file.attrs[name]) for name, kind in ATTRIBUTES.items()},
             **arrays,
             simulations=tuple(
-                _simulation(file, f"{k:04d}", runs, dict(lengths)) for k in range(count)
+                _simulation(file, f"{k:04d}", runs, dict(lengths))
+                for k in range(len(file["simulations"]))
             ),
             provenance={name: str(text) for name, text in file["provenance"].attrs.items()},
             content_hash=str(file.attrs[HASH]),
@@ -211,13 +214,11 @@ def _run(group: h5py.Group, wanted: Collection[str], lengths: Lengths) -> Run:
     return Run(
         **{name: found.get(name) for name in MOTION},
         statistics={name: values for name, values in found.items() if name in STATISTICS},
-        attributes={name: _value(value) for name, value in group.attrs.items()},
+        attributes={
+            name: value if isinstance(value, str) else value.item()
+            for name, value in group.attrs.items()
+        },
     )
-
-
-def _value(value: Any) -> str | int | float:
-    """An attribute as text or number."""
-    return value if isinstance(value, str) else value.item()
 
 
 def _array(group: h5py.Group, name: str, shape: tuple[int | str, ...], lengths: Lengths) -> Array:
@@ -233,10 +234,3 @@ def _array(group: h5py.Group, name: str, shape: tuple[int | str, ...], lengths: 
     if not np.isfinite(values).all():
         raise FileFormatError(f"{place} has infinite or NaN entries")
     return values
-
-
-def _check_cells(cells: Array, nodes: int) -> None:
-    if cells.min() < 0 or cells.max() >= nodes:
-        raise FileFormatError(
-            f"mesh/cells refers to nodes {cells.min()} to {cells.max()}: expected 0 to {nodes - 1}"
-        )
