@@ -124,33 +124,17 @@ def check_dataset(
 
 @dataclass(eq=False)
 class _Check:
-    """The findings so far, and what files are compared with.
-
-    Attributes
-    ----------
-    config : DatasetConfig or None
-        If it could be read.
-    plans : dict of Path to MeshPlan, or None
-        Of the files that should be there.
-    hashes : dict of str to str, or None
-        Hashes of the files' contents by the manifest, if there is one.
-    meshes : dict of str to Path
-        First file with a mesh, by its digest.
-    forces : dict of str to str
-        Where forces on a mesh came first.
-    origins : dict of str to dict of str to Path
-        First file made by each state of the code, and on each device.
-    """
+    """The findings so far, and what files are compared with."""
 
     folder: Path
     repeat: int
     findings: list[Finding] = field(default_factory=list)
-    config: DatasetConfig | None = None
-    plans: dict[Path, MeshPlan] | None = None
-    hashes: dict[str, Any] | None = None
-    meshes: dict[str, Path] = field(default_factory=dict)
-    forces: dict[str, str] = field(default_factory=dict)
-    origins: dict[str, dict[str, Path]] = field(default_factory=dict)
+    config: DatasetConfig | None = None  # if it could be read
+    plans: dict[Path, MeshPlan] | None = None  # of the files that should be there
+    hashes: dict[str, Any] | None = None  # of the files' contents, by the manifest
+    meshes: dict[str, Path] = field(default_factory=dict)  # first file with a mesh, by digest
+    forces: dict[str, str] = field(default_factory=dict)  # where forces on a mesh came first
+    origins: dict[str, dict[str, Path]] = field(default_factory=dict)  # by code, and by device
 
     def note(self, path: Path, message: str, severity: Severity = "error") -> None:
         self.findings.append(Finding(path, severity, message))

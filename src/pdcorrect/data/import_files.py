@@ -88,7 +88,8 @@ def shard_from_trajectories(
         problems.append(replace(loaded, scene=told))
         rollout = _restricted(rollouts[k], problem) if rollouts else None
         motions.append(ImportedMotion(restrict(run, problem).positions, coarse=rollout))
-    return shard_of(arrays_of(problem), motions, problems, dataset, split, number, best)
+    step = problem.time_step
+    return shard_of(arrays_of(problem), motions, problems, step, dataset, split, number, best)
 
 
 def _restricted(coarse: Trajectory, problem: Problem) -> Array:

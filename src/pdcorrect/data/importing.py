@@ -130,6 +130,7 @@ def shard_from_arrays(
         check_scene(scene)
         check_integrator("the scene", scene.time.integrator)
         problem = coarse_problem("the scene", scene, step)
+        step = problem.time_step
     if mass is not None:
         arrays["mass"] = _array("mass", mass, (nodes,))
     elif problem is not None:
@@ -137,8 +138,8 @@ def shard_from_arrays(
     else:
         arrays["mass"] = lumped(Space(mesh).mass(moduli["density"]))
     every = [motions] if isinstance(motions, ImportedMotion) else list(motions)
-    problems = step if problem is None else [problem] * len(every)
-    return shard_of(arrays, every, problems, dataset, split, number, best)
+    problems = [] if problem is None else [problem] * len(every)
+    return shard_of(arrays, every, problems, step, dataset, split, number, best)
 
 
 def check_integrator(name: str, found: str) -> None:
@@ -178,7 +179,8 @@ def portable(scene: Scene) -> Scene:
 def shard_of(
     arrays: Mapping[str, Any],
     motions: Sequence[ImportedMotion],
-    problems: Sequence[Problem] | float,
+    problems: Sequence[Problem],
+    time_step: float,
     dataset: str,
     split: str,
     number: int,
@@ -191,32 +193,30 @@ def shard_of(
     arrays : mapping of str to array
         Of mesh and material, by their names in a `Shard`.
     motions : sequence of ImportedMotion
-    problems : sequence of Problem, or float
-        The coarse model under each simulation's loads, or the time step where there is none, s.
+    problems : sequence of Problem
+        The coarse model under each simulation's loads; none where there is no scene.
     """
     if not motions:
         raise InputError("no simulations: expected at least one.")
-    known = [] if isinstance(problems, float) else problems
-    step = problems if isinstance(problems, float) else problems[0].time_step
     shard = Shard(
         attributes={
             "dataset": dataset, "split": split, "number": number, "setting": SETTING,
-            "config_hash": "", "time_step": step,
-            "tolerance": known[0].scene.solver.tolerance if known else 0.0,
+            "config_hash": "", "time_step": time_step,
+            "tolerance": problems[0].scene.solver.tolerance if problems else 0.0,
         },
         **arrays,
         simulations=(),
     )  # fmt: skip
     _refuse_faults(shard)
-    if known and (unlike := unlike_arrays(known[0], shard)):
+    if problems and (unlike := unlike_arrays(problems[0], shard)):
         raise InputError(f"the scene: its {unlike[0]} is not the one given: expected equal values.")
     given = [_given(f"simulation {k}", motion, shard) for k, motion in enumerate(motions)]
-    if known:
-        _add_steps_and_loads(given, known)
+    if problems:
+        _add_steps_and_loads(given, problems)
     if best:
-        _add_best(given, known)
-    simulations = [_simulation(each, step) for each in given]
-    for k, problem in enumerate(known):
+        _add_best(given, problems)
+    simulations = [_simulation(each, time_step) for each in given]
+    for k, problem in enumerate(problems):
         simulations[k] = replace(simulations[k], scene_toml=portable(problem.scene).to_toml())
     shard = replace(shard, simulations=tuple(simulations))
     _refuse_faults(shard)

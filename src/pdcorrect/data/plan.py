@@ -40,19 +40,16 @@ class MeshPlan:
 
     Attributes
     ----------
-    split : str
     number : int
         Of the mesh in its split.
     design : Design
         In cells.
     young, poisson, density : float
         Pa, dimensionless, kg/m3.
-    simulations : int
-    step, frames
-        Seconds and number of time steps.
+    step : float
+        s.
     refine : int
         Of the reference.
-    strength_factor : float
     stream : tuple of int
         Name of the mesh's stream of random numbers.
     """

@@ -155,29 +155,16 @@ class Engines:
 
 @dataclass(eq=False)
 class _Draft:
-    """A simulation in the making.
-
-    Attributes
-    ----------
-    plan : MeshPlan
-    models, problems : dict of str to Model and to Problem
-        Of the mesh by run, without this simulation's loads.
-    number : int
-        On its mesh.
-    scene : Scene
-        Of the attempt under way.
-    steps, predictions : dict of str to Steps
-        Of the attempt by run.
-    """
+    """A simulation in the making, at one attempt."""
 
     plan: MeshPlan
     models: dict[str, Model]
-    problems: dict[str, Problem]
-    number: int
+    problems: dict[str, Problem]  # of the mesh by run, without this simulation's loads
+    number: int  # on its mesh
     scene: Scene
     attempt: int = 0
     rejected: tuple[str, ...] = ()
-    steps: dict[str, Steps] = field(default_factory=dict)
+    steps: dict[str, Steps] = field(default_factory=dict)  # rollouts by run
     predictions: dict[str, Steps] = field(default_factory=dict)
 
     @property
@@ -201,13 +188,7 @@ class _Draft:
             self.rejected = (*self.rejected, f"{name}, {steps.failure}")
 
     def again(self, config: DatasetConfig) -> _Draft:
-        """The next attempt.
-
-        Raises
-        ------
-        ConvergenceError
-            If there were too many.
-        """
+        """The next attempt; `ConvergenceError` if there were too many."""
         attempt = self.attempt + 1
         if attempt == MOST_ATTEMPTS:
             raise ConvergenceError(
