@@ -207,25 +207,27 @@ def shard_of(
         **arrays,
         simulations=(),
     )  # fmt: skip
-    _refuse_faults(shard)
     if problems and (unlike := unlike_arrays(problems[0], shard)):
         raise InputError(f"the scene: its {unlike[0]} is not the one given: expected equal values.")
     given = [_given(f"simulation {k}", motion, shard) for k, motion in enumerate(motions)]
+    _refuse_faults(shard, given)  # before steps are taken from them
     if problems:
         _add_steps_and_loads(given, problems)
     if best:
         _add_best(given, problems)
-    simulations = [_simulation(each, time_step) for each in given]
-    for k, problem in enumerate(problems):
-        simulations[k] = replace(simulations[k], scene_toml=portable(problem.scene).to_toml())
-    shard = replace(shard, simulations=tuple(simulations))
-    _refuse_faults(shard)
-    return shard
+    shard = _refuse_faults(shard, given)
+    texts = [portable(problem.scene).to_toml() for problem in problems] or [""] * len(given)
+    told = zip(shard.simulations, texts, strict=True)
+    return replace(shard, simulations=tuple(replace(s, scene_toml=text) for s, text in told))
 
 
-def _refuse_faults(shard: Shard) -> None:
+def _refuse_faults(shard: Shard, given: Sequence[Mapping[str, Array]]) -> Shard:
+    """The shard with its simulations, in which the check of a data set would find nothing."""
+    step = float(shard.attributes["time_step"])
+    shard = replace(shard, simulations=tuple(_simulation(each, step) for each in given))
     for message in file_faults(shard):
         raise InputError(f"{message}.")
+    return shard
 
 
 def _given(where: str, motion: ImportedMotion, shard: Shard) -> dict[str, Array]:
@@ -253,9 +255,8 @@ def _given(where: str, motion: ImportedMotion, shard: Shard) -> dict[str, Array]
 def _add_steps_and_loads(given: Sequence[dict[str, Array]], problems: Sequence[Problem]) -> None:
     """Those of the coarse model where they are not given."""
     bare = [k for k, each in enumerate(given) if "predictions" not in each]
-    found = _single_steps([given[k] for k in bare], [problems[k] for k in bare])
-    for k, predictions in zip(bare, found, strict=True):
-        given[k]["predictions"] = predictions
+    for k, steps in zip(bare, _single_steps(given, problems, bare), strict=True):
+        given[k]["predictions"] = steps
     for each, problem in zip(given, problems, strict=True):
         if "forces" not in each:
             h, frames = problem.time_step, enumerate(each["reference"][:-1])
@@ -276,31 +277,32 @@ def _add_best(given: Sequence[dict[str, Array]], problems: Sequence[Problem]) ->
         )
     problem = discretise(better)
     loaded = [problem.with_loads(p.scene.loads) for p in problems]
-    for each, steps in zip(given, _single_steps(given, loaded), strict=True):
-        each["best steps"] = steps
-    for each, own in zip(given, loaded, strict=True):
-        (run,) = _moved(_engine(own).rollouts([own], len(each["forces"])))
-        each["best"] = np.concatenate([problem.positions[None], run])
+    numbers = range(len(given))
+    for k, steps in zip(numbers, _single_steps(given, loaded, numbers), strict=True):
+        run = _engine(problem).rollouts([loaded[k]], len(given[k]["reference"]) - 1)
+        frames = [problem.positions[None], *_moved(run, [k])]
+        given[k] |= {"best": np.concatenate(frames), "best steps": steps}
 
 
 def _engine(problem: Problem) -> OneByOne:
     return OneByOne("pd", problem.scene.solver.tolerance, recover=True)
 
 
-def _single_steps(given: Sequence[Mapping[str, Array]], problems: Sequence[Problem]) -> list[Array]:
-    """One step of each problem from each frame of the reference but the last."""
-    if not problems:
-        return []
+def _single_steps(
+    given: Sequence[Mapping[str, Array]], problems: Sequence[Problem], numbers: Sequence[int]
+) -> list[Array]:
+    """Of chosen simulations one step from each frame of the reference but the last."""
     h, starts = problems[0].time_step, []
-    for each in given:
-        frames = enumerate(zip(each["reference"], velocities(each["reference"], h), strict=True))
+    for reference in (given[k]["reference"] for k in numbers):
+        frames = enumerate(zip(reference, velocities(reference, h), strict=True))
         starts.append([State(x, v, t * h) for t, (x, v) in frames][:-1])
-    return _moved(_engine(problems[0]).predictions(problems, starts))
+    found = _engine(problems[0]).predictions([problems[k] for k in numbers], starts)
+    return _moved(found, numbers)
 
 
-def _moved(found: Sequence[Steps]) -> list[Array]:
+def _moved(found: Sequence[Steps], numbers: Sequence[int]) -> list[Array]:
     """The positions of steps that all succeeded."""
-    for k, steps in enumerate(found):
+    for k, steps in zip(numbers, found, strict=True):
         if steps.failure:
             raise InputError(f"simulation {k}: {steps.failure} of the coarse model.")
     return [steps.positions for steps in found]

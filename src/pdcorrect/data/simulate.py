@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -72,8 +73,9 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     """The runs of a mesh by name, the reference first."""
     best, converged = config.setting != "as-published", config.setting == "converged"
     divisor = CONVERGED_DIVISOR if converged else 1
+    truth = partial(Model, best=best, truth=True)
     found = {
-        REFERENCE: Model(mesh.refine, best=best, divisor=divisor, truth=True),
+        REFERENCE: truth(mesh.refine, divisor=divisor),
         PLAIN: Model(1, predict=not converged),
     }
     if best:
@@ -86,13 +88,9 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
         found["intermediate"] = Model(2)
     if mesh.split == EVALUATION:
         if config.converged_steps:
-            found[CONVERGED] = Model(
-                mesh.refine, best=best, divisor=config.converged_steps, truth=True
-            )
+            found[CONVERGED] = truth(mesh.refine, divisor=config.converged_steps)
         if mesh.number < config.finest_meshes:
-            found["finest"] = Model(
-                2 * mesh.refine, best=best, divisor=divisor, sample=True, truth=True
-            )
+            found["finest"] = truth(2 * mesh.refine, divisor=divisor, sample=True)
     return found
 
 
