@@ -37,15 +37,7 @@ LEAST_ERROR = 1e-30
 
 @dataclass(frozen=True, eq=False)
 class BaseErrors:
-    """Mean squared errors of the base model, m2, one a trajectory, (B,).
-
-    Attributes
-    ----------
-    one_step : (B,)
-        d1.
-    rollout : (B,)
-        D.
-    """
+    """d1 and D of the base model, m2, one a trajectory, (B,)."""
 
     one_step: Tensor
     rollout: Tensor
@@ -81,9 +73,7 @@ def body_losses(
     errors : (..., 3)
         Distances at nodes, m.
     total : callable
-        Sums of values (...) over the nodes of each body, (B,).
-    counts : (B,)
-        Nodes of each body.
+        Sums of values (...) over the nodes of each body, (B,), which has ``counts`` (B,).
     scale : (B,)
         d(j), m2.
     added : (B,)

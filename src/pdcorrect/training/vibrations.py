@@ -37,17 +37,7 @@ Array = NDArray[np.float64]
 
 
 class BodyModes(NamedTuple):
-    """Of one body.
-
-    Attributes
-    ----------
-    frequencies : (m,)
-        Angular, rad/s.
-    weighted : (m, N, 3)
-        M phi, kg^1/2.
-    squares : (m,)
-        |phi|^2 / N, 1/kg.
-    """
+    """Angular frequencies (m,), rad/s; M phi (m, N, 3), kg^1/2; |phi|^2 / N (m,), 1/kg."""
 
     frequencies: Array
     weighted: Array
@@ -78,16 +68,13 @@ class Vibrations:
     Parameters
     ----------
     bodies : sequence of BodyModes
-        Unlike ones.
-    owners : sequence of int
-        Which of them each body is, (B,).
+        Unlike ones; ``owners`` says which of them each body is, (B,).
     steps : (B,) int
         T of each body's simulation.
     time_step : float
         h, s.
     nodes : int
         Of padded tensors.
-    device : torch.device
     """
 
     def __init__(
@@ -114,13 +101,7 @@ class Vibrations:
         self._responses = torch.from_numpy(responses).to(device)
 
     def ahead(self, positions: Tensor, velocities: Tensor) -> Tensor:
-        """Mean squared distances (B,), m2, that errors will come to in the next T frames.
-
-        Parameters
-        ----------
-        positions, velocities : (B, N, 3)
-            Errors, m and m/s.
-        """
+        """Mean squared distances (B,), m2, that errors (B, N, 3) come to in the next T frames."""
         weighted = self._weighted.index_select(0, self._owners).to(positions.dtype)
         x, y = (torch.einsum("bmnd,bnd->bm", weighted, z) for z in (positions, velocities))
         xx, xy, yy = self._responses.to(positions.dtype)
