@@ -9,7 +9,7 @@ import pytest
 import pdcorrect as pc
 from conftest import cross
 from pdcorrect.errors import InputError
-from pdcorrect.evaluation.comparison_cases import cases_with
+from pdcorrect.evaluation.comparison_cases import cases_for
 from pdcorrect.scene import trained_coarse
 
 ROOT = Path(__file__).parents[1]
@@ -138,10 +138,10 @@ def test_a_silent_corrector_of_it_has_its_omega(published):
 def test_a_model_of_it_is_compared_beside_it(published, tmp_path):
     pytest.importorskip("torch_geometric")
     save_silent(published, tmp_path / "silent")
-    cases = cases_with([str(tmp_path / "silent")])
+    scene = heavy().with_changes(time={"frames": 2})
+    cases = cases_for(scene, [str(tmp_path / "silent")])
     assert [case.label for case in cases[-2:]] == ["coarse PD, total mass", "hybrid silent"]
     chosen = (cases[0], cases[2], *cases[-2:])
-    scene = heavy().with_changes(time={"frames": 2})
     rows = {row.label: row for row in pc.compare(scene, cases=chosen).rows}
     base, hybrid = rows["coarse PD, total mass"], rows["hybrid silent"]
     assert hybrid.rms_error == base.rms_error < 0.7 * rows["coarse PD"].rms_error
@@ -200,12 +200,11 @@ def test_regions_that_end_inside_of_cells_may_weigh_otherwise_when_refined():
 
 def test_a_silent_model_of_it_is_evaluated_as_its_run(published, tmp_path):
     pytest.importorskip("torch_geometric")
-    from pdcorrect.evaluation.candidates import saved_candidates
-    from pdcorrect.evaluation.evaluation import evaluate
+    from pdcorrect.evaluation.evaluation import evaluate, saved_candidates
 
     save_silent(published, tmp_path / "silent")
     (saved,) = saved_candidates([str(tmp_path / "silent")])
-    runs = evaluate([saved.candidate], published).runs
+    runs = evaluate([saved], published).runs
     for measure in ("omega", "step_omega", "energy_error", "rms_error"):
         own, base = (runs[name].values(measure)[0] for name in ("silent", "total-mass"))
         np.testing.assert_allclose(own, base, rtol=1e-3, atol=0.02)
