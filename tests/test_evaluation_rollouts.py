@@ -42,7 +42,7 @@ from training_samples import shortened  # noqa: E402
 
 @pytest.fixture(scope="module")
 def cases():
-    return read_cases(TINY, bases=["best"], skip_damaged=False).cases
+    return read_cases(TINY, bases=["best"]).cases
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.training import scenes  # noqa: E402
+from pdcorrect.training.losses import MODES, Vibrations, body_modes  # noqa: E402
 from pdcorrect.training.recordings import load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, unroll  # noqa: E402
-from pdcorrect.training.vibrations import MODES, Vibrations, body_modes  # noqa: E402
 
 STEP = 0.01  # s
 CPU = torch.device("cpu")

@@ -35,9 +35,6 @@ def evaluate(
     ] = None,
     gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
     seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
-    skip_damaged: Annotated[
-        bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
-    ] = False,
     incomplete: Annotated[
         bool, typer.Option("--incomplete", help="Also if files of the split are missing.")
     ] = False,
@@ -66,7 +63,7 @@ def evaluate(
         task = progress.add_task("evaluating", total=None)
         found = run(
             saved, folder, split, device=device, batch=batch,
-            workers=workers, skip_damaged=skip_damaged, incomplete=incomplete,
+            workers=workers, incomplete=incomplete,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
     notes = _notes(saved, found)
@@ -82,9 +79,9 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
     from pdcorrect.evaluation.report import refused_corrections
 
-    notes = [f"left out: {text}" for text in found.damaged.values()]
+    notes = []
     if found.missing:
-        count = len(found.missing) + len(found.shards) + len(found.damaged)
+        count = len(found.missing) + len(found.shards)
         notes.append(f"{len(found.missing)} of {count} files of the split are missing.")
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)

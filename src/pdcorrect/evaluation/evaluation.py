@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from pdcorrect.corrector.model_io import (
     weights_digest,
 )
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
-from pdcorrect.data.folder import Damage, check_whole, missing_files
+from pdcorrect.data.folder import check_whole, missing_files
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.measures import (
@@ -199,8 +199,6 @@ class Evaluation:
         interest.
     shards : mapping of str to str
         Content hash of each file, by its name.
-    damaged : mapping of Path to str
-        Files that were left out.
     missing : tuple of Path
         Files that the data set's configuration asks for and that are not there.
     """
@@ -212,7 +210,6 @@ class Evaluation:
     time_step: float
     runs: Mapping[str, EvaluatedRun]
     shards: Mapping[str, str]
-    damaged: Damage = field(default_factory=dict)
     missing: tuple[Path, ...] = ()
 
 
@@ -224,7 +221,6 @@ def evaluate(
     device: str = "cpu",
     batch: int = 32,
     workers: int = 1,
-    skip_damaged: bool = False,
     incomplete: bool = False,
     on_cases: OnCases | None = None,
 ) -> Evaluation:
@@ -245,8 +241,6 @@ def evaluate(
         Simulations that are stepped together; on a CPU candidates with ``alone`` step one by one.
     workers : int
         Processes that measure; the results do not depend on their number.
-    skip_damaged : bool
-        Leave out files that are damaged.
     incomplete : bool
         Take the files that are there, if the data set's configuration asks for more.
     on_cases : callable, optional
@@ -269,9 +263,8 @@ def evaluate(
             missing = tuple(missing_files(folder, split))
     else:
         check_whole(folder, [split])
-    found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
-    read = {*found.shards, *(path.name for path in found.damaged)}
-    missing = tuple(path for path in missing if path.name not in read)
+    found = read_cases(folder, split, bases)
+    missing = tuple(path for path in missing if path.name not in found.shards)
     known = {candidate.name: candidate for candidate in candidates}
     stored = dict.fromkeys(name for case in found.cases for name in _stored(case))
     if len(known) < len(candidates) or known.keys() & {*stored, REFERENCE}:
@@ -295,7 +288,7 @@ def evaluate(
     about = found.attributes
     return Evaluation(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
-        float(about["time_step"]), runs, found.shards, found.damaged, missing,
+        float(about["time_step"]), runs, found.shards, missing,
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, read_files, shard_paths
+from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
@@ -72,43 +72,36 @@ class EvaluationCase:
 
 
 class SplitCases(NamedTuple):
-    """A split's simulations in float64, its files' content hashes, and those that are damaged."""
+    """A split's simulations in float64, and its files' content hashes by name."""
 
     attributes: Mapping[str, str | int | float]
     cases: tuple[EvaluationCase, ...]
     shards: Mapping[str, str]
-    damaged: Damage
 
 
 def read_cases(
-    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = (), *, skip_damaged: bool
+    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = ()
 ) -> SplitCases:
     """All simulations of a split, and problems of the plain coarse model and of ``bases``.
-
-    With ``skip_damaged`` files that are damaged are left out.
 
     Raises
     ------
     InputError
         If the split is missing, of several data sets, or its problems cannot be rebuilt.
     FileFormatError
-        If a file is damaged; with ``skip_damaged`` if all are.
+        If a file is damaged.
     """
-    damaged: Damage = {}
-    wanted = [PLAIN, *bases]
-    shards: dict[str, str] = {}
+    attributes: list[Mapping[str, str | int | float]] = []
     cases: list[EvaluationCase] = []
-
-    def read(path: Path) -> Mapping[str, str | int | float]:
+    shards: dict[str, str] = {}
+    for path in shard_paths(folder, split):
         shard = read_shard(path)
+        attributes.append(shard.attributes)
+        cases += _cases(shard, path, [PLAIN, *bases])
         shards[path.name] = shard.content_hash
-        cases.extend(_cases(shard, path, wanted))
-        return shard.attributes
-
-    attributes = read_files(shard_paths(folder, split), read, damaged if skip_damaged else None)
     if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
         raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
-    return SplitCases(attributes[0], tuple(cases), shards, damaged)
+    return SplitCases(attributes[0], tuple(cases), shards)
 
 
 def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[EvaluationCase]:

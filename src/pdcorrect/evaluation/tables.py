@@ -120,7 +120,6 @@ def to_json(evaluation: Evaluation, record: Mapping[str, Any] | None = None, see
             "time_step": evaluation.time_step,
             "trajectories": count,
             "shards": dict(evaluation.shards),
-            "damaged": {path.name: text for path, text in evaluation.damaged.items()},
             "missing": [path.name for path in evaluation.missing],
         },
         "runs": {

@@ -77,7 +77,7 @@ class Loss(Strict):
         Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``); None: as x.
     ahead
         Of "relative", in unrolled stages: weight of what the error of a state will come to in the
-        frames ahead (`pdcorrect.training.vibrations`).
+        frames ahead.
     """
 
     kind: Literal["relative", "absolute"] = "relative"

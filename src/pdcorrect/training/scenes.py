@@ -18,8 +18,8 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
+from pdcorrect.training.losses import BodyModes, Vibrations, body_modes
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
-from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 
 Frames = NDArray[np.int64]
 
