@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import Problem, coarse_model, discretise
+from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse, check_scene, learned_coarse, trained_coarse
 
-CASE_BASES = ("plain", "enhanced", "learned", "best", "total-mass")
+CASE_BASES = ("plain", "enhanced", "learned", "best")
 """In the order of rows."""
 _27_NODES = "hex27"
 _SECOND_ORDER = "generalised-alpha"
@@ -25,10 +25,9 @@ class Case:
     solver : str
         "pd" or "newton".
     refine : int
-    base : {"plain", "enhanced", "learned", "best", "total-mass"}
-        "enhanced", "learned": element and mass of `best_coarse`, `learned_coarse`.  Others as of
-        `coarse_model`: "best" is what correctors were trained on.  "total-mass" is for the coarse
-        mesh only.
+    base : {"plain", "enhanced", "learned", "best"}
+        Element and mass of the scene, or of its `best_coarse`, `learned_coarse` or
+        `trained_coarse`, on which correctors of the base "best" were trained.
     model : str or None
         Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
     gate : bool
@@ -58,20 +57,17 @@ class Case:
         Raises
         ------
         InputError
-            If there is no such base on its mesh, or an element is given with another base.
+            If there is no such base, or an element is given with another one than "plain".
         """
         if self.integrator is not None:
             scene = scene.with_changes(time={"integrator": self.integrator})
-        possible = self.element is None and (self.refine == 1 or self.base in _BETTER)
-        if self.base != "plain" and not possible:
+        if self.base not in CASE_BASES or (self.base != "plain" and self.element is not None):
             raise InputError(
-                f"{self.label}: base {self.base!r} refined {self.refine} times, with element "
-                f"{self.element!r}: expected base 'plain', or one refinement and no element."
+                f"{self.label}: base {self.base!r} with element {self.element!r}: expected one of "
+                f"{', '.join(CASE_BASES)}, and 'plain' for an element."
             )
-        if self.base in _BETTER:
-            return discretise(_BETTER[self.base](scene), self.refine)
         if self.base != "plain":
-            return coarse_model(scene, self.base)
+            return discretise(_BETTER[self.base](scene), self.refine)
         # "per-node" is for nodes at corners only
         per_node = self.element is not None and scene.solver.mass == "per-node"
         return discretise(scene, self.refine, "averaged" if per_node else None, self.element)
@@ -93,8 +89,8 @@ _BEST = Case("best coarse PD", "pd", 1, "enhanced")
 _FINE_BEST = Case("fine best PD", "pd", 4, "enhanced")
 _FINE_TRAINED = Case("fine PD as trained", "pd", 4, "best")
 """The reference that correctors of the base "best" have learned from."""
-_CORRECTED = {"best": "coarse PD as trained", "total-mass": "coarse PD, total mass"}
-"""Labels of coarse models that are corrected, by their base."""
+_TRAINED = Case("coarse PD as trained", "pd", 1, "best")
+"""The coarse model that those correct."""
 
 
 def with_learned(scene: Scene) -> Scene:
@@ -116,7 +112,7 @@ def with_learned(scene: Scene) -> Scene:
 _BETTER: dict[str, Callable[[Scene], Scene]] = {
     "enhanced": best_coarse, "learned": with_learned, "best": trained_coarse
 }  # fmt: skip
-"""Element and mass of bases that may be refined."""
+"""Element and mass of a base."""
 
 
 def cases_for(
@@ -195,15 +191,15 @@ def _hybrids(models: Sequence[str], gate: bool) -> tuple[Case, list[Case]]:
 
     names = unlike_ends([model_folder(model).resolve() for model in models])
     bases = [load_model(model).base for model in models]
-    if "best" in bases and set(bases) != {"best"}:
+    if set(bases) not in ({"best"}, {"plain"}):
         raise InputError(
-            f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: "
-            "expected of 'best' or of the others, as their references have unlike elements; "
-            "compare the others apart."
+            f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: expected "
+            "all of 'best' or all of 'plain', as their references have unlike elements."
         )
     without = "" if gate else ", no gate"
-    return _FINE_TRAINED if "best" in bases else CASES[0], [
-        *(Case(_CORRECTED[b], "pd", 1, b) for b in dict.fromkeys(bases) if b != "plain"),
+    reference, corrected = (_FINE_TRAINED, [_TRAINED]) if "best" in bases else (CASES[0], [])
+    return reference, [
+        *corrected,
         *(
             Case(f"hybrid {name}{without}", "pd", 1, base, model, gate)
             for name, base, model in zip(names, bases, models, strict=True)

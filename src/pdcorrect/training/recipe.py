@@ -17,7 +17,6 @@ from pydantic.config import JsonDict
 from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.corrector.architecture import CorrectorConfig, changed
 from pdcorrect.data.configuration import TRAINING, VALIDATION
-from pdcorrect.fem.problem import Base
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
@@ -230,7 +229,7 @@ class TrainingConfig(TomlConfig):
     without
         Files of the data set that are left out, such as "training/mesh-0042".
     base
-        Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
+        Whose steps are corrected, see `pdcorrect.coarse_model`.
     validate_every, checkpoint_every, report_every
         The last in iterations.
     """
@@ -238,7 +237,7 @@ class TrainingConfig(TomlConfig):
     corrector: Architecture = Architecture()
     start_from: ModelName | None = None
     without: tuple[FileName, ...] = ()
-    base: Base = "plain"
+    base: Literal["plain", "best"] = "plain"
     seed: Count = 0
     fitting: Fitting = Fitting()
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.schema import PLAIN, REFERENCE, TOTAL_MASS, Shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import InputError
@@ -38,8 +38,6 @@ class Recording:
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
         Mean squared errors of the base model, m2, see `pdcorrect.training.losses`.
-    total_mass : float or None
-        To which the base model's density is scaled, kg; None where it is not.
     """
 
     path: Path
@@ -52,7 +50,6 @@ class Recording:
     plain: Array
     one_step: float
     rollout: float
-    total_mass: float | None = None
 
     @property
     def steps(self) -> int:
@@ -152,7 +149,6 @@ def _recording(path: Path, shard: Shard, number: int, split: str, base: Base) ->
     """A simulation that lacks nothing, see `_check_complete`."""
     runs = shard.simulations[number].runs
     reference, plain, rollout = (np.asarray(runs[n].positions) for n in (REFERENCE, PLAIN, base))
-    mass = float(runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
     return Recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
@@ -164,7 +160,6 @@ def _recording(path: Path, shard: Shard, number: int, split: str, base: Base) ->
         plain=plain,
         one_step=_mean_square(np.asarray(runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
-        total_mass=mass,
     )
 
 

@@ -33,7 +33,7 @@ class SceneGroup:
     Parameters
     ----------
     recordings : sequence of Recording
-    base : {"plain", "best", "total-mass"}
+    base : {"plain", "best"}
     device : str or torch.device
     modes : dict, optional
         Modes of meshes that are known already, by file; new ones are added.

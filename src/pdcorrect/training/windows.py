@@ -107,7 +107,6 @@ class StepWindows:
         for k, r in enumerate(recordings):
             self._numbers[files[r.path], r.number] = k
         self._errors = base_errors(recordings, self.device)
-        masses = {files[r.path]: r.total_mass for r in recordings}
         self._nodes = np.array([h.nodes for h in headers])
         rows = np.zeros(self._numbers.shape, dtype=np.int64)
         for row, h in zip(rows, headers, strict=True):
@@ -118,7 +117,8 @@ class StepWindows:
         self._bodies: dict[int, BodyGraph] = {}
         for window in self.of_each_file().tolist():
             file = int(self.dataset.places([window])[0][0])
-            self._bodies[file] = self._alone(window, masses[file])
+            body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
+            self._bodies[file] = body.to(dtype=torch.float64)
             self._keep(file)
             self.dataset.forget()
 
@@ -129,15 +129,6 @@ class StepWindows:
         free = torch.cuda.mem_get_info(self.device)[0]
         fits = int(self.dataset.shard_bytes().sum()) < _SHARE_OF_DEVICE * free
         return self.device if fits else torch.device("cpu")
-
-    def _alone(self, window: int, mass: float | None) -> BodyGraph:
-        """The body of a window, float64, of the base model's mass (kg)."""
-        body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
-        body = body.to(dtype=torch.float64)
-        if mass is None:
-            return body
-        factor = mass / body.mass.sum()
-        return replace(body, mass=factor * body.mass, density=factor * body.density)
 
     def _keep(self, file: int) -> None:
         """Copy a file's frames to their places; a last frame has no step that follows it."""
