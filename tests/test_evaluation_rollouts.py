@@ -111,7 +111,7 @@ def test_steps_after_a_failure_do_not_count_as_corrected(cases):
     reasons = np.zeros(case.steps, dtype=np.int64)
     reasons[:2] = Reason.OUTSIDE
     outcomes = [Outcome(case.reference, None, "plain", reasons, failed) for failed in (3, 4, None)]
-    runs = [EvaluatedRun("run", None, None, (measure(case, one),)) for one in outcomes]
+    runs = [EvaluatedRun("run", None, (measure(case, one),)) for one in outcomes]
     assert [all(run.reasons) for run in runs] == [True, False, False]
     assert [len(run.trajectories[0].reasons) for run in runs] == [2, 3, case.steps]
 
