@@ -20,7 +20,6 @@ from pdcorrect.training.recordings import load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402
-from pdcorrect.training.windows import StepWindows  # noqa: E402
 
 MODELS = Path(__file__).parents[1] / "models"
 
@@ -107,14 +106,6 @@ def test_files_that_cannot_be_left_out_are_refused(several, tmp_path):
     config = samples.config(*STAGES, without=["training/mesh-0042"])
     with pytest.raises(InputError, match="training/mesh-0042"):
         Training(config, several, tmp_path / "out", incomplete=True)
-
-
-def test_windows_need_the_recordings_of_their_split(several):
-    config = samples.config(samples.one_step())
-    recordings = load_recordings(several, "training", "plain")
-    for wrong in (recordings[1:], [recordings[0], *recordings[:-1]]):
-        with pytest.raises(InputError, match="3 simulations"):
-            StepWindows(several, wrong, config.corrector.config(), "plain")
 
 
 RECIPES = MODELS / "recipes"

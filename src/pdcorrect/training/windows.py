@@ -22,7 +22,6 @@ from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.reader import ShardShuffle, TrajectoryDataset
-from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses, network_precision
@@ -73,11 +72,6 @@ class StepWindows:
     on the CPU if all would fill more than 0.3 of what is free on a GPU.  Of bodies all that is
     known at rest is computed once.  ``recordings`` are all of the split, for the base model's
     errors, and ``without`` are files that are left out, see `pdcorrect.data.folder.shard_paths`.
-
-    Raises
-    ------
-    InputError
-        If the recordings are not those of the split.
     """
 
     def __init__(
@@ -96,12 +90,6 @@ class StepWindows:
             folder, TRAINING, window=2 if self._history else 1, base=base, without=without
         )
         headers = self.dataset.headers
-        wanted = [(h.path, k) for h in headers for k in range(len(h.steps))]
-        if sorted((r.path, r.number) for r in recordings) != sorted(wanted):
-            raise InputError(
-                f"{len(recordings)} recordings for {len(wanted)} simulations: expected those of "
-                "the same files, one each."
-            )
         files = {header.path: k for k, header in enumerate(headers)}
         self._numbers = np.zeros((len(headers), max(len(h.steps) for h in headers)), dtype=np.int64)
         for k, r in enumerate(recordings):
