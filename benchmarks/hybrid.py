@@ -33,7 +33,7 @@ from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.schema import REFERENCE
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import models, rebuilt_problems
-from pdcorrect.evaluation.candidates import saved_candidates
+from pdcorrect.evaluation.evaluation import saved_candidates
 from pdcorrect.fem.problem import Problem, coarse_model, discretise
 from pdcorrect.scene import trained_coarse
 
@@ -78,7 +78,7 @@ def main() -> None:
     batches = [1] if chosen.quick else [int(count) for count in chosen.batches.split(",")]
     steps = 3 if chosen.quick else chosen.steps
     (saved,) = saved_candidates([chosen.model], chosen.device)
-    base, model = saved.candidate.base, saved.model
+    base, model = saved.base, saved.model
 
     def hybrid(stepper: BatchStepper) -> BatchHybrid:
         return BatchHybrid(

@@ -136,7 +136,7 @@ def main() -> None:
         changes = {name: changes[name] for name in options.only}
     notes, more = [], {}
     if options.fit:
-        cases = read_cases(options.data, split, skip_damaged=False).cases[: options.fit]
+        cases = read_cases(options.data, split).cases[: options.fit]
         factor = fitted(cases, options.device, options.batch)
         changes["fitted stiffness"], more["stiffness_factor"] = with_stiffness(factor), factor
         notes.append(

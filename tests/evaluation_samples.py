@@ -54,8 +54,8 @@ class Fake:
         return BatchState(positions, finite.velocities, finite.times, finite.memory)
 
 
-def fake(cases, answer, name="fake", base="plain", group=None, **options):
-    return Candidate(name, base, lambda stepper: Fake(stepper, cases, answer, **options), group)
+def fake(cases, answer, name="fake", base="plain", **options):
+    return Candidate(name, base, lambda stepper: Fake(stepper, cases, answer, **options))
 
 
 def perfect(case, t, x):

@@ -12,7 +12,7 @@ import pdcorrect as pc
 from conftest import beam
 from pdcorrect._files import INTERRUPTED
 from pdcorrect.cli.common import BAD_INPUT, FAILED
-from pdcorrect.evaluation.report_notes import inverted_frames
+from pdcorrect.evaluation.report import inverted_frames
 
 
 @pytest.fixture

@@ -118,8 +118,7 @@ def test_scenes_with_an_absolute_path_are_read_and_those_taken_out_ask_for_their
 def test_a_moved_data_set_is_trained_on_and_judged(moved, tmp_path):
     pytest.importorskip("torch_geometric")
     import training_samples as samples
-    from pdcorrect.evaluation.candidates import saved_candidates
-    from pdcorrect.evaluation.evaluation import evaluate
+    from pdcorrect.evaluation.evaluation import evaluate, saved_candidates
     from pdcorrect.training.training import Training
 
     settings = samples.config(
@@ -129,6 +128,6 @@ def test_a_moved_data_set_is_trained_on_and_judged(moved, tmp_path):
     assert training.run()
     assert np.isfinite(training.progress.metrics["omega_mean"])
     (saved,) = saved_candidates([tmp_path / "out" / "model"], gate=None)
-    runs = evaluate([saved.candidate], moved).runs
+    runs = evaluate([saved], moved).runs
     assert len(runs) > 2
     assert all(np.isfinite(run.values("omega")[0]).all() for run in runs.values())

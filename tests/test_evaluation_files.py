@@ -18,19 +18,17 @@ from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.data.simulate import rebuilt_problems  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.evaluation import tables  # noqa: E402
-from pdcorrect.evaluation.candidates import saved_candidates  # noqa: E402
-from pdcorrect.evaluation.evaluation import evaluate  # noqa: E402
+from pdcorrect.evaluation.evaluation import evaluate, saved_candidates  # noqa: E402
 from pdcorrect.evaluation.measures import TrajectoryMeasures, read_cases  # noqa: E402
-from pdcorrect.evaluation.resampling import summarise  # noqa: E402
 from pdcorrect.figures.curves import plot_omega  # noqa: E402
 
 
 @pytest.fixture(scope="module")
 def evaluation():
-    cases = read_cases(TINY, bases=["best"], skip_damaged=False).cases
+    cases = read_cases(TINY, bases=["best"]).cases
     candidates = [
-        fake(cases, perfect, "perfect", group="fakes", refused=(1, 2)),
-        fake(cases, as_stored("plain"), "like plain", group="fakes"),
+        fake(cases, perfect, "perfect", refused=(1, 2)),
+        fake(cases, as_stored("plain"), "like plain"),
         fake(cases, as_stored("best"), "like best", "best"),
     ]
     return evaluate(candidates, TINY, batch=3)
@@ -73,19 +71,15 @@ def test_the_summary_holds_the_numbers_and_where_they_come_from(evaluation):
     assert found["data"]["trajectories"] == 4
     assert set(found["data"]["shards"]) == {f"mesh-{k:04d}.h5" for k in range(3)}
     values, meshes = evaluation.runs["best"].values("omega")
-    expected = json.loads(json.dumps(asdict(summarise(values, meshes, 3))))
+    expected = json.loads(json.dumps(asdict(tables.summarise(values, meshes, 3))))
     assert found["runs"]["best"]["measures"]["omega"] == expected
     assert found["runs"]["best"]["measures"]["omega"]["smallest"] == min(values)
-    group = found["seeds"]["fakes"]
-    assert group["models"] == ["perfect", "like plain"]
-    assert group["measures"]["omega"]["mean"] == 50.0
-    assert group["measures"]["omega"]["deviation"] == pytest.approx(100 / np.sqrt(2))
 
 
 def test_tables_name_every_run_and_what_is_removed(evaluation):
     text = tables.markdown(evaluation, ["a note"])
     lines = {line.split("|")[1].strip(): line for line in text.splitlines() if "|" in line}
-    assert {"perfect", "like plain", "best", "intermediate", "fakes"} <= set(lines)
+    assert {"perfect", "like plain", "best", "intermediate"} <= set(lines)
     headings, rows = tables.headline(evaluation)
     found = dict(zip(headings, rows[0], strict=True))
     assert found["run"] == "perfect"
@@ -183,26 +177,15 @@ def test_files_that_do_not_fit_their_scenes_are_refused(stored):
 # --- damaged and missing files ---------------------------------------------------------
 
 
-@pytest.fixture
-def damaged(tmp_path):
-    """The tiny data set's evaluation split with a changed byte in its second file."""
+def test_a_damaged_file_is_named(tmp_path):
     folder = tmp_path / "tiny"
     shutil.copytree(TINY / "evaluation", folder / "evaluation")
     path = folder / "evaluation" / "mesh-0001.h5"
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
-    return folder
-
-
-def test_a_damaged_file_is_named_and_may_be_left_out(damaged):
     with pytest.raises(FileFormatError, match=r"mesh-0001\.h5"):
-        evaluate([], damaged)
-    found = evaluate([], damaged, skip_damaged=True)
-    assert [path.name for path in found.damaged] == ["mesh-0001.h5"]
-    assert {t.measures.mesh for t in found.runs["plain"].trajectories} == {0, 2}
-    content = json.loads(tables.to_json(found))
-    assert "checksum" in content["data"]["damaged"]["mesh-0001.h5"]
+        evaluate([], folder)
 
 
 @pytest.fixture
@@ -247,14 +230,12 @@ def test_a_configuration_that_cannot_be_used_is_told_before_anything_is_done(unf
 # --- models and the command ------------------------------------------------------------
 
 
-def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_seed(tmp_path):
+def test_models_are_named_by_what_tells_them_apart_and_say_what_they_know(tmp_path):
     paths = [untrained(tmp_path / f"seed-{k}" / "model", seed=k) for k in range(2)]
     paths.append(untrained(tmp_path / "other" / "model", base="best"))
     found = saved_candidates(paths)
-    assert [one.candidate.name for one in found] == ["seed-0/model", "seed-1/model", "other/model"]
-    groups = [one.candidate.group for one in found]
-    assert groups[0] == groups[1] != groups[2]
-    assert [one.candidate.base for one in found] == ["plain", "plain", "best"]
+    assert [one.name for one in found] == ["seed-0/model", "seed-1/model", "other/model"]
+    assert [one.base for one in found] == ["plain", "plain", "best"]
     assert found[1].record()["seed"] == 1
     assert found[0].warnings("tiny", "x", "evaluation") == []
     for dataset, config_hash, split in (
@@ -263,18 +244,23 @@ def test_models_are_named_by_what_tells_them_apart_and_grouped_without_their_see
     ):  # fmt: skip
         (told,) = found[0].warnings(dataset, config_hash, split)
         assert "seed-0/model" in told
+    sets = [{"name": name, "config_hash": "x"} for name in ("tiny", "other")]
+    found[0].model.record.training["data_sets"] = sets
+    (told,) = found[0].warnings("other", "x", "evaluation")  # tiny may hold meshes of this split
+    assert "'other'" in told
     with pytest.raises(InputError, match="seed-0"):
         saved_candidates([paths[0], paths[0]])
 
 
-def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged, program):
+def test_the_command_measures_a_model_and_writes_everything(tmp_path, program):
     pytest.importorskip("matplotlib")
     model = untrained(tmp_path / "zero", dataset="other")
-    (damaged / "evaluation" / "mesh-0000.h5").unlink()
+    folder = tmp_path / "tiny"
+    (folder / "evaluation").mkdir(parents=True)
+    shutil.copy(TINY / "evaluation" / "mesh-0002.h5", folder / "evaluation")
     output = tmp_path / "found"
-    status, out, _ = program("evaluate", model, damaged, "--skip-damaged", "-o", output)
+    status, out, _ = program("evaluate", model, folder, "-o", output)
     assert status == 0
-    assert "mesh-0001.h5" in out
     assert {path.name for path in output.iterdir()} == {
         "summary.json", "trajectories.csv", "errors.csv", "table.md", "errors.png", "omega.png"
     }  # fmt: skip
@@ -288,7 +274,7 @@ def test_the_command_measures_a_model_and_writes_everything(tmp_path, damaged, p
     assert abs(found["omega"]["mean"]) < 0.01  # solved again, to the data set's tolerance
     assert abs(found["step_omega"]["mean"]) < 0.1
     assert found["omega"]["interval"] is None  # one mesh
-    status, out, _ = program("evaluate", model, damaged, "--skip-damaged", "--no-gate")
+    status, out, _ = program("evaluate", model, folder, "--no-gate")
     assert status == 0
     assert "refused (" not in out
 

@@ -173,4 +173,4 @@ def test_the_recipe_of_fine_tuning_has_the_architecture_of_the_model_it_starts_f
 
     config = TrainingConfig.load(OWN / "finetune.toml")
     assert config.start_from is not None
-    assert config.architecture() == pc.load_model(config.start_from).corrector.config
+    assert config.corrector.config() == pc.load_model(config.start_from).corrector.config

@@ -162,7 +162,7 @@ def training(output):
 
 def whole_training(output, killed):
     from pdcorrect.corrector.model_io import load_model
-    from pdcorrect.training.checkpoints import read_checkpoint
+    from pdcorrect.training.progress import read_checkpoint
 
     if (output / "training" / "model" / "model.json").exists():
         load_model(output / "training" / "model")

@@ -12,10 +12,13 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError  # noqa: E402
-from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint  # noqa: E402
 from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402
 from pdcorrect.training.optimisation import rate_at  # noqa: E402
-from pdcorrect.training.progress import check_same  # noqa: E402
+from pdcorrect.training.progress import (  # noqa: E402
+    check_same,
+    read_checkpoint,
+    write_checkpoint,
+)
 from pdcorrect.training.recipe import Loss, Rate, TrainingConfig  # noqa: E402
 from pdcorrect.training.recordings import _mean_square, load_recordings  # noqa: E402
 

@@ -52,46 +52,6 @@ def test_a_start_of_another_architecture_or_base_or_that_is_not_there_is_refused
             Training(settings(start, {}, **changes), data, tmp_path / "out")
 
 
-# --- the record --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("fitting", "expected"),
-    [
-        ({}, ["first", "tiny"]),
-        ({"widen": False}, ["first"]),
-    ],
-    ids=str,
-)
-def test_a_model_records_the_data_sets_that_its_ranges_were_fitted_to(
-    data, earlier, tmp_path, fitting, expected
-):
-    model = load_model(earlier)
-    assert model.fitted_to == model.record.training["fitted_to"] == ["tiny"]
-    sets = [{"name": name, "config_hash": name[::-1]} for name in ("first", "second")]
-    model.record.training.update(data_sets=sets, fitted_to=["first"])
-    start = save_model(model.corrector, tmp_path / "start", record=model.record)
-    Training(settings(start, fitting), data, tmp_path / "out").run()
-    found = load_model(tmp_path / "out" / "model")
-    assert [name for name, _ in found.data_sets] == ["first", "second", "tiny"]
-    assert found.record.dataset == "first+second+tiny"
-    assert found.fitted_to == found.record.training["fitted_to"] == expected
-    again = settings(tmp_path / "out" / "model", {})
-    Training(again, data, tmp_path / "again").run()
-    further = load_model(tmp_path / "again" / "model").fitted_to
-    assert further == [*expected, *({"tiny"} - set(expected))]  # each once
-
-
-def test_ranges_of_a_model_that_does_not_record_it_count_as_fitted_to_all_that_it_learned(earlier):
-    model = load_model(earlier)
-    del model.record.training["fitted_to"]
-    sets = [{"name": name, "config_hash": None} for name in ("b+a", "a", "c")]
-    model.record.training["data_sets"] = sets
-    assert model.fitted_to == ["b", "a", "c"]
-    del model.record.training["data_sets"]
-    assert model.fitted_to == ["tiny"]
-
-
 # --- another time step -------------------------------------------------------------------------
 
 

@@ -18,15 +18,14 @@ import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.gate import Gate  # noqa: E402
 from pdcorrect.corrector.model_io import load_model  # noqa: E402
 from pdcorrect.errors import ConvergenceError  # noqa: E402
-from pdcorrect.training.batch_losses import OneStepBatches  # noqa: E402
-from pdcorrect.training.checkpoints import read_checkpoint  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
+from pdcorrect.training.progress import read_checkpoint  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from pdcorrect.training.recordings import load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroups  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Scores, Validation  # noqa: E402
+from pdcorrect.training.windows import OneStepBatches, seed_of  # noqa: E402
 from training_samples import weights  # noqa: E402
 
 
@@ -217,12 +216,8 @@ def test_two_processes_train_like_one_with_both_batches(folder, tmp_path):
     windows, _ = samples.windows(folder, settings)
     stage = settings.stages[0]
     optimiser = Optimiser(corrector, stage, None, ProcessGroup())
-    from pdcorrect.training.batch_losses import make_source
-
-    parts = [
-        make_source(0, settings, windows, SceneGroups([], "plain"), ProcessGroup(rank, 2))
-        for rank in (0, 1)
-    ]
+    seed = seed_of(settings.seed, 0)
+    parts = [OneStepBatches(windows, stage, seed, ProcessGroup(rank, 2)) for rank in (0, 1)]
     for k in range(3):
         loss = sum(part.loss(corrector, k, 1) for part in parts) / 2
         optimiser.step(loss, k / 3)

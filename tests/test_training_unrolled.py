@@ -16,9 +16,9 @@ from pdcorrect.data.shard_reader import read_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402
-from pdcorrect.training.distributed import joined  # noqa: E402
+from pdcorrect.training.distributed import ProcessGroup, joined  # noqa: E402
 from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup, SceneGroups, grouped  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402
@@ -51,13 +51,15 @@ def test_groups_hold_all_simulations_once_and_states_have_backward_differences(g
     every = [
         group
         for rank in (0, 1)
-        for group in grouped(recordings, 3, seed=5, rank=rank, world_size=2)
+        for group in SceneGroups(recordings, "plain", seed=5, world=ProcessGroup(rank, 2)).of(3, 1)
     ]
     assert sorted(r.name for g in every for r in g) == sorted(r.name for r in recordings)
-    whole = [r for g in grouped(recordings, 3, seed=5) for r in g]
-    meshes = [r.mesh for r in whole]
+    meshes, others = (
+        [r.path for g in SceneGroups(recordings, "plain", seed=seed).of(3, 1) for r in g]
+        for seed in (5, 6)
+    )
     assert len([1 for a, b in itertools.pairwise(meshes) if a != b]) == 5
-    assert meshes != [r.mesh for g in grouped(recordings, 3, seed=6) for r in g]
+    assert meshes != others
 
     frames = np.array([0, 4, 20])
     positions, velocities = group.states(frames)
@@ -198,7 +200,7 @@ def test_scenes_that_failed_count_once_after_several_processes_resume(folder):
     counts = []
     for rank in (0, 1):
         batches = UnrolledBatches(
-            SceneGroups(recordings, "plain", rank=rank, world_size=2),
+            SceneGroups(recordings, "plain", world=ProcessGroup(rank, 2)),
             stage.model_copy(update={"batch": 1}),
         )
         batches.load_state_dict(numbers, {})

@@ -17,10 +17,10 @@ from pdcorrect.corrector.features import (  # noqa: E402
     values,
 )
 from pdcorrect.data.shard_reader import read_shard  # noqa: E402
-from pdcorrect.training.batch_losses import OneStepBatches, one_step_loss  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
+from pdcorrect.training.windows import OneStepBatches, one_step_loss  # noqa: E402
 from training_samples import weights  # noqa: E402
 
 

@@ -15,10 +15,10 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from pdcorrect.training import scenes  # noqa: E402
+from pdcorrect.training.losses import MODES, Vibrations, body_modes  # noqa: E402
 from pdcorrect.training.recordings import load_recordings  # noqa: E402
 from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, unroll  # noqa: E402
-from pdcorrect.training.vibrations import MODES, Vibrations, body_modes  # noqa: E402
 
 STEP = 0.01  # s
 CPU = torch.device("cpu")
@@ -192,7 +192,7 @@ def test_modes_of_a_mesh_are_computed_once_or_the_recording_is_named(recordings,
     groups = SceneGroups(recordings, "plain")
     for chosen in (recordings[:1], recordings, recordings[1:]):
         groups(chosen).vibrations  # noqa: B018
-    assert len(asked) == len({r.mesh for r in recordings})
+    assert len(asked) == len({r.path for r in recordings})
 
     def failing(problem):
         raise ConvergenceError("the search did not end.")

@@ -84,7 +84,7 @@ def unrolled(**changes):
 def windows(folder, settings, **options):
     """The windows of a configuration's training split, and its recordings."""
     recordings = load_recordings(folder, "training", settings.base)
-    architecture = settings.architecture()
+    architecture = settings.corrector.config()
     return StepWindows(folder, recordings, architecture, settings.base, **options), recordings
 
 
@@ -93,7 +93,7 @@ def fitted(folder, settings, silent=False):
     from pdcorrect.corrector.corrector import Corrector
 
     torch.manual_seed(0)
-    corrector = Corrector(settings.architecture())
+    corrector = Corrector(settings.corrector.config())
     fit_normaliser(corrector, windows(folder, settings)[0], 50)
     if silent:
         with torch.no_grad():

@@ -57,7 +57,7 @@ _HOME = {
     "render_overlay": "pdcorrect.figures",
     "compare": "pdcorrect.evaluation.compare",
     "converged": "pdcorrect.evaluation.converged",
-    "error_estimate": "pdcorrect.evaluation.error_estimate",
+    "error_estimate": "pdcorrect.evaluation.converged",
 }
 _NEEDS_TORCH = (
     "BatchStepper", "BatchGradients", "PDLayer", "Corrector", "HybridStepper", "hybrid_of",
@@ -123,8 +123,7 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.hybrid import HybridStepper, hybrid_of
     from pdcorrect.corrector.model_io import load_model, save_model
     from pdcorrect.evaluation.compare import compare
-    from pdcorrect.evaluation.converged import converged
-    from pdcorrect.evaluation.error_estimate import error_estimate
+    from pdcorrect.evaluation.converged import converged, error_estimate
     from pdcorrect.fem.modes import modes
     from pdcorrect.fem.problem import Problem, coarse_model, discretise
     from pdcorrect.fem.stress import stress

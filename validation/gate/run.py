@@ -43,7 +43,7 @@ def held(data: Path, split: str) -> dict[str, Held]:
     from pdcorrect.evaluation.rollouts import roll_out
 
     corrector = pc.load_model(MODEL).corrector
-    cases = read_cases(data, split, ["best"], skip_damaged=False).cases
+    cases = read_cases(data, split, ["best"]).cases
     stepper = BatchStepper([case.problems["best"] for case in cases])
     found = {}
     for name, gate in (("none", None), ("default", Gate())):

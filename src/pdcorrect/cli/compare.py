@@ -97,7 +97,6 @@ def compare(
     from pdcorrect._files import make_folder
     from pdcorrect.evaluation import report
     from pdcorrect.evaluation.comparison_cases import HEX27, cases_for
-    from pdcorrect.evaluation.report_notes import notes
     from pdcorrect.scene import Scene
 
     if figures:
@@ -118,7 +117,7 @@ def compare(
     finer = _finer(loaded, count) if estimate_error else None
     comparison = _run(loaded, count, cases, truth, finer)
     _print_table(comparison)
-    for note in notes(comparison):
+    for note in report.notes(comparison):
         say("- " + note)
     say("drawing the figures ..." if figures else "")
     say(f"report: {report.write_report(comparison, output, draw=figures)}")
@@ -149,7 +148,7 @@ def _converged(scene: Scene, count: int, error: bool) -> Trajectory:
 
 def _finer(scene: Scene, count: int) -> Trajectory | None:
     """What estimates errors, with a bar; None, and why, if it fails."""
-    from pdcorrect.evaluation.error_estimate import finer_run
+    from pdcorrect.evaluation.converged import finer_run
 
     with progress_bar("estimate of errors", count) as advance:
         try:

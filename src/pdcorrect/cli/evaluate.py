@@ -13,8 +13,7 @@ from pdcorrect.errors import require_extra
 
 if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
-    from pdcorrect.evaluation.candidates import SavedCandidate
-    from pdcorrect.evaluation.evaluation import Evaluation
+    from pdcorrect.evaluation.evaluation import Evaluation, SavedCandidate
 
 
 def evaluate(
@@ -36,9 +35,6 @@ def evaluate(
     ] = None,
     gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
     seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
-    skip_damaged: Annotated[
-        bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
-    ] = False,
     incomplete: Annotated[
         bool, typer.Option("--incomplete", help="Also if files of the split are missing.")
     ] = False,
@@ -48,13 +44,12 @@ def evaluate(
 ) -> None:
     """Measure models, and the stored runs of a data set, against its reference.
 
-    Every simulation of the split is stepped from rest.  Several models that differ by their
-    seed only are summed up together.
+    Every simulation of the split is stepped from rest.
     """
     from rich.console import Console
     from rich.progress import Progress
 
-    from pdcorrect.evaluation.candidates import DEFAULT_GATE, saved_candidates
+    from pdcorrect.evaluation.evaluation import DEFAULT_GATE, saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate as run
     from pdcorrect.evaluation.tables import write_evaluation
 
@@ -67,8 +62,8 @@ def evaluate(
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("evaluating", total=None)
         found = run(
-            [one.candidate for one in saved], folder, split, device=device, batch=batch,
-            workers=workers, skip_damaged=skip_damaged, incomplete=incomplete,
+            saved, folder, split, device=device, batch=batch,
+            workers=workers, incomplete=incomplete,
             on_cases=lambda done, total: progress.update(task, completed=done, total=total),
         )  # fmt: skip
     notes = _notes(saved, found)
@@ -82,11 +77,11 @@ def evaluate(
 
 def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
     """What a reader of the numbers has to know."""
-    from pdcorrect.evaluation.report_notes import refused_corrections
+    from pdcorrect.evaluation.report import refused_corrections
 
-    notes = [f"left out: {text}" for text in found.damaged.values()]
+    notes = []
     if found.missing:
-        count = len(found.missing) + len(found.shards) + len(found.damaged)
+        count = len(found.missing) + len(found.shards)
         notes.append(f"{len(found.missing)} of {count} files of the split are missing.")
     for one in saved:
         notes += one.warnings(found.dataset, found.config_hash, found.split)
@@ -147,7 +142,7 @@ def _record(
         "folder": folder,
         "batch": batch,
         "gate": None if gate is None else gate.model_dump(),
-        "models": {one.candidate.name: one.record() for one in saved},
+        "models": {one.name: one.record() for one in saved},
         "notes": notes,
     }
 

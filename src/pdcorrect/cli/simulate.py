@@ -178,11 +178,11 @@ def _run(
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, energy, and what is unusual about a run."""
-    from pdcorrect.evaluation.report import three_digits
-    from pdcorrect.evaluation.report_notes import (
+    from pdcorrect.evaluation.report import (
         gained_energy,
         inverted_frames,
         refused_corrections,
+        three_digits,
     )
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
@@ -223,7 +223,7 @@ def _estimated(run: Trajectory) -> str:
     """The estimated error of a run, over all nodes and frames."""
     import numpy as np
 
-    from pdcorrect.evaluation.error_estimate import error_estimate
+    from pdcorrect.evaluation.converged import error_estimate
     from pdcorrect.metrics import rms_error
 
     with progress_bar("finer run", len(run)) as advance:

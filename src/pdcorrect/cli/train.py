@@ -23,10 +23,7 @@ _UNFINISHED = 1
 
 def train(
     config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
-    data: Annotated[
-        list[Path],
-        typer.Option(help="Folder of the data set; again for more, learned together."),
-    ],
+    data: Annotated[Path, typer.Option(help="Folder of the data set.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
     resume: Annotated[
@@ -63,10 +60,9 @@ def train(
     if evaluate is not None:
         from pdcorrect.data.folder import check_whole, shard_paths
 
-        for folder in data:
-            shard_paths(folder, evaluate)  # refused now, not when the training has ended
-            if not incomplete:
-                check_whole(folder, [evaluate])
+        shard_paths(data, evaluate)  # refused now, not when the training has ended
+        if not incomplete:
+            check_whole(data, [evaluate])
     tell_of_compiling()
     with joined(device) as (world, own):
         training = Training(
@@ -85,14 +81,11 @@ def train(
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
         from pdcorrect.cli.evaluate import evaluate as judge
-        from pdcorrect.corrector.model_io import unlike_ends
 
-        several = unlike_ends([folder.resolve() for folder in data]) if len(data) > 1 else [""]
-        for folder, name in zip(data, several, strict=True):
-            judge(
-                [str(output / MODEL), str(folder)], split=evaluate, device=own,
-                output=output / EVALUATION / name, incomplete=incomplete, figures=False,
-            )  # fmt: skip
+        judge(
+            [str(output / MODEL), str(data)], split=evaluate, device=own,
+            output=output / EVALUATION, incomplete=incomplete, figures=False,
+        )  # fmt: skip
 
 
 def _tell(at: Progress, row: Mapping[str, Any]) -> None:

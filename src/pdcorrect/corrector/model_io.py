@@ -171,18 +171,6 @@ class LoadedModel:
         return [(self.record.dataset, training.get("config_hash"))]
 
     @property
-    def fitted_to(self) -> list[str]:
-        """Names of the data sets that its training fitted or widened its ranges to.
-
-        Those are what a gate knows of bodies at rest and of time steps, among others.  All that it
-        was trained on if not recorded.
-        """
-        training: dict[str, Any] = self.record.training
-        if "fitted_to" in training:
-            return list(training["fitted_to"])
-        return list(dict.fromkeys(one for name, _ in self.data_sets for one in name.split(JOINT)))
-
-    @property
     def velocity(self) -> Any:
         """What becomes of velocities, see `HybridStepper`."""
         return self.configuration.get("velocity", "recomputed")

@@ -47,7 +47,6 @@ class Answers(NamedTuple):
     cells : (C, 8) int
         VTK order.
     young, density : (C,)
-    poisson : float
     held : (N,) bool
     forces, displacements : (L, N, 3)
         Static loads of the coarse model, and the fine answers, of size 1 in the mean; where
@@ -56,10 +55,9 @@ class Answers(NamedTuple):
         Twice the fine model's energies.
     foundation : float
         Stiffness over mass, 1/s2, of springs that hold each node of a body with no held one.
-    squares : (M,)
-        Squared angular frequencies of the modes, ascending, the foundation's included.
-    modes : (M, N, 3)
-        Of unit mass in the fine model.
+    squares, modes : (M,), (M, N, 3)
+        Squared angular frequencies, ascending, the foundation's included; shapes of unit mass in
+        the fine model.
     stiffness, mass : (24, 24), (8, 8)
         See `unit_cell`.
     """
@@ -81,17 +79,13 @@ class Answers(NamedTuple):
 
 
 class VoxelMesh(NamedTuple):
-    """Nodes and cells of a grid of unit cells, numbered by place.
-
-    Attributes
-    ----------
-    places : (N, 3) int
-    cells : (C, 8) int
-        VTK order.
+    """Nodes (N, 3) and cells (C, 8), in VTK order, of a grid of unit cells; numbers of the nodes
+    by place, -1 where there is none.
     """
 
     places: NDArray[np.int64]
     cells: NDArray[np.int64]
+    numbers: NDArray[np.int64]
 
     @classmethod
     def of(cls, solid: Grid) -> VoxelMesh:
@@ -100,7 +94,7 @@ class VoxelMesh(NamedTuple):
         numbers = np.full(nodes.shape, -1)
         numbers[nodes] = np.arange(nodes.sum())
         corners = np.argwhere(solid)[:, None] + _CORNERS
-        return cls(np.argwhere(nodes), numbers[tuple(np.moveaxis(corners, -1, 0))])
+        return cls(np.argwhere(nodes), numbers[tuple(np.moveaxis(corners, -1, 0))], numbers)
 
 
 @lru_cache(maxsize=64)
@@ -160,7 +154,7 @@ def answers(body: VoxelBody, rng: np.random.Generator) -> Answers:
     size = np.sqrt((U**2).sum(axis=2).mean(axis=1))
     F, flat = F / size[:, None, None], flat / size[:, None]
     squares, shapes = _modes(K, mass, free, factor.solve, 6 if foundation else 0)
-    at = _at_coarse(coarse, fine)
+    at = fine.numbers[tuple((REFINEMENT * coarse.places).T)]
     return Answers(
         coarse.places,
         coarse.cells,
@@ -185,18 +179,9 @@ def _refined(grid: NDArray[T]) -> NDArray[T]:
     return grid
 
 
-def _at_coarse(coarse: VoxelMesh, fine: VoxelMesh) -> NDArray[np.int64]:
-    """Numbers of the fine nodes at the coarse ones."""
-    shape = fine.places.max(axis=0) + 1
-    numbers = np.zeros(shape, dtype=np.int64)
-    numbers[tuple(fine.places.T)] = np.arange(len(fine.places))
-    return numbers[tuple((REFINEMENT * coarse.places).T)]
-
-
 def _interpolation(coarse: VoxelMesh, fine: VoxelMesh) -> sp.csr_matrix:
     """Trilinear, (fine nodes, coarse nodes)."""
-    numbers = np.full(coarse.places.max(axis=0) + 2, -1)
-    numbers[tuple(coarse.places.T)] = np.arange(len(coarse.places))
+    numbers = np.pad(coarse.numbers, (0, 1), constant_values=-1)
     low, inside = np.divmod(fine.places, REFINEMENT)
     rows, columns, values = [], [], []
     for corner in _CORNERS:
@@ -296,10 +281,8 @@ def _loads(
 def _face_areas(fine: VoxelMesh, axis: int, side: int) -> Array:
     """Area of each node's share in the outer faces that look along an axis, (nodes,)."""
     corners = np.flatnonzero(_CORNERS[:, axis] == side)
-    centre = 2 * fine.places[fine.cells].mean(axis=1).round(1)  # of the cells, in half cells
-    index = np.round(centre).astype(int) // 2
-    shape = index.max(axis=0) + 2
-    solid = np.zeros(shape, dtype=bool)
+    index = fine.places[fine.cells[:, 0]]
+    solid = np.zeros(index.max(axis=0) + 2, dtype=bool)
     solid[tuple(index.T)] = True
     beyond = index.copy()
     beyond[:, axis] += 1 if side else -1

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.ndimage as ndi
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -34,10 +35,9 @@ class VoxelBody:
     ----------
     kind : str
         Of its shape.
-    solid : (a, b, c) bool
+    solid, young, density : (a, b, c)
     held : (a + 1, b + 1, c + 1) bool
         Of the nodes, those whose three components are clamped.
-    young, density : (a, b, c)
     poisson : float
     """
 
@@ -107,7 +107,7 @@ def _prism(rng: np.random.Generator) -> Grid:
     section = np.zeros((1, 4, 4), dtype=bool)
     section[0, rng.integers(4), rng.integers(4)] = True
     for _ in range(rng.integers(1, 9)):
-        places = np.argwhere(_neighbours(section) & ~section)
+        places = np.argwhere(ndi.binary_dilation(section) & ~section)
         section[tuple(places[rng.integers(len(places))])] = True
     return np.repeat(section, rng.integers(4, _LONGEST + 1), axis=0)
 
@@ -157,8 +157,7 @@ def _random(rng: np.random.Generator) -> Grid:
     solid = np.zeros((8, 6, 6), dtype=bool)
     solid[4, 3, 3] = True
     for _ in range(rng.integers(_FEWEST, 60)):
-        around = _neighbours(solid) & ~solid
-        places = np.argwhere(around)
+        places = np.argwhere(ndi.binary_dilation(solid) & ~solid)
         solid[tuple(places[rng.integers(len(places))])] = True
     return solid
 
@@ -184,28 +183,12 @@ def _box(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[slice, ...]:
     return tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))
 
 
-def _neighbours(solid: Grid) -> Grid:
-    """Cells that share a face with a solid one, or are one."""
-    out = solid.copy()
-    for axis in range(3):
-        ahead = np.moveaxis(out, axis, 0)
-        source = np.moveaxis(solid, axis, 0)
-        ahead[1:] |= source[:-1]
-        ahead[:-1] |= source[1:]
-    return out
-
-
 def connected(solid: Grid, start: tuple[int, ...] | None = None) -> Grid:
     """The part with a cell, by default the first one, that hangs together by faces."""
     if not solid.any():
         return solid
-    part = np.zeros_like(solid)
-    part[tuple(np.argwhere(solid)[0]) if start is None else start] = True
-    while True:
-        grown = _neighbours(part) & solid
-        if (grown == part).all():
-            return part
-        part = grown
+    parts, _ = ndi.label(solid)
+    return np.asarray(parts == parts[tuple(np.argwhere(solid)[0]) if start is None else start])
 
 
 def _trimmed(solid: Grid) -> Grid:

@@ -50,11 +50,12 @@ def generate(
     make_folder(folder)
     _mark(folder, {"drawn": DRAWN, "seed": seed})
     deadline = None if seconds is None else time.monotonic() + seconds
-    missing = [n for n, path in enumerate(file_paths(folder, count)) if not path.exists()]
+    paths = enumerate(file_paths(folder, count))
+    missing = [(path, seed, n, deadline) for n, path in paths if not path.exists()]
     if workers == 1:
-        return sum(not _write(folder, seed, n, deadline) for n in missing)
+        return sum(not _write(*each) for each in missing)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        tasks = [pool.submit(_write, folder, seed, n, deadline) for n in missing]
+        tasks = [pool.submit(_write, *each) for each in missing]
         return sum(not task.result() for task in as_completed(tasks))
 
 
@@ -87,14 +88,10 @@ def _read(data: Mapping[str, Array], name: str) -> Any:
 
 def file_paths(folder: Path, count: int) -> list[Path]:
     """Files of the first ``count`` bodies."""
-    return [_path(folder, number) for number in range(-(-count // A_FILE))]
+    return [folder / f"bodies-{number:04d}.npz" for number in range(-(-count // A_FILE))]
 
 
-def _path(folder: Path, number: int) -> Path:
-    return folder / f"bodies-{number:04d}.npz"
-
-
-def _write(folder: Path, seed: int, number: int, deadline: float | None) -> bool:
+def _write(path: Path, seed: int, number: int, deadline: float | None) -> bool:
     """One file, unless it is too late."""
     if deadline is not None and time.monotonic() > deadline:
         return False
@@ -112,6 +109,6 @@ def _write(folder: Path, seed: int, number: int, deadline: float | None) -> bool
                     arrays[f"{key} largest"] = largest
                     kept = (kept / largest).astype(np.float16)
                 arrays[key] = kept
-    with replacing(_path(folder, number)) as part, part.open("wb") as file:
+    with replacing(path) as part, part.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return True

@@ -81,23 +81,21 @@ class Batch(NamedTuple):
 
     Attributes
     ----------
-    numbers : (C, 37), neighbours : (C, 27), near : (C,)
+    numbers : (C, 37), neighbours : (C, 27), near, young, density : (C,)
     owner : (C,)
         Body of each cell.
     K : (B, 24, 24), M : (B, 8, 8), stiff_root : (B, 18, 18), heavy_root : (B, 7, 7)
         Of its unit cell.
-    young, density : (C,)
     rows : (C, 24)
         Place of each displacement among the body's, which are padded to n.
     solve : (C, 24)
         Place among the free ones, padded to m; m itself where held.
-    foundation : (B,)
-    free : (B, n)
-    forces, displacements : (B, L, n)
-    energies : (B, L), loaded : (B, L)
+    places : (B, m)
+        Of the free ones among all; n where padded.
+    foundation : (B,), forces, displacements : (B, L, n), energies : (B, L)
+    loaded : (B, L)
         Whether there is such a load.
-    squares : (B, M)
-    modes : (B, M, n)
+    squares : (B, M), modes : (B, M, n)
     """
 
     numbers: Tensor

@@ -19,9 +19,8 @@ from torch import Tensor
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, replacing, write_text
 from pdcorrect.elements.collection import DRAWN, file_paths, generate, read_file
-from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Sample, collate, errors, loss, means, sample
-from pdcorrect.elements.network import ElementNetwork
+from pdcorrect.elements.network import Descent, ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.element_network import write_network
 from pdcorrect.fem.learned import LARGEST_POISSON
@@ -42,7 +41,6 @@ class ElementRecipe:
     ----------
     bodies : int
         Random bodies to learn from; others, and fewer, judge it.
-    seed : int
     width, rounds : int
         See `ElementNetwork`.
     iterations, batch : int
@@ -117,21 +115,7 @@ def train(
 
 
 class Trainer:
-    """The network, its optimiser and the batches of bodies.
-
-    Parameters
-    ----------
-    recipe : ElementRecipe
-    known, others : sequences of Sample
-        Bodies to learn from, and to judge by.
-    device : str
-    kind : subclass of ElementNetwork
-        Of the network.
-
-    Attributes
-    ----------
-    iteration : int
-    """
+    """The network, its optimiser, and the batches of ``known`` bodies; ``others`` judge it."""
 
     def __init__(
         self,
@@ -279,12 +263,8 @@ class Trainer:
 class Recorded:
     """Work on a GPU as a CUDA graph: its thousand kernels take longer to launch than to run.
 
-    Parameters
-    ----------
-    work : callable
-        Without arguments and of the same shapes each time; its answer is overwritten each time.
-    pool : handle of `torch.cuda.graph_pool_handle`
-        Memory that it shares with other graphs that never run at the same time.
+    ``work`` is of the same shapes each time, and its answer is overwritten each time.  ``pool`` is
+    memory that it shares with other graphs that never run at the same time.
     """
 
     def __init__(self, work: Callable[[], Tensor], pool: Any) -> None:

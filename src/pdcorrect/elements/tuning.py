@@ -16,9 +16,8 @@ from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
-from pdcorrect.elements.descent import Descent
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
-from pdcorrect.elements.network import ElementNetwork
+from pdcorrect.elements.network import Descent, ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.element_network import MODEL, read_network, write_network
 from pdcorrect.fem.learned import LARGEST_POISSON, effective_moduli

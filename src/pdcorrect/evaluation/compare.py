@@ -11,12 +11,7 @@ import numpy as np
 
 from pdcorrect import metrics
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.evaluation.comparison_cases import (
-    CASE_BASES,
-    Case,
-    cases_for,
-    without_best,
-)
+from pdcorrect.evaluation.comparison_cases import CASE_BASES, Case, cases_for
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.metrics import relative_error
 from pdcorrect.scene import Scene
@@ -69,10 +64,8 @@ class Comparison:
     ----------
     rows : tuple of Row
         In the order coarse to fine, without cases that failed.
-    runs : dict of str to Trajectory
-        Each case on its own mesh.
-    on_coarse : dict of str to Trajectory
-        The same on the coarse nodes.
+    runs, on_coarse : dict of str to Trajectory
+        Each case on its own mesh, and on the coarse nodes.
     cases : tuple of Case
     models : dict of str to dict
         Of correctors, by label: model, base, the data set that it was trained on, that one's
@@ -80,18 +73,13 @@ class Comparison:
     reference : str
         Label of the case that errors are measured against.
     solver_error : float or None
-        Largest node distance between PD and Newton on the coarse mesh, m: they
-        minimise the same energy, so this is solver error, unless the body
-        buckles and they take different branches.  None without both, or if a
-        frame needed a fallback.
+        Largest node distance between PD and Newton on the coarse mesh, m: they minimise the same
+        energy, so this is solver error, unless the body buckles and they take different branches.
+        None without both, or if a frame needed a fallback.
     failures : dict of str to str
         Of cases that did not come to their end, by label: why.
-    without_best : str or None
-        Why none of the cases is the best coarse model; None if one is, or could be.
-    converged : Trajectory or None
-        The converged motion, if errors to it were asked for.
-    finer : Trajectory or None
-        What errors on the coarse mesh are estimated by, if that was asked for.
+    converged, finer : Trajectory or None
+        The converged motion, and what errors on the coarse mesh are estimated by, if asked for.
     """
 
     scene: Scene
@@ -103,7 +91,6 @@ class Comparison:
     cases: tuple[Case, ...]
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     failures: Mapping[str, str] = field(default_factory=dict)
-    without_best: str | None = None
     converged: Trajectory | None = None
     finer: Trajectory | None = None
 
@@ -240,9 +227,7 @@ def compare(
         )
     return Comparison(
         scene, tuple(rows), runs, on_coarse, cases[0].label, _solver_error(complete, runs), cases,
-        _models(cases), failures,
-        None if any(case.base == "enhanced" for case in cases) else without_best(scene), converged,
-        finer,
+        _models(cases), failures, converged, finer,
     )  # fmt: skip
 
 

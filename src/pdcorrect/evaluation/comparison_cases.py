@@ -6,8 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.problem import Problem, coarse_model, discretise
+from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import Scene, best_coarse, check_scene, learned_coarse, trained_coarse
+
+CASE_BASES = ("plain", "enhanced", "learned", "best")
+"""In the order of rows."""
+_27_NODES = "hex27"
+_SECOND_ORDER = "generalised-alpha"
 
 
 @dataclass(frozen=True)
@@ -20,18 +25,15 @@ class Case:
     solver : str
         "pd" or "newton".
     refine : int
-    base : {"plain", "enhanced", "learned", "best", "total-mass"}
-        "enhanced", "learned": element and mass of `best_coarse`, `learned_coarse`.  Others as of
-        `coarse_model`: "best" is what correctors were trained on.  "total-mass" is for the coarse
-        mesh only.
+    base : {"plain", "enhanced", "learned", "best"}
+        Element and mass of the scene, or of its `best_coarse`, `learned_coarse` or
+        `trained_coarse`, on which correctors of the base "best" were trained.
     model : str or None
         Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
     gate : bool
         Whether a default `Gate` lets the corrector pass.
-    element : str or None
-        In place of the scene's, on the scene's cells; of base "plain" only.
-    integrator : str or None
-        In place of the scene's.
+    element, integrator : str or None
+        In place of the scene's; an element on the scene's cells, of base "plain" only.
     """
 
     label: str
@@ -55,23 +57,40 @@ class Case:
         Raises
         ------
         InputError
-            If there is no such base on its mesh, or an element is given with another base.
+            If there is no such base, or an element is given with another one than "plain".
         """
         if self.integrator is not None:
             scene = scene.with_changes(time={"integrator": self.integrator})
-        possible = self.element is None and (self.refine == 1 or self.base in _BETTER)
-        if self.base != "plain" and not possible:
+        if self.base not in CASE_BASES or (self.base != "plain" and self.element is not None):
             raise InputError(
-                f"{self.label}: base {self.base!r} refined {self.refine} times, with element "
-                f"{self.element!r}: expected base 'plain', or one refinement and no element."
+                f"{self.label}: base {self.base!r} with element {self.element!r}: expected one of "
+                f"{', '.join(CASE_BASES)}, and 'plain' for an element."
             )
-        if self.base in _BETTER:
-            return discretise(_BETTER[self.base](scene), self.refine)
         if self.base != "plain":
-            return coarse_model(scene, self.base)
+            return discretise(_BETTER[self.base](scene), self.refine)
         # "per-node" is for nodes at corners only
         per_node = self.element is not None and scene.solver.mass == "per-node"
         return discretise(scene, self.refine, "averaged" if per_node else None, self.element)
+
+
+CASES = (
+    Case("fine PD", "pd", 4),
+    Case("intermediate PD", "pd", 2),
+    Case("coarse PD", "pd", 1),
+    Case("coarse Newton", "newton", 1),
+)
+"""Of a scene as it is; the first case is the reference of all errors."""
+
+HEX27 = Case("coarse PD, hex27", "pd", 1, element=_27_NODES)
+"""The scene's cells with 27 nodes each."""
+LEARNED = Case("learned coarse PD", "pd", 1, "learned")
+"""The coarse model with the learned element."""
+_BEST = Case("best coarse PD", "pd", 1, "enhanced")
+_FINE_BEST = Case("fine best PD", "pd", 4, "enhanced")
+_FINE_TRAINED = Case("fine PD as trained", "pd", 4, "best")
+"""The reference that correctors of the base "best" have learned from."""
+_TRAINED = Case("coarse PD as trained", "pd", 1, "best")
+"""The coarse model that those correct."""
 
 
 def with_learned(scene: Scene) -> Scene:
@@ -82,7 +101,7 @@ def with_learned(scene: Scene) -> Scene:
     InputError
         If the scene's own element has 27 nodes.
     """
-    if scene.solver.element == HEX27.element:
+    if scene.solver.element == _27_NODES:
         raise InputError(
             "learned: the scene's 27-node elements have nodes where it has none: expected a "
             "scene of another element."
@@ -93,34 +112,7 @@ def with_learned(scene: Scene) -> Scene:
 _BETTER: dict[str, Callable[[Scene], Scene]] = {
     "enhanced": best_coarse, "learned": with_learned, "best": trained_coarse
 }  # fmt: skip
-"""Element and mass of bases that may be refined."""
-
-CASES = (
-    Case("fine PD", "pd", 4),
-    Case("intermediate PD", "pd", 2),
-    Case("coarse PD", "pd", 1),
-    Case("coarse Newton", "newton", 1),
-)
-"""Of a scene as it is; the first case is the reference of all errors."""
-
-HEX27 = Case("coarse PD, hex27", "pd", 1, element="hex27")
-"""The scene's cells with 27 nodes each."""
-
-_SECOND_ORDER = "generalised-alpha"
-_BEST = Case("best coarse PD", "pd", 1, "enhanced")
-LEARNED = Case("learned coarse PD", "pd", 1, "learned")
-"""The coarse model with the learned element."""
-_FINE_BEST = replace(CASES[0], label="fine best PD", base="enhanced")
-"""The coarse model and the reference with the best element."""
-
-_FINE_TRAINED = replace(CASES[0], label="fine PD as trained", base="best")
-"""The reference that correctors of the base "best" have learned from."""
-
-_COARSE = {"best": "coarse PD as trained", "total-mass": "coarse PD, total mass"}
-"""Labels of coarse models that are corrected, by their base."""
-
-CASE_BASES = ("plain", "enhanced", "learned", "best", "total-mass")
-"""In the order of rows."""
+"""Element and mass of a base."""
 
 
 def cases_for(
@@ -132,12 +124,12 @@ def cases_for(
     learned: bool = False,
     second_order: bool = False,
 ) -> tuple[Case, ...]:
-    """What `compare` runs by default: `cases_with`, and always the best coarse model.
+    """What `compare` runs by default: the scene as it is, and always the best coarse model.
 
     The reference is the fine mesh with the element of the best coarse model; with correctors it
-    is what they learned from.  A scene that has no such model, see `without_best`,
-    has its own element on the fine mesh.  The coarse run of a scene with the learned element is
-    called so.
+    is what they learned from, and the coarse models that they correct are among the cases.  A
+    scene of 27-node elements, or of the best coarse model's own, has its own element on the fine
+    mesh.  The coarse run of a scene with the learned element is called so.
 
     Parameters
     ----------
@@ -157,31 +149,33 @@ def cases_for(
     Raises
     ------
     InputError
-        As `cases_with`; or if a corrector's base or reference cannot be made for the scene, or
-        the scene's own element has 27 nodes and others are asked for.
+        If there is no such model, models learned from references of unlike elements, or the
+        scene's own element has 27 nodes and others are asked for.
     """
-    reference, *others = cases_with(models, gate=gate)
-    if without_best(scene) is None:
-        reference = reference if models else _FINE_BEST
-        others.insert(len(CASES) - 1, _BEST)
-    if reference == _FINE_TRAINED:
-        why = _impossible(scene, trained_coarse(scene))
-        if why:
+    check_scene(scene)
+    own = scene.solver.element
+    if own == _27_NODES and hex27:
+        raise InputError(
+            "hex27: the scene's own element is hex27: expected a scene of another element."
+        )
+    reference, *others = CASES
+    if own != _27_NODES and scene.solver != best_coarse(scene).solver:
+        reference = _FINE_BEST
+        others.append(_BEST)
+    if models:
+        reference, hybrids = _hybrids(models, gate)
+        if own == _27_NODES and reference == _FINE_TRAINED:
             raise InputError(
-                f"models {', '.join(models)}: correct a coarse model that this scene has not: "
-                f"{why}. Expected a scene that has one, or models of another base."
+                f"models {', '.join(models)}: correct a coarse model without nodes where the "
+                "scene's 27-node elements have some: expected a scene of another element."
             )
-    if scene.solver.element == "hex8-learned":
+        others += hybrids
+    if own == "hex8-learned":
         others[others.index(CASES[2])] = replace(CASES[2], label=LEARNED.label)
     elif learned:
         with_learned(scene)  # or a refusal before anything runs
         others.append(LEARNED)
-    if hex27:
-        if scene.solver.element == HEX27.element:
-            raise InputError(
-                "hex27: the scene's own element is hex27: expected a scene of another element."
-            )
-        others.append(HEX27)
+    others += [HEX27] if hex27 else []
     if second_order and scene.time.integrator not in (_SECOND_ORDER, "quasi-static"):
         others += [
             replace(case, label=f"{case.label}, {_SECOND_ORDER}", integrator=_SECOND_ORDER)
@@ -191,69 +185,23 @@ def cases_for(
     return (reference, *others)
 
 
-def without_best(scene: Scene) -> str | None:
-    """Why a scene has no best coarse model beside its own; None if it has one.
-
-    Where the scene itself cannot be discretised the reason is that of the scene.
-    """
-    check_scene(scene)
-    if scene.solver == best_coarse(scene).solver:
-        return "the scene's own element and mass are those of the best coarse model"
-    return _impossible(scene, best_coarse(scene))
-
-
-def _impossible(scene: Scene, other: Scene) -> str | None:
-    """Why the scene with another element of 8 nodes is no case beside it; None if it is one."""
-    if scene.solver.element == HEX27.element:
-        return "it has no nodes where the scene's 27-node elements have some"
-    try:
-        discretise(other)
-    except InputError as error:
-        return str(error).rstrip(".")
-    return None
-
-
-def cases_with(models: Sequence[str], *, gate: bool = True) -> tuple[Case, ...]:
-    """The cases of a scene as it is, and correctors.
-
-    Those of the best coarse model have learned references with its element: all errors
-    are then distances from such a one.  The coarse models that they correct are among the cases.
-    `cases_for` adds what a scene affords besides.
-
-    Parameters
-    ----------
-    models : sequence of str
-        Names or folders.
-    gate : bool
-        Of the correctors.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, or they learned from references of unlike elements.
-    """
-    if not models:
-        return CASES
+def _hybrids(models: Sequence[str], gate: bool) -> tuple[Case, list[Case]]:
+    """What correctors learned from, the coarse models that they correct, and they themselves."""
     from pdcorrect.corrector.model_io import load_model, model_folder, unlike_ends
 
     names = unlike_ends([model_folder(model).resolve() for model in models])
     bases = [load_model(model).base for model in models]
-    reference, *others = CASES
-    if "best" in bases:
-        if set(bases) != {"best"}:
-            raise InputError(
-                f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: "
-                "expected of 'best' or of the others, as their references have unlike elements; "
-                "compare the others apart."
-            )
-        reference = _FINE_TRAINED
+    if set(bases) not in ({"best"}, {"plain"}):
+        raise InputError(
+            f"models {', '.join(names)}: correctors of {', '.join(sorted(set(bases)))}: expected "
+            "all of 'best' or all of 'plain', as their references have unlike elements."
+        )
     without = "" if gate else ", no gate"
-    return (
-        reference,
-        *others,
-        *(Case(_COARSE[b], "pd", 1, b) for b in dict.fromkeys(bases) if b != "plain"),
+    reference, corrected = (_FINE_TRAINED, [_TRAINED]) if "best" in bases else (CASES[0], [])
+    return reference, [
+        *corrected,
         *(
             Case(f"hybrid {name}{without}", "pd", 1, base, model, gate)
             for name, base, model in zip(names, bases, models, strict=True)
         ),
-    )
+    ]

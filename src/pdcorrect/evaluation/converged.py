@@ -1,4 +1,4 @@
-"""The converged motion of a scene, from which relative errors are measured; kept on disk."""
+"""The converged motion of a scene, kept on disk, and estimates of how far runs are from it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pdcorrect._environment import cache_folder, code_digest
 from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect._version import __version__
-from pdcorrect.errors import FileFormatError
-from pdcorrect.fem.problem import discretise
+from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
+from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.metrics import relative_error
-from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene
+from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene, learned_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.solvers.rollout import restrict, rollout
+from pdcorrect.solvers.rollout import OWN_MATERIAL, OnStep, restrict, rollout
 from pdcorrect.state import StepResult
 from pdcorrect.trajectory import Trajectory
 
@@ -30,13 +33,17 @@ TIME_ERROR, MESH_ERROR, MESH_CHECK = "time_error", "mesh_error", "mesh_error_fro
 INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
 _MOST_CELLS = 60_000
 """Of a mesh that is only for the estimate of another's error."""
+FINER = 2
+"""Times as many cells along each axis, and substeps, as a run whose error is estimated."""
+_SAME = 1e-9
+"""Of the cell size, for states that are the same."""
 
-OnStep = Callable[[str, int, int], None]
+OnRun = Callable[[str, int, int], None]
 """Called with what is computed, its frame, and their number."""
 
 
 def converged(
-    scene: Scene, frames: int | None = None, *, error: bool = False, on_step: OnStep | None = None
+    scene: Scene, frames: int | None = None, *, error: bool = False, on_step: OnRun | None = None
 ) -> Trajectory:
     """The motion that a scene tends to as mesh and time step are refined.
 
@@ -84,7 +91,7 @@ def converged(
     return run
 
 
-def _computed(scene: Scene, refine: int, divisor: int, on_step: OnStep | None) -> Trajectory:
+def _computed(scene: Scene, refine: int, divisor: int, on_step: OnRun | None) -> Trajectory:
     problem = discretise(_refined_in_time(best_coarse(scene), divisor), refine)
     coarse = discretise(best_coarse(scene))
     stepper = ProjectiveDynamics(problem).prepare()
@@ -117,7 +124,7 @@ def _refined_in_time(scene: Scene, divisor: int) -> Scene:
     )
 
 
-def _own_error(scene: Scene, run: Trajectory, on_step: OnStep | None) -> dict[str, str]:
+def _own_error(scene: Scene, run: Trajectory, on_step: OnRun | None) -> dict[str, str]:
     """Relative errors by halving or doubling step and cells, as attributes."""
     found = {}
     if scene.time.integrator != "quasi-static":
@@ -170,3 +177,84 @@ def _keep(path: Path, run: Trajectory) -> None:
         make_folder(path.parent)
         with replacing(path, part_of_process(path)) as part:
             save_trajectory(part, run)
+
+
+# --- estimates ---------------------------------------------------------------------------
+
+
+def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> NDArray[np.float64]:
+    """Estimated distance of each node from the converged motion, in each frame, (T+1, N), m.
+
+    It is the distance to another run, with the learned element on 2x2x2 cells for each of the
+    run's, by generalised-alpha with twice as many substeps.  That run takes 10 to 20 times as
+    long.  How near the estimate is: `validation/unlike_bodies`.
+
+    Parameters
+    ----------
+    run : Trajectory
+        Of its scene's material and initial state, without other forces than the scene's.
+    on_step : callable, optional
+        For progress, see `rollout`.
+
+    Raises
+    ------
+    InputError
+        If the run has no scene, or another material, state at the beginning, or steps.
+    ConvergenceError
+        If a step of the finer run fails.
+    """
+    if not isinstance(run, Trajectory):
+        raise InputError(f"run is a {type(run).__name__}: expected a Trajectory.")
+    scene = Scene.from_toml(run.scene_toml, "the run's scene")
+    scene = scene.with_changes(time={"frames": max(1, len(run))})
+    refine = int(run.attributes.get("refine", "1"))
+    _check_own(run, discretise(scene, refine))
+    finer = restrict(finer_run(scene, len(run), refine, on_step=on_step), run)
+    return np.asarray(np.linalg.norm(run.positions - finer.positions, axis=2))
+
+
+def finer_run(
+    scene: Scene, frames: int, refine: int = 1, *, on_step: OnStep | None = None
+) -> Trajectory:
+    """The run from which `error_estimate` measures those with ``refine`` cells for each coarse one.
+
+    Raises
+    ------
+    ConvergenceError
+    """
+    # weights tuned to a body do not know finer cells
+    scene = scene.with_changes(solver={"weights": None})
+    if scene.time.integrator != "quasi-static":
+        scene = scene.with_changes(time={"substeps": FINER * scene.time.substeps, **INTEGRATOR})
+    problem = discretise(learned_coarse(scene), FINER * refine)
+    try:
+        return rollout(ProjectiveDynamics(problem).prepare(), frames, on_step=on_step)
+    except ConvergenceError as error:
+        raise ConvergenceError(
+            f"the finer run of the estimate: {error}", result=error.result
+        ) from None
+
+
+def _check_own(run: Trajectory, problem: Problem) -> None:
+    """Refuse a run of other steps, material or initial state than those of its scene's problem."""
+    time = problem.scene.time
+    kind = run.attributes.get("integrator", time.integrator)
+    still = [name == "quasi-static" for name in (kind, time.integrator)]
+    if still[0] != still[1] or not np.allclose(run.times, time.step * np.arange(len(run) + 1)):
+        raise InputError(
+            f"the run's frames, by {kind}, are not at the times of its scene (steps of "
+            f"{time.step:g} s, {time.integrator}): expected a run of the scene itself."
+        )
+    material = run.attributes.get("material", OWN_MATERIAL)
+    if material != OWN_MATERIAL:
+        raise InputError(f"the run's material is {material}: expected that of its scene.")
+    begin, far = problem.initial_state(), _SAME * problem.cell_size
+    x, v = begin.positions[None], begin.velocities[None]
+    own = restrict(Trajectory(x, v, np.zeros(1), {}, problem.positions, problem.cells), run)
+    if (
+        np.abs(run.positions[0] - own.positions[0]).max() > far
+        or np.abs(run.velocities[0] - own.velocities[0]).max() * problem.time_step > far
+    ):
+        raise InputError(
+            "the run begins with another state than its scene: expected the scene's initial one."
+        )

@@ -6,17 +6,27 @@ import contextlib
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.batch.stepper import BatchStepper
+from pdcorrect.corrector.batch_hybrid import BatchHybrid
+from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, check_whole, missing_files
+from pdcorrect.corrector.model_io import (
+    LoadedModel,
+    load_model,
+    model_folder,
+    unlike_ends,
+    weights_digest,
+)
+from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
+from pdcorrect.data.folder import check_whole, missing_files
 from pdcorrect.data.schema import PLAIN, REFERENCE
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation.measures import (
@@ -35,8 +45,10 @@ from pdcorrect.evaluation.rollouts import (
     single_steps_alone,
 )
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.projective import ProjectiveDynamics
 
 Array = NDArray[np.float64]
+DEFAULT_GATE = Gate()
 OnCases = Callable[[int, int], None]
 """Called with how many trajectories of how many are done."""
 
@@ -53,8 +65,6 @@ class Candidate:
         Run of the coarse model that it corrects: "plain", "best" or "total-mass".
     hybrid : callable
         From a stepper of that model's problems to their corrected step.
-    group : str or None
-        Shared by models that differ by their seed only.
     alone : callable or None
         From one problem of that model to its corrected step, which a CPU takes in the place of
         ``hybrid``; None: batches there, too.
@@ -63,8 +73,83 @@ class Candidate:
     name: str
     base: str
     hybrid: Callable[[BatchStepper], Hybrid]
-    group: str | None = None
     alone: Callable[[Problem], HybridStepper] | None = None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SavedCandidate(Candidate):
+    """A model of a folder, to be evaluated."""
+
+    folder: Path
+    model: LoadedModel
+    weights_sha256: str
+
+    def record(self) -> dict[str, Any]:
+        """What identifies it, for results."""
+        found = self.model.record
+        return {
+            "folder": str(self.folder),
+            "weights_sha256": self.weights_sha256,
+            "base": self.base,
+            "seed": self.model.configuration.get("seed"),
+            "velocity": self.model.velocity,
+            "dataset": found.dataset,
+            "dataset_hash": found.dataset_hash,
+            "code_digest": found.code_digest,
+        }
+
+    def warnings(self, dataset: str, config_hash: str, split: str) -> list[str]:
+        """What speaks against taking its errors for those on unseen meshes of its own data."""
+        name, trained = self.name, repr(self.model.record.dataset)
+        known = [x for own, x in self.model.data_sets if own == dataset]
+        if not {config_hash, None}.intersection(known):
+            other = f"another configuration of {dataset!r}" if known else f"not on {dataset!r}"
+            return [f"{name} was trained on {trained}, {other}: it may know meshes of this split."]
+        if split == TRAINING:
+            return [f"{name} was trained on this split: these are not unseen meshes."]
+        if split == VALIDATION:
+            return [f"{name}'s weights were chosen by this split: the figures are too good."]
+        if len({own for own, _ in self.model.data_sets}) > 1:
+            others = f"sets other than {dataset!r} may hold meshes of this split"
+            return [f"{name} was trained on {trained}: {others}."]
+        return []
+
+
+def saved_candidates(
+    paths: Sequence[str | Path], device: str = "cpu", *, gate: Gate | None = DEFAULT_GATE
+) -> list[SavedCandidate]:
+    """Models by folder or name; they are called by the ends of their paths that tell them apart.
+
+    Which coarse model one corrects, and how velocities follow, is what its training says; "plain"
+    and "recomputed" where it says nothing.  Without a gate only corrections that are not finite
+    are refused.
+
+    Raises
+    ------
+    InputError
+        If a model is missing or comes twice.
+    FileFormatError
+        If one is damaged.
+    """
+    names = unlike_ends([model_folder(path).resolve() for path in paths])
+    return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
+
+
+def _saved(path: str | Path, name: str, device: str, gate: Gate | None) -> SavedCandidate:
+    folder = model_folder(path)
+    model = load_model(path, device)
+
+    def hybrid(stepper: BatchStepper) -> Hybrid:
+        return BatchHybrid(stepper, model.corrector, velocity=model.velocity, gate=gate)
+
+    def alone(problem: Problem) -> HybridStepper:
+        coarse = ProjectiveDynamics(problem)
+        return HybridStepper(coarse, model.corrector, velocity=model.velocity, gate=gate)
+
+    return SavedCandidate(
+        name=name, base=model.base, hybrid=hybrid, alone=alone, folder=folder, model=model,
+        weights_sha256=weights_digest(folder),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,14 +159,13 @@ class EvaluatedRun:
     Attributes
     ----------
     name : str
-    base, group : str or None
+    base : str or None
         Of a `Candidate`.
     trajectories : tuple of MeasuredRollout
     """
 
     name: str
     base: str | None
-    group: str | None
     trajectories: tuple[MeasuredRollout, ...]
 
     def values(self, measure: str) -> tuple[list[float], list[int]]:
@@ -108,15 +192,13 @@ class Evaluation:
     Attributes
     ----------
     dataset, split, setting, config_hash : str
-    time_step, cell_size : float
-        s; m.
+    time_step : float
+        s.
     runs : mapping of str to EvaluatedRun
         Candidates, then stored runs, "reference" last: of the latter only energies are of
         interest.
     shards : mapping of str to str
         Content hash of each file, by its name.
-    damaged : mapping of Path to str
-        Files that were left out.
     missing : tuple of Path
         Files that the data set's configuration asks for and that are not there.
     """
@@ -126,10 +208,8 @@ class Evaluation:
     setting: str
     config_hash: str
     time_step: float
-    cell_size: float
     runs: Mapping[str, EvaluatedRun]
     shards: Mapping[str, str]
-    damaged: Damage = field(default_factory=dict)
     missing: tuple[Path, ...] = ()
 
 
@@ -141,7 +221,6 @@ def evaluate(
     device: str = "cpu",
     batch: int = 32,
     workers: int = 1,
-    skip_damaged: bool = False,
     incomplete: bool = False,
     on_cases: OnCases | None = None,
 ) -> Evaluation:
@@ -157,14 +236,11 @@ def evaluate(
         None are allowed: then only stored runs are measured.
     folder : path
         Of the data set.
-    split : str
-    device : str
+    split, device : str
     batch : int
         Simulations that are stepped together; on a CPU candidates with ``alone`` step one by one.
     workers : int
         Processes that measure; the results do not depend on their number.
-    skip_damaged : bool
-        Leave out files that are damaged.
     incomplete : bool
         Take the files that are there, if the data set's configuration asks for more.
     on_cases : callable, optional
@@ -187,9 +263,8 @@ def evaluate(
             missing = tuple(missing_files(folder, split))
     else:
         check_whole(folder, [split])
-    found = read_cases(folder, split, bases, skip_damaged=skip_damaged)
-    read = {*found.shards, *(path.name for path in found.damaged)}
-    missing = tuple(path for path in missing if path.name not in read)
+    found = read_cases(folder, split, bases)
+    missing = tuple(path for path in missing if path.name not in found.shards)
     known = {candidate.name: candidate for candidate in candidates}
     stored = dict.fromkeys(name for case in found.cases for name in _stored(case))
     if len(known) < len(candidates) or known.keys() & {*stored, REFERENCE}:
@@ -206,7 +281,6 @@ def evaluate(
         name: EvaluatedRun(
             name,
             known[name].base if name in known else None,
-            known[name].group if name in known else None,
             tuple(measured[i][name] for i in sorted(measured) if name in measured[i]),
         )
         for name in (*known, *stored, REFERENCE)
@@ -214,8 +288,7 @@ def evaluate(
     about = found.attributes
     return Evaluation(
         str(about["dataset"]), split, str(about["setting"]), str(about["config_hash"]),
-        float(about["time_step"]), found.cases[0].cell_size, runs, found.shards, found.damaged,
-        missing,
+        float(about["time_step"]), runs, found.shards, missing,
     )  # fmt: skip
 
 

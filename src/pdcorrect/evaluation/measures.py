@@ -6,12 +6,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.configuration import EVALUATION
-from pdcorrect.data.folder import Damage, read_files, shard_paths
+from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
@@ -24,7 +25,6 @@ from pdcorrect.metrics import (
     EnergyBalance,
     angular_momentum,
     error_over_time,
-    largest_displacement,
     largest_error,
     linear_momentum,
     mean_squared_error,
@@ -47,10 +47,8 @@ class EvaluationCase:
         Coarse models by the run they made, "plain" among them.
     reference : (T+1, N, 3)
         m.
-    runs : mapping of str to (T+1, N, 3)
-        Stored rollouts, m.
-    predictions : mapping of str to (T, N, 3)
-        Stored single steps from the reference's frames, m.
+    runs, predictions : mappings of str to (T+1, N, 3) and (T, N, 3)
+        Stored rollouts, and single steps from the reference's frames, m.
     """
 
     mesh: int
@@ -72,63 +70,38 @@ class EvaluationCase:
         """T."""
         return len(self.reference) - 1
 
-    @property
-    def time_step(self) -> float:
-        """In s."""
-        return self.problems[PLAIN].time_step
 
-    @property
-    def cell_size(self) -> float:
-        """Of the coarse mesh, m."""
-        return self.problems[PLAIN].cell_size
-
-
-@dataclass(frozen=True, eq=False)
-class SplitCases:
-    """A split's simulations in float64; see `read_cases`."""
+class SplitCases(NamedTuple):
+    """A split's simulations in float64, and its files' content hashes by name."""
 
     attributes: Mapping[str, str | int | float]
     cases: tuple[EvaluationCase, ...]
     shards: Mapping[str, str]
-    damaged: Damage
 
 
 def read_cases(
-    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = (), *, skip_damaged: bool
+    folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = ()
 ) -> SplitCases:
-    """All simulations of a split and their coarse models' problems.
-
-    Parameters
-    ----------
-    folder : path
-    split : str
-    bases : iterable of str
-        Coarse models besides the plain one.
-    skip_damaged : bool
-        Leave out files that are damaged.
+    """All simulations of a split, and problems of the plain coarse model and of ``bases``.
 
     Raises
     ------
     InputError
         If the split is missing, of several data sets, or its problems cannot be rebuilt.
     FileFormatError
-        If a file is damaged; with ``skip_damaged`` if all are.
+        If a file is damaged.
     """
-    damaged: Damage = {}
-    wanted = [PLAIN, *bases]
-    shards: dict[str, str] = {}
+    attributes: list[Mapping[str, str | int | float]] = []
     cases: list[EvaluationCase] = []
-
-    def read(path: Path) -> Mapping[str, str | int | float]:
+    shards: dict[str, str] = {}
+    for path in shard_paths(folder, split):
         shard = read_shard(path)
+        attributes.append(shard.attributes)
+        cases += _cases(shard, path, [PLAIN, *bases])
         shards[path.name] = shard.content_hash
-        cases.extend(_cases(shard, path, wanted))
-        return shard.attributes
-
-    attributes = read_files(shard_paths(folder, split), read, damaged if skip_damaged else None)
     if len({(a["config_hash"], a["time_step"]) for a in attributes}) > 1:
         raise InputError(f"{folder}, {split}: files of several configurations: expected one.")
-    return SplitCases(attributes[0], tuple(cases), shards, damaged)
+    return SplitCases(attributes[0], tuple(cases), shards)
 
 
 def _cases(shard: Shard, path: Path, bases: Sequence[str]) -> list[EvaluationCase]:
@@ -214,15 +187,10 @@ class TrajectoryMeasures:
         Share of the plain run's squared error that is removed (eq. 7-2), per cent.
     omega_base : float
         The same of the run's own coarse model.
-    rms_reduction : float
-        Share of the plain run's RMS error that is removed, per cent.
     rms_error, worst_node : float
         RMS and largest distance of nodes over frames 1..T, m.
     step_omega, step_rms_error : float
         As ``omega`` and ``rms_error``, of single steps from the reference's frames.
-    within_1, within_2, within_5 : float
-        Time until the RMS distance exceeds 1, 2, 5 % of the reference's largest
-        displacement, s; the duration if it never does.
     energy_error : float
         RMS over frames of the difference of kinetic and elastic energy from the
         reference's, over the reference's largest.
@@ -239,8 +207,8 @@ class TrajectoryMeasures:
         Smallest det F at quadrature points of the plain coarse model.
     relative_error : float
         RMS distance from the time-converged reference over that one's RMS displacement, per cent.
-    converged_omega, converged_rms_error : float
-        ``omega`` and ``rms_error`` (m) against the time-converged reference.
+    converged_rms_error : float
+        ``rms_error`` (m) against the time-converged reference.
     gate_rate : float
         Share of the steps that a gate left uncorrected, per cent.
     failed : int
@@ -252,21 +220,16 @@ class TrajectoryMeasures:
     relative_error: float | None = None
     omega: float | None = None
     omega_base: float | None = None
-    rms_reduction: float | None = None
     rms_error: float | None = None
     worst_node: float | None = None
     step_omega: float | None = None
     step_rms_error: float | None = None
-    within_1: float | None = None
-    within_2: float | None = None
-    within_5: float | None = None
     energy_error: float | None = None
     energy_loss: float | None = None
     linear_momentum_error: float | None = None
     angular_momentum_error: float | None = None
     stress_error: float | None = None
     smallest_volume_ratio: float | None = None
-    converged_omega: float | None = None
     converged_rms_error: float | None = None
     gate_rate: float | None = None
     failed: int | None = None
@@ -282,8 +245,7 @@ class MeasuredRollout:
     errors : (T+1,)
         RMS distance from the reference over time, m.
     reasons : (T,) int64
-        Why a gate left its steps uncorrected, numbers of `pdcorrect.corrector.gate.Reason`, 0 where
-        it did not; those until it failed.
+        Why a gate left its steps uncorrected, see `Outcome`; those until it failed.
     """
 
     measures: TrajectoryMeasures
@@ -305,7 +267,7 @@ def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
     errors = np.zeros(0)
     if outcome.positions is not None:
         errors = error_over_time(outcome.positions, case.reference)
-        found |= _of_rollout(case, outcome.positions, outcome.base, errors)
+        found |= _of_rollout(case, outcome.positions, outcome.base)
         found |= _of_physics(case, outcome.positions, outcome.base)
     if outcome.reasons is not None:
         found["gate_rate"] = 100.0 * float((outcome.reasons > 0).mean())
@@ -330,12 +292,6 @@ def omega(positions: Array, coarse: Array | None, reference: Array) -> float | N
     return 100.0 * (1.0 - mean_squared_error(positions, reference) / error) if error else None
 
 
-def time_within(errors: Array, limit: float, time_step: float) -> float:
-    """Time of the first frame whose error exceeds a limit, s; that of the last one if none."""
-    beyond = np.flatnonzero(errors > limit)
-    return time_step * float(beyond[0] if len(beyond) else len(errors) - 1)
-
-
 def _of_steps(case: EvaluationCase, predictions: Array) -> dict[str, float | None]:
     start = case.reference[:1]
     plain = case.predictions.get(PLAIN)
@@ -348,27 +304,18 @@ def _of_steps(case: EvaluationCase, predictions: Array) -> dict[str, float | Non
 
 
 def _of_rollout(
-    case: EvaluationCase, positions: Array, base: str | None, errors: Array
+    case: EvaluationCase, positions: Array, base: str | None
 ) -> dict[str, float | None]:
     reference, plain = case.reference, case.runs.get(PLAIN)
-    rms = rms_error(positions, reference)
-    plain_rms = 0.0 if plain is None else rms_error(plain, reference)
-    size = largest_displacement(reference)
-    converged = case.runs.get(CONVERGED)
     found = {
         "omega": omega(positions, plain, reference),
         "omega_base": omega(positions, case.runs.get(base), reference) if base else None,
-        "rms_reduction": 100.0 * (1.0 - rms / plain_rms) if plain_rms else None,
-        "rms_error": rms,
+        "rms_error": rms_error(positions, reference),
         "worst_node": largest_error(positions, reference),
-        **{
-            f"within_{share}": time_within(errors, share / 100 * size, case.time_step)
-            for share in (1, 2, 5)
-        },
     }
+    converged = case.runs.get(CONVERGED)
     if converged is not None:
         found["relative_error"] = 100.0 * relative_error(positions, converged)
-        found["converged_omega"] = omega(positions, plain, converged)
         found["converged_rms_error"] = rms_error(positions, converged)
     return found
 
@@ -381,7 +328,8 @@ def _of_physics(
     size = float(truth.total.max())
     largest = float(ours.total.max())
     closed = not own.clamps.moving and not any(own.scene.damping.model_dump().values())
-    plain, h = case.problems[PLAIN], case.time_step
+    plain = case.problems[PLAIN]
+    h = plain.time_step
     momenta = {
         name: [of(x, velocities(x, h), plain.mass) for x in (positions, case.reference)]
         for name, of in (

@@ -1,4 +1,4 @@
-"""A `Comparison` as Markdown, CSV, JSON, figures and files for ParaView."""
+"""A `Comparison` as Markdown, CSV, JSON, figures and files for ParaView; notes on runs."""
 
 from __future__ import annotations
 
@@ -7,20 +7,28 @@ import dataclasses
 import io
 import json
 import re
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import pdcorrect.figures as figures
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
-from pdcorrect.evaluation.report_figures import draw_figures
-from pdcorrect.evaluation.report_notes import notes
+from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
+from pdcorrect.metrics import largest_displacement
+from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
+_NOT_UNIQUE = 100.0
+"""Tolerances by which PD and Newton differ where they have taken different branches."""
+_GAINED = 0.1
+"""Of a run's largest energy: more than steps of second order gain where they are short enough."""
 
 # --- the table ---------------------------------------------------------------------------
 
@@ -176,3 +184,184 @@ def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
         write_vtu_series(run, target, name=name, stress_of=run.problem)
         for name, run in runs.items()
     ]
+
+
+# --- figures -----------------------------------------------------------------------------
+
+
+def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
+    """Bodies side by side and over each other, and plots; returns their file names.
+
+    No plot of errors where there is none but the reference's.
+    """
+    labels = [row.label for row in comparison.rows]
+    runs = [comparison.runs[label] for label in labels]
+    truth = comparison.on_coarse[comparison.reference]
+    distance = np.linalg.norm(truth.positions - truth.points, axis=2)
+    frame, node = np.unravel_index(int(distance.argmax()), distance.shape)
+    figures.render(
+        runs,
+        folder / "comparison.png",
+        labels=[_panel_label(comparison, row) for row in comparison.rows],
+        colour="displacement",
+        frame=int(frame),
+    )
+    names = ["comparison.png"]
+    overlaid = overlaid_labels(comparison)
+    if len(overlaid) > 1:
+        last = comparison.on_coarse[overlaid[-1]]
+        figures.render_overlay(
+            [comparison.on_coarse[label] for label in overlaid],
+            folder / "overlay.png",
+            labels=overlaid,
+            frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
+        )
+        names.append("overlay.png")
+    point = truth.points[node]
+    figures.plot_node_trajectories(runs, folder / "node.png", node_point=point, labels=labels)
+    figures.plot_energy(runs, folder / "energy.png", labels=labels)
+    relative = comparison.converged is not None
+    marks = {row.label: (row.seconds_a_frame, _error(row)) for row in comparison.rows}
+    marks = {label: mark for label, mark in marks.items() if mark[1] > 0}
+    if marks:
+        names += ["error_against_time.png", "error_over_time.png"]
+        figures.plot_error_over_time(
+            comparison.errors_over_time(),
+            truth.times,
+            folder / "error_over_time.png",
+            "converged motion" if relative else "reference",
+        )
+        figures.plot_error_against_time(marks, folder / "error_against_time.png", relative)
+    return [*names, "node.png", "energy.png"]
+
+
+def _error(row: Row) -> float:
+    """That which comes first: to the converged motion, or else from the reference, m."""
+    return row.rms_error if row.relative_error is None else row.relative_error
+
+
+def overlaid_labels(comparison: Comparison) -> list[str]:
+    """Which runs are drawn over each other: the reference, what is near it, and the coarse mesh.
+
+    What is near it is the nearest corrector or better coarse model; without any, the nearest with
+    more nodes.  Runs that the comparison does not have are left out.
+    """
+    errors = {row.label: row.rms_error for row in comparison.rows}
+    cases = [case for case in comparison.cases if case.label in errors]
+    plain = [c.label for c in cases if c.plain and c.solver == "pd"]
+    others = [c for c in cases if c.label != comparison.reference]
+    finer = [c.label for c in others if c.refine > 1 or c.element is not None]
+    better = [c.label for c in cases if c.refine == 1 and (c.model or c.base != "plain")] or finer
+    nearest = sorted(better, key=lambda label: errors[label])[:1]
+    return list(dict.fromkeys([comparison.reference, *nearest, *plain[:1]]))
+
+
+def _panel_label(comparison: Comparison, row: Row) -> str:
+    """Lines above a body."""
+    error = f"RMS error {1e3 * row.rms_error:.2g} mm"
+    if row.relative_error is not None:
+        error = f"error {100.0 * row.relative_error:.3g} %"
+    elif row.label == comparison.reference:
+        error = "reference"
+    lines = [
+        f"{row.label}, {row.nodes} nodes",
+        f"{error}, {1e3 * row.seconds_a_frame:.3g} ms a frame",
+    ]
+    if row.refused_frames:
+        lines.append(f"{row.refused_frames} of {len(comparison.runs[row.label])} refused")
+    return "\n".join(lines)
+
+
+# --- notes -------------------------------------------------------------------------------
+
+
+def notes(comparison: Comparison) -> list[str]:
+    """What errors are measured from, and what is unusual: one sentence each."""
+    truth, time = comparison.on_coarse[comparison.reference], comparison.scene.time
+    found = [
+        f"{len(truth)} frames of {time.step:g} s by {time.integrator}; RMS and worst are distances "
+        f"from {comparison.reference}, which moves by up to {1e3 * largest_displacement(truth):.3g}"
+        " mm.",
+        _own_error(comparison),
+        _branches(comparison),
+    ]
+    found += [f"{label} failed: {why.rstrip('.')}." for label, why in comparison.failures.items()]
+    for row in comparison.rows:
+        stats = comparison.runs[row.label].stats
+        told = [
+            f"{row.unusual_frames} frames needed a fallback." if row.unusual_frames else "",
+            inverted_frames(stats, time.step),
+            refused_corrections(stats["gate"]) if row.refused_frames else "",
+        ]
+        found += [f"{row.label}: {text}" for text in told if text]
+    return [note for note in found if note]
+
+
+def _own_error(comparison: Comparison) -> str:
+    """Of the converged motion, where it is known."""
+    known = {} if comparison.converged is None else comparison.converged.attributes
+    return ", ".join(
+        f"own {name} error of the converged motion {float(known[key]):.2%}"
+        for name, key in (("time", TIME_ERROR), ("mesh", MESH_ERROR))
+        if key in known
+    )
+
+
+def _branches(comparison: Comparison) -> str:
+    """Whether PD and Newton have come to other motions."""
+    problem, apart = comparison.runs[comparison.reference].problem, comparison.solver_error
+    if problem is None or apart is None:
+        return ""
+    if apart <= _NOT_UNIQUE * comparison.scene.solver.tolerance * problem.cell_size:
+        return ""
+    return (
+        f"PD and Newton differ by {1e3 * apart:.2g} mm on the coarse mesh: the motion seems not to "
+        "be unique, and distances from one reference mean little."
+    )
+
+
+def refused_corrections(reasons: Iterable[float]) -> str:
+    """One sentence: how many corrections were refused, and why; empty if none was.
+
+    ``reasons`` are numbers of `pdcorrect.corrector.gate.Reason`, 0 where a step was corrected.
+    """
+    from pdcorrect.corrector.gate import refusals
+
+    every = list(reasons)
+    found = refusals(every)
+    if not found:
+        return ""
+    counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
+    return f"{sum(one.steps for one in found)} of {len(every)} corrections were refused ({counts})."
+
+
+def gained_energy(stats: Mapping[str, Any]) -> str:
+    """Whether a run has more energy than was put in since its first step; empty if not."""
+    stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
+    put_in = np.cumsum(
+        np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
+    )
+    gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
+    if not gained > _GAINED * stored.max():
+        return ""
+    return (
+        f"the run gained {gained:.3g} J that nothing put in: take smaller steps or a smaller "
+        "spectral_radius"
+    )
+
+
+def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
+    """How many frames of a run ended with inverted cells, and the first one; empty if none.
+
+    ``step`` is the length of a frame, s.
+    """
+    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
+    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
+        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
+    if not inverted.any():
+        return ""
+    first = 1 + int(inverted.argmax())
+    return (
+        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
+        f"first at t = {first * step:g} s"
+    )

@@ -66,15 +66,9 @@ def roll_out(
     """All scenes of a stepper from their initial states, each for its number of steps.
 
     A failed scene is held at its last state, so its error is that of a simulation that has
-    stopped: it is neither left out nor replaced by anything better.
-
-    Parameters
-    ----------
-    hybrid, stepper
-    steps : sequence of int
-    worth : callable, optional
-        Told each frame and the positions (B, N, 3) there, m: which scenes (B,) are to go on.
-        Others are held without having failed.
+    stopped: it is neither left out nor replaced by anything better.  ``worth`` is told each frame
+    and the positions (B, N, 3) there, m, and says which scenes (B,) are to go on; others are held
+    without having failed.
     """
     rest, state, previous = stepper.rest_state(), stepper.initial_state(), None
     frames, reasons = [rest.positions], []
@@ -110,20 +104,10 @@ def single_steps(
     references: Sequence[Array],
     coarse: Sequence[Array | None],
 ) -> list[Array]:
-    """One step from each frame of each scene's reference but the last, (T, N, 3), m.
+    """One step from each frame of each scene's reference (T+1, N, 3) but the last, (T, N, 3), m.
 
-    Parameters
-    ----------
-    hybrid, stepper
-    references : sequence of (T+1, N, 3)
-        m.
-    coarse : sequence of (T, N, 3) or None
-        Single steps of the coarse model: the correction of the step before is taken to have
-        been what it lacked; without them zero.
-
-    Notes
-    -----
-    A step that fails leaves the scene where it was.
+    The correction of the step before is taken to have been what the coarse model's single steps
+    (T, N, 3) lacked; without them zero.  A step that fails leaves the scene where it was.
     """
     h = stepper.time_step
     speeds = [velocities(x, h) for x in references]
@@ -193,16 +177,7 @@ def roll_out_alone(hybrid: HybridStepper, steps: int) -> Outcome:
 
 
 def single_steps_alone(hybrid: HybridStepper, reference: Array, coarse: Array | None) -> Array:
-    """One step from each frame of a reference but the last, (T, N, 3), m; see `single_steps`.
-
-    Parameters
-    ----------
-    hybrid : HybridStepper
-    reference : (T+1, N, 3)
-        m.
-    coarse : (T, N, 3), optional
-        Single steps of the coarse model, m.
-    """
+    """One step from each frame of a reference but the last, (T, N, 3), m; see `single_steps`."""
     h = hybrid.coarse.time_step
     speeds = velocities(reference, h)
     found = []

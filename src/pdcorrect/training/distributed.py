@@ -16,12 +16,7 @@ from pdcorrect.errors import InputError
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """A process among others, as ``torchrun`` started them; alone by default.
-
-    Attributes
-    ----------
-    rank, size : int
-    """
+    """A process among others, as ``torchrun`` started them; alone by default."""
 
     rank: int = 0
     size: int = 1

@@ -25,16 +25,8 @@ def fit_normaliser(corrector: Corrector, windows: StepWindows, most: int, seed: 
 
     Inputs are what the network sees in a step from the reference, targets what it should
     give there, on free components.  Ranges hold the first steps of simulations besides: of a
-    kick, that is the only one with its load.
-
-    Parameters
-    ----------
-    corrector : Corrector
-    windows : StepWindows
-        Of the training split.
-    most : int
-        Windows; if there are more, so many are drawn without replacement by ``seed``.  The same
-        limit holds for first steps.
+    kick, that is the only one with its load.  If there are more than ``most`` windows, or first
+    steps, so many are drawn without replacement by ``seed``.
     """
     chosen = _chosen(np.arange(len(windows.dataset)), most, seed)
     found, target = _moments(corrector, windows, chosen)
@@ -49,7 +41,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
     """Widen the ranges of a fitted normalisation to what these windows hold, too.
 
     Means, deviations and the output's scale stay, for the weights belong to them; a gate then
-    takes these data for known as well as those before.  Parameters as of `fit_normaliser`.
+    takes these data for known as well as those before.
     """
     corrector.envelope.widen(_at_rest(windows))
     _widen(corrector, windows, _chosen(np.arange(len(windows.dataset)), most, seed))

@@ -35,19 +35,7 @@ def rate_at(rate: Rate, progress: float) -> float:
 class Optimiser:
     """Updates a corrector's weights by one stage's rules.
 
-    Parameters
-    ----------
-    corrector : Corrector
-    stage : Stage
-    averaged : Corrector or None
-        Takes the averaged weights, if the stage wants them.
-    world : ProcessGroup
-
-    Attributes
-    ----------
-    loss_sum, count, skipped, row, longest : () tensors
-        Since `take_report`: sum of the finite losses and their number, batches left out; then
-        how many were left out in a row up to now, and at most.
+    ``averaged`` takes the averaged weights, if the stage wants them.
     """
 
     def __init__(
@@ -61,6 +49,8 @@ class Optimiser:
         self._stage, self._world = stage, world
         self._adam = torch.optim.Adam(self._weights, lr=stage.rate.peak, fused=True)
         device = self._weights[0].device
+        # since `take_report`: sum of the finite losses and their number, batches left out; then
+        # how many were left out in a row up to now, and at most
         self._bad = torch.zeros((), device=device)
         self._told = torch.zeros(len(_TOLD), dtype=torch.float64, device=device)
         self._counts = dict(zip(_TOLD, self._told.unbind(), strict=True))

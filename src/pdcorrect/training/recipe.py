@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -16,11 +15,9 @@ from pydantic import (
 from pydantic.config import JsonDict
 
 from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
-from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, changed
+from pdcorrect.corrector.architecture import CorrectorConfig, changed
 from pdcorrect.data.configuration import TRAINING, VALIDATION
-from pdcorrect.fem.problem import Base
 
-_FILE = re.compile(rf"([^/]+/)?({TRAINING}|{VALIDATION})/mesh-\d{{4,}}")
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 Decay = Annotated[float, Field(strict=True, gt=0, lt=1)]
 Flag = Annotated[bool, Field(strict=True)]
@@ -36,24 +33,8 @@ def _rising(steps: tuple[int, ...]) -> tuple[int, ...]:
     return steps
 
 
-def _file_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    for name in names:
-        if not _FILE.fullmatch(name) or names.count(name) > 1:
-            raise ValueError(
-                f"{name!r}: expected files of the training and validation splits, each once, such "
-                "as 'training/mesh-0042', with several data sets 'SET/training/mesh-0042'"
-            )
-    return names
-
-
-def _model_name(name: str) -> str:
-    if not name.strip():
-        raise ValueError("expected the folder or name of a model; leave the key out for none")
-    return name
-
-
-ModelName = Annotated[str, AfterValidator(_model_name)]
-Files = Annotated[tuple[str, ...], AfterValidator(_file_names)]
+ModelName = Annotated[str, Field(min_length=1)]
+FileName = Annotated[str, Field(pattern=rf"^({TRAINING}|{VALIDATION})/mesh-\d{{4,}}$")]
 Horizon = Annotated[tuple[PositiveCount, ...], BeforeValidator(_several), AfterValidator(_rising)]
 
 
@@ -64,17 +45,10 @@ _CHANGES: JsonDict = {name: {} for name in CorrectorConfig.model_fields}
 class Architecture(Strict):
     """A preset of `PRESETS`, and the values that differ from it."""
 
-    preset: str = "compact"
+    preset: Literal["thesis", "equivariant", "compact"] = "compact"
     changes: Annotated[dict[str, Any], Field(json_schema_extra={"properties": _CHANGES})] = Field(
         default_factory=dict
     )
-
-    @field_validator("preset")
-    @classmethod
-    def _there(cls, name: str) -> str:
-        if name not in PRESETS:
-            raise ValueError(f"expected one of {', '.join(map(repr, PRESETS))}")
-        return name
 
     @field_validator("changes")
     @classmethod
@@ -94,16 +68,15 @@ class Loss(Strict):
     Attributes
     ----------
     kind
-        "relative": mean squared distance over that of the base model on the same
-        trajectory.  "absolute": positions in units of 1 / ``scale`` metres (thesis: 1000).
+        "relative": mean squared distance over that of the base model on the same trajectory.
+        "absolute": of positions in units of 1 / ``scale`` metres (thesis: 1000).
     power
         Of "absolute": 1 sums distances over nodes, 2 their squares.
     bend
-        Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``), so that those
-        far above ``bend`` do not outweigh all others.  None: as x.
+        Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``); None: as x.
     ahead
         Of "relative", in unrolled stages: weight of what the error of a state will come to in the
-        frames ahead (`pdcorrect.training.vibrations`).
+        frames ahead.
     """
 
     kind: Literal["relative", "absolute"] = "relative"
@@ -123,13 +96,8 @@ class Loss(Strict):
 class Noise(Strict):
     """Gaussian noise on what the network sees of the coarse solver's answer (eq. 5-5, 5-6).
 
-    The target makes good for it, too.
-
-    Attributes
-    ----------
-    tau
-        Deviation of a component, in root mean squared one-step errors (a component) of the base
-        model on the same trajectory.
+    The target makes good for it, too.  ``tau`` is the deviation of a component, in root mean
+    squared one-step errors (a component) of the base model on the same trajectory.
     """
 
     tau: NonNegative = 0.0
@@ -138,11 +106,7 @@ class Noise(Strict):
 class Rate(Strict):
     """Adam's learning rate: linear rise, then half a cosine; constant if ``last`` is ``peak``.
 
-    Attributes
-    ----------
-    peak, last
-    warmup
-        Share of the stage.
+    ``warmup`` is the share of the stage in which it rises.
     """
 
     peak: Positive = 1e-3
@@ -176,14 +140,12 @@ class Stage(Strict):
     through_solver
         Of "unrolled": whether derivatives go through the coarse solver.
     start
-        Of "unrolled": states of the reference, or of a pool of the model's own rollouts,
-        each of which goes back to the reference with probability ``restart`` after it was used,
-        and in any case where its mean squared distance from it is more than that of the base
-        model's rollout: nothing is to be learned there.
+        Of "unrolled": states of the reference, or of a pool of the model's own rollouts.  Those
+        go back to the reference with probability ``restart`` after each use, and where their mean
+        squared distance from it is more than that of the base model's rollout.
     at_rest
-        Of "unrolled": share of the states of the reference that are those at rest, before the first
-        step; the others are of any frame.  For loads that act in the first steps only, as kicks,
-        which are seldom met otherwise.
+        Of "unrolled": share of the states of the reference that are those before the first step;
+        the others are of any frame.  For loads that act in the first steps only, as kicks.
     seconds, iterations, epochs
         Exactly one; epochs only of "one-step".
     batch
@@ -248,9 +210,8 @@ class Fitting(Strict):
         Most that are taken from the training split.
     widen
         Whether a training that goes on with another model widens that one's ranges of known
-        inputs and bodies to what it learns.  They are extremes, so the more there is to learn, the
-        less a gate refuses.  Weights do not depend on it.  If not, the data's time step has to be
-        one that the other model's gate lets pass.
+        inputs and bodies to what it learns; weights do not depend on it.  If not, the data's time
+        step has to be one that the other model's gate lets pass.
     """
 
     windows: PositiveCount = 10_000
@@ -264,22 +225,19 @@ class TrainingConfig(TomlConfig):
     ----------
     start_from
         Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
-        training begins with, in place of drawn and fitted ones; ``corrector`` must describe its
-        architecture.  A folder's path starts where the program does.
+        training begins with; ``corrector`` must describe its architecture.
     without
-        Files of the data set that are left out, such as "training/mesh-0042": of bodies that
-        another set keeps for its evaluation, say.  Of several data sets with the name of a set's
-        folder, "impulse-more/training/mesh-0042".
+        Files of the data set that are left out, such as "training/mesh-0042".
     base
-        Whose steps are corrected, see `pdcorrect.coarse_model`: "plain", "best" or "total-mass".
+        Whose steps are corrected, see `pdcorrect.coarse_model`.
     validate_every, checkpoint_every, report_every
         The last in iterations.
     """
 
     corrector: Architecture = Architecture()
     start_from: ModelName | None = None
-    without: Files = ()
-    base: Base = "plain"
+    without: tuple[FileName, ...] = ()
+    base: Literal["plain", "best"] = "plain"
     seed: Count = 0
     fitting: Fitting = Fitting()
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
@@ -304,7 +262,3 @@ class TrainingConfig(TomlConfig):
         if self.start_from is None and not self.fitting.widen:
             raise ValueError("fitting.widen = false is about a model to start from: expected one")
         return self
-
-    def architecture(self) -> CorrectorConfig:
-        """Of the corrector."""
-        return self.corrector.config()

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pdcorrect.data.folder import Folders, folders_of, shard_paths
-from pdcorrect.data.schema import PLAIN, REFERENCE, TOTAL_MASS, Shard, Simulation
+from pdcorrect.data.folder import shard_paths
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import InputError
@@ -31,33 +31,25 @@ class Recording:
     ----------
     path : Path
         The file, which has one mesh.
-    dataset, config_hash, content_hash, setting, split : str
-    mesh, number : int
-        Of the mesh in its split, and on the mesh.
-    time_step : float
-        s.
+    dataset, config_hash, content_hash, split : str
+    number : int
+        On its mesh.
     reference, plain : (T+1, N, 3)
         The reference, and the rollout of the plain coarse model, m.
     one_step, rollout : float
         Mean squared errors of the base model, m2, see `pdcorrect.training.losses`.
-    total_mass : float or None
-        To which the base model's density is scaled, kg; None where it is not.
     """
 
     path: Path
     dataset: str
     config_hash: str
     content_hash: str
-    setting: str
     split: str
-    mesh: int
     number: int
-    time_step: float
     reference: Array
     plain: Array
     one_step: float
     rollout: float
-    total_mass: float | None = None
 
     @property
     def steps(self) -> int:
@@ -67,24 +59,20 @@ class Recording:
     @property
     def name(self) -> str:
         """For messages and tables."""
-        return f"{self.dataset}, {self.split}/mesh-{self.mesh:04d}/{self.number}"
+        return f"{self.dataset}, {self.split}/{self.path.stem}/{self.number}"
 
 
 def load_recordings(
-    folder: Folders, split: str, base: Base, *, scenes: bool = True, without: Collection[str] = ()
+    folder: str | Path,
+    split: str,
+    base: Base,
+    *,
+    scenes: bool = True,
+    without: Collection[str] = (),
 ) -> list[Recording]:
-    """The simulations of a split, mesh by mesh.
+    """The simulations of a split, mesh by mesh, without those of files in ``without``.
 
-    Parameters
-    ----------
-    folder : path, or sequence of paths
-        Of the data set; of several, one after the other.
-    split : str
-    base : {"plain", "best", "total-mass"}
-    scenes : bool
-        Whether the base model is to step again, for which it takes the scenes.
-    without : collection of str
-        Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
+    ``scenes`` says whether the base model is to step again, for which it takes the scenes.
 
     Raises
     ------
@@ -95,12 +83,13 @@ def load_recordings(
         If a file is damaged.
     """
     found = []
-    for path in _paths(folder, split, without):
+    for path in shard_paths(folder, split, without):
         runs = dict.fromkeys(_runs(base), ("positions", "predictions"))
         shard = read_shard(path, runs=runs)
         _check_complete(path, shard, base, scenes)
-        for number, simulation in enumerate(shard.simulations):
-            found.append(_recording(path, shard, simulation, number, split, base))
+        found += [
+            _recording(path, shard, number, split, base) for number in range(len(shard.simulations))
+        ]
     return found
 
 
@@ -132,11 +121,6 @@ def data_hash(recordings: Sequence[Recording]) -> str:
     return digest.hexdigest()
 
 
-def _paths(folder: Folders, split: str, without: Collection[str]) -> list[Path]:
-    """Files of a split of all data sets."""
-    return [path for each in folders_of(folder) for path in shard_paths(each, split, without)]
-
-
 def _check_complete(path: Path, shard: Shard, base: Base, scenes: bool) -> None:
     """Refuse a file of which a simulation lacks what a training of ``base`` needs."""
     for number, simulation in enumerate(shard.simulations):
@@ -161,37 +145,26 @@ def _runs(base: Base) -> tuple[str, ...]:
     return tuple(dict.fromkeys((REFERENCE, PLAIN, base)))
 
 
-def _recording(
-    path: Path, shard: Shard, simulation: Simulation, number: int, split: str, base: Base
-) -> Recording:
+def _recording(path: Path, shard: Shard, number: int, split: str, base: Base) -> Recording:
     """A simulation that lacks nothing, see `_check_complete`."""
-    runs = simulation.runs
+    runs = shard.simulations[number].runs
     reference, plain, rollout = (np.asarray(runs[n].positions) for n in (REFERENCE, PLAIN, base))
-    mass = float(runs[base].attributes["total_mass"]) if base == TOTAL_MASS else None
     return Recording(
         path=path,
         dataset=str(shard.attributes["dataset"]),
         config_hash=str(shard.attributes["config_hash"]),
         content_hash=shard.content_hash,
-        setting=str(shard.attributes["setting"]),
         split=split,
-        mesh=int(shard.attributes["number"]),
         number=number,
-        time_step=float(shard.attributes["time_step"]),
         reference=reference,
         plain=plain,
         one_step=_mean_square(np.asarray(runs[base].predictions), reference[1:]),
         rollout=_mean_square(rollout[1:], reference[1:]),
-        total_mass=mass,
     )
 
 
 def _mean_square(x: Array, y: Array) -> float:
-    """Mean over frames and nodes of the squared distance, m2.
-
-    At least that of positions which differ by the rounding of their storage, which is
-    nothing that can be learned.
-    """
+    """Mean over frames and nodes of the squared distance, m2; at least what rounding makes."""
     distance = x.astype(np.float64) - y
     return max(float((distance**2).sum(axis=2).mean()), rounding(y), LEAST_ERROR)
 

@@ -17,8 +17,9 @@ from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Base
+from pdcorrect.training.distributed import ProcessGroup
+from pdcorrect.training.losses import BodyModes, Vibrations, body_modes
 from pdcorrect.training.recordings import Recording, base_errors, make_problems
-from pdcorrect.training.vibrations import BodyModes, Vibrations, body_modes
 
 Frames = NDArray[np.int64]
 
@@ -32,7 +33,7 @@ class SceneGroup:
     Parameters
     ----------
     recordings : sequence of Recording
-    base : {"plain", "best", "total-mass"}
+    base : {"plain", "best"}
     device : str or torch.device
     modes : dict, optional
         Modes of meshes that are known already, by file; new ones are added.
@@ -43,9 +44,7 @@ class SceneGroup:
         T of each simulation.
     errors : BaseErrors
     counts : (B,) tensor
-        Nodes of each.
-    nodes : int
-        Of all.
+        Nodes of each; ``nodes`` are those of all.
     """
 
     def __init__(
@@ -147,10 +146,6 @@ class SceneGroup:
             self.device,
         )
 
-    def times(self, frames: Frames) -> list[float]:
-        """Seconds."""
-        return [self.time_step * int(frame) for frame in frames]
-
     def sums(self, values: Tensor) -> Tensor:
         """Sums (B,) over the nodes of each scene of values (B, N)."""
         return torch.where(self.mask, values, 0.0).sum(dim=1)
@@ -172,16 +167,7 @@ class SceneGroup:
 
 
 class SceneGroups:
-    """A rank's groups of simulations, set up when they are first needed and then kept.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    base : {"plain", "best", "total-mass"}
-    device : str or torch.device
-    seed, rank, world_size : int
-        See `grouped`.
-    """
+    """A process's groups of simulations, set up when they are first needed and then kept."""
 
     def __init__(
         self,
@@ -190,28 +176,36 @@ class SceneGroups:
         device: str | torch.device = "cpu",
         *,
         seed: int = 0,
-        rank: int = 0,
-        world_size: int = 1,
+        world: ProcessGroup | None = None,
     ) -> None:
-        self.recordings, self.device, self.rank = tuple(recordings), torch.device(device), rank
-        self._base, self._place = base, {"seed": seed, "rank": rank, "world_size": world_size}
+        self.recordings, self.device = tuple(recordings), torch.device(device)
+        self.world = ProcessGroup() if world is None else world
+        self._base, self._seed = base, seed
         self._known: dict[tuple[tuple[Path, int], ...], SceneGroup] = {}
         self._modes: dict[Path, BodyModes] = {}
 
     def of(self, size: int, shortest: int) -> list[list[Recording]]:
         """The simulations of at least so many steps, in groups of at most ``size``.
 
+        Meshes are in random order and simulations of a mesh stay together, for they share
+        factorisations.
+
         Raises
         ------
         InputError
-            If there is none for this rank.
+            If there is none for this process.
         """
         usable = [r for r in self.recordings if r.steps >= shortest]
-        found = grouped(usable, size, **self._place)
+        meshes = list(dict.fromkeys(r.path for r in usable))
+        turn = np.random.default_rng((self._seed, 2)).permutation(len(meshes))
+        place = {path: int(k) for path, k in zip(meshes, turn, strict=True)}
+        ordered = sorted(usable, key=lambda r: (place[r.path], r.number))
+        groups = [ordered[i : i + size] for i in range(0, len(ordered), size)]
+        found = groups[self.world.rank :: self.world.size]
         if not found:
             raise InputError(
                 f"{len(usable)} simulations of {shortest} steps or more, in groups of {size}, "
-                f"for {self._place['world_size']} processes: expected a group for each."
+                f"for {self.world.size} processes: expected a group for each."
             )
         return found
 
@@ -232,19 +226,3 @@ class SceneGroups:
             del self._known[next(iter(self._known))]
             torch.cuda.empty_cache()
             free, total = torch.cuda.mem_get_info(self.device)
-
-
-def grouped(
-    recordings: Sequence[Recording], size: int, *, seed: int, rank: int = 0, world_size: int = 1
-) -> list[list[Recording]]:
-    """A rank's groups of at most ``size`` simulations.
-
-    Meshes are in random order and simulations of a mesh stay together, for they share
-    factorisations.
-    """
-    meshes = list(dict.fromkeys(r.path for r in recordings))
-    turn = np.random.default_rng((seed, 2)).permutation(len(meshes))
-    place = {path: int(k) for path, k in zip(meshes, turn, strict=True)}
-    ordered = sorted(recordings, key=lambda r: (place[r.path], r.number))
-    groups = [ordered[i : i + size] for i in range(0, len(ordered), size)]
-    return groups[rank::world_size]

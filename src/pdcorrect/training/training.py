@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,32 +14,45 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pdcorrect._config import as_toml
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_description import ModelRecord
-from pdcorrect.corrector.model_io import LoadedModel, save_model, weights_digest
+from pdcorrect.corrector.model_io import (
+    JOINT,
+    LoadedModel,
+    load_model,
+    save_model,
+    weights_digest,
+)
 from pdcorrect.data.configuration import TRAINING, VALIDATION
-from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
+from pdcorrect.data.folder import check_whole, splits_of
 from pdcorrect.data.schema import INTEGRATOR, SUFFIX
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.training.batch_losses import Source, make_source
-from pdcorrect.training.checkpoints import read_checkpoint, write_checkpoint
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.fitting import check_time_steps, fit_normaliser, widen_ranges
-from pdcorrect.training.models import Lineage, load_start
 from pdcorrect.training.optimisation import Optimiser, rate_at
-from pdcorrect.training.progress import HistoryFile, Progress, check_same
+from pdcorrect.training.progress import (
+    HistoryFile,
+    Progress,
+    check_same,
+    read_checkpoint,
+    write_checkpoint,
+)
 from pdcorrect.training.recipe import Stage, TrainingConfig
 from pdcorrect.training.recordings import Recording, data_hash, load_recordings
 from pdcorrect.training.scenes import SceneGroups
+from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.validation import Validation
-from pdcorrect.training.windows import StepWindows
+from pdcorrect.training.windows import OneStepBatches, StepWindows, seed_of
 
 MOST_SKIPPED = 20
 """Batches in a row whose loss or gradient is not finite, at which training fails."""
 CHECKPOINT, MODEL, CONFIG = "checkpoint.safetensors", "model", "config.toml"
 
+Source = OneStepBatches | UnrolledBatches
+"""Losses of one batch after the other, and states to go on from."""
 Report = Callable[[Progress, Mapping[str, Any]], None]
 """Told where the training is, and the numbers of a row of the history."""
 
@@ -51,8 +63,8 @@ class Training:
     Parameters
     ----------
     config : TrainingConfig
-    data : path, or sequence of paths
-        Folder of the data set; of several, to be learned together.
+    data : path
+        Folder of the data set.
     output : path
         For ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard`` and
         the best ``model``.
@@ -74,11 +86,10 @@ class Training:
     Raises
     ------
     InputError
-        If the folder holds a training and ``resume`` is not set, or it was another one; if
-        files of the data sets are missing, or do not have what the configuration wants; if one
-        has a validation split and another has none, or their settings or time steps differ; if the
-        model to start from is missing, or of another architecture or base, or its ranges stay and
-        the data have another time step.
+        If the folder holds a training and ``resume`` is not set, or it was another one; if files
+        of the data set are missing, or do not have what the configuration wants; if the model to
+        start from is missing, or of another architecture or base, or its ranges stay and the data
+        have another time step.
     FileFormatError
         If the checkpoint, a file of the data set, or the model to start from is damaged.
     """
@@ -86,7 +97,7 @@ class Training:
     def __init__(
         self,
         config: TrainingConfig,
-        data: Folders,
+        data: str | Path,
         output: str | Path,
         *,
         device: str = "cpu",
@@ -98,19 +109,9 @@ class Training:
         self.config, self.world = config, ProcessGroup() if world is None else world
         self.device = usable_device(device)
         self.output, self._on_report = Path(output), on_report
-        data = folders_of(data)
         if not incomplete:
-            for folder in data:
-                check_whole(folder, (TRAINING, VALIDATION))
-        splits, without = _common_splits(data), config.without
-        _check_left_out(without, data)
-        unrolled = any(stage.kind == "unrolled" for stage in config.stages)
-        self._recordings = load_recordings(
-            data, TRAINING, config.base, scenes=unrolled, without=without
-        )
-        validated: list[Recording] = []
-        if VALIDATION in splits:
-            validated = load_recordings(data, VALIDATION, config.base, without=without)
+            check_whole(data, (TRAINING, VALIDATION))
+        self._recordings, validated = self._recorded(Path(data))
         digest = data_hash([*self._recordings, *validated])
         self._identity = json.loads(
             json.dumps({"config": config.model_dump(mode="json"), "data": digest})
@@ -119,15 +120,14 @@ class Training:
         if start is not None:
             self._identity["start"] = weights_digest(str(config.start_from))
         found = self._checkpoint(resume)
-        _check_alike(self._recordings)
-        self._lineage = Lineage.of(config, start, self._recordings)
+        own = self._recordings[0].dataset, self._recordings[0].config_hash
+        self._data_sets = list(dict.fromkeys([*(start.data_sets if start else ()), own]))
         self._windows = StepWindows(
-            data, self._recordings, config.architecture(), config.base, device=self.device,
-            without=without,
+            data, self._recordings, config.corrector.config(), config.base, device=self.device,
+            without=config.without,
         )  # fmt: skip
         self._groups = SceneGroups(
-            self._recordings, config.base, self.device, seed=config.seed, rank=self.world.rank,
-            world_size=self.world.size,
+            self._recordings, config.base, self.device, seed=config.seed, world=self.world,
         )  # fmt: skip
         self.corrector = self._new_corrector(start, fit=found is None)
         self._averaged = copy.deepcopy(self.corrector)
@@ -145,6 +145,18 @@ class Training:
             make_folder(self.output)
             write_text(self.output / CONFIG, config.to_toml())
             self._history = HistoryFile(self.output, length, self.progress.total)
+
+    def _recorded(self, data: Path) -> tuple[list[Recording], list[Recording]]:
+        """Simulations to learn from, and those to validate with, if there are any."""
+        base, without = self.config.base, self.config.without
+        for name in without:
+            if not (data / f"{name}{SUFFIX}").exists():
+                raise InputError(f"without = {name!r}: {data} has no such file.")
+        unrolled = any(stage.kind == "unrolled" for stage in self.config.stages)
+        learned = load_recordings(data, TRAINING, base, scenes=unrolled, without=without)
+        if VALIDATION not in splits_of(data):
+            return learned, []
+        return learned, load_recordings(data, VALIDATION, base, without=without)
 
     # --- running ----------------------------------------------------------------------------
 
@@ -172,7 +184,12 @@ class Training:
     def _run_stage(self, stage: Stage) -> bool:
         """One stage, or what is left of it; whether it came to its end."""
         at = self.progress
-        source = make_source(at.stage, self.config, self._windows, self._groups, self.world)
+        seed = seed_of(self.config.seed, at.stage)
+        source: Source
+        if stage.kind == "one-step":
+            source = OneStepBatches(self._windows, stage, seed, self.world)
+        else:
+            source = UnrolledBatches(self._groups, stage, seed=seed)
         optimiser = self._optimiser(stage, source)
         shown = self.corrector if stage.ema is None else self._averaged
         while (share := stage.share_done(len(source), at.iteration, at.stage_seconds)) < 1.0:
@@ -268,7 +285,7 @@ class Training:
         else:
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(config.seed)
-                corrector = Corrector(config.architecture()).to(self.device)
+                corrector = Corrector(config.corrector.config()).to(self.device)
         if fit:
             windows, seed = config.fitting.windows, config.seed
             if start is None:
@@ -286,12 +303,12 @@ class Training:
         self._best = {n: x.detach().clone() for n, x in shown.network.state_dict().items()}
         if self.world.first:
             record = ModelRecord(
-                dataset=self._lineage.name,
+                dataset=JOINT.join(dict.fromkeys(name for name, _ in self._data_sets)),
                 dataset_hash=self._identity["data"],
                 training={
                     **self._identity,
                     "integrator": INTEGRATOR,
-                    **self._lineage.record(),
+                    "data_sets": [{"name": name, "config_hash": x} for name, x in self._data_sets],
                     "iterations": self.progress.total, "seconds": self.progress.seconds,
                     "processes": self.world.size,
                 },
@@ -339,48 +356,34 @@ class Training:
         return int(content["history"])
 
 
-def _common_splits(folders: Sequence[Path]) -> list[str]:
-    """Training and, if there is one, validation split."""
-    without = [folder for folder in folders if VALIDATION not in splits_of(folder)]
-    if not without:
-        return [TRAINING, VALIDATION]
-    if len(without) < len(folders):
-        raise InputError(
-            f"{without[0]}: no split {VALIDATION!r}: expected one in all data sets, or in none."
-        )
-    return [TRAINING]
+def load_start(config: TrainingConfig, device: torch.device) -> LoadedModel | None:
+    """The model that a training goes on with, if there is one.
 
-
-def _check_left_out(names: Sequence[str], folders: Sequence[Path]) -> None:
-    """Refuse files to be left out that are not there, or that may be of several data sets."""
-    for name in names:
-        *given, split, mesh = name.split("/")
-        having = [
-            folder
-            for folder in folders
-            if (not given or folder.resolve().name == given[0])
-            and (folder / split / f"{mesh}{SUFFIX}").exists()
-        ]
-        if len(having) != 1:
-            raise InputError(
-                f"without = {name!r}: {len(having)} files of {', '.join(map(str, folders))} are "
-                "called so: expected one, of several data sets as 'SET/training/mesh-0042'."
-            )
-
-
-def _check_alike(recordings: Sequence[Recording]) -> None:
-    """Refuse data sets of unlike settings or time steps.
-
-    What else a batch asks to be the same is told when one is made, see `BatchStepper`.
+    Raises
+    ------
+    InputError
+        If there is no such model, or its architecture, base model or velocity is another one
+        than the training's.
+    FileFormatError
+        If a file is damaged.
     """
-    first = recordings[0]
-    for other, name in itertools.product(recordings, ("setting", "time_step")):
-        here, there = getattr(first, name), getattr(other, name)
-        if here != there:
-            raise InputError(
-                f"{other.path}: {name} {there!r}, unlike {here!r} of {first.path}: expected "
-                "the same in all data sets."
-            )
+    if config.start_from is None:
+        return None
+    model = load_model(config.start_from, device)
+    own, wanted = (c.model_dump() for c in (model.corrector.config, config.corrector.config()))
+    own |= {"base": model.base, "velocity": model.velocity}
+    wanted |= {"base": config.base, "velocity": "recomputed"}
+    unlike = [name for name in own if own[name] != wanted[name]]
+    if unlike:
+        found, expected = (
+            ", ".join(f"{name} = {as_toml(each[name])}" for name in unlike)
+            for each in (own, wanted)
+        )
+        raise InputError(
+            f"start_from = {config.start_from!r}: that model has {found}: expected {expected}, as "
+            "here."
+        )
+    return model
 
 
 def _part(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ class Rollouts:
     correction : (n, 3) tensor
         Of the last step, m; zero if there was none.
     frames, ages : (B,) int
-        Frame of each scene, and steps since it was on the reference.
+        Frame of each scene, and steps since it was on the reference; -1 if it is to go back.
     """
 
     positions: Tensor
@@ -41,18 +41,9 @@ class Rollouts:
     ages: Frames
 
 
-@dataclass(frozen=True, eq=False)
-class Unrolled:
-    """Outcome of some steps.
-
-    Attributes
-    ----------
-    losses : (B,) tensor
-        Mean over the steps.
-    alive : (B,) bool
-        Scenes whose steps all succeeded; losses of others are zero.
-    end : Rollouts
-        Without derivatives.
+class Unrolled(NamedTuple):
+    """Outcome of some steps: mean losses (B,), zero where a step failed; which scenes had none
+    that failed; and where they are, without derivatives.
     """
 
     losses: Tensor
@@ -62,12 +53,6 @@ class Unrolled:
 
 class UnrolledBatches:
     """Draws groups and start frames, steps the hybrid, and compares it with the reference.
-
-    Parameters
-    ----------
-    groups : SceneGroups
-    stage : Stage
-    seed : int
 
     Attributes
     ----------
@@ -83,7 +68,7 @@ class UnrolledBatches:
     def __init__(self, groups: SceneGroups, stage: Stage, *, seed: int = 0) -> None:
         self._groups, self._stage = groups, stage
         self._chosen = groups.of(stage.batch, max(stage.steps))
-        self._seed = (seed, groups.rank)
+        self._seed = (seed, groups.world.rank)
         self._pool: dict[int, Rollouts] = {}
         self.failed = 0
 
@@ -169,7 +154,7 @@ def unroll(
     for _ in range(steps):
         with network_precision(corrector, stage.amp):
             positions, velocities, correction = layer(
-                positions, velocities, group.times(frames), correction
+                positions, velocities, [group.time_step * int(k) for k in frames], correction
             )
         fine = group.on_device(np.array(in_one(layer.steps.statuses[-1])))
         living = living & fine & torch.isfinite(positions).flatten(1).all(dim=1)

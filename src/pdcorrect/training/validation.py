@@ -8,7 +8,7 @@ rollout does not hide what the others say.  What a model is worth is told by
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,17 +27,8 @@ LEAST = -100.0
 """Omega of a simulation whose rollout failed or is worse than this, per cent."""
 
 
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """Omega of simulations.
-
-    Attributes
-    ----------
-    omegas : (S,)
-        Per cent, in the order of the recordings; at least `LEAST`.
-    failed : int
-        Rollouts in which a step failed.
-    """
+class Scores(NamedTuple):
+    """Omega of simulations (S,), per cent, at least `LEAST`; rollouts in which a step failed."""
 
     omegas: NDArray[np.float64]
     failed: int
@@ -58,13 +49,8 @@ class Scores:
 class Validation:
     """Rollouts of recorded simulations over all their frames, all together.
 
-    With several processes each one takes a part; all get all scores.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    base : {"plain", "best", "total-mass"}
-        Which is corrected; Omega is against "plain" in any case.
+    With several processes each one takes a part; all get all scores.  ``base`` says which model
+    is corrected; Omega is against "plain" in any case.
     """
 
     def __init__(

@@ -1,12 +1,13 @@
-"""`StepWindows`: single steps of many bodies with the corrections that they need.
+"""Single steps of many bodies with the corrections that they need, and batches of them.
 
 They come from the stored predictions of a data set, so no simulator runs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +17,15 @@ from torch import Tensor
 
 from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
+from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
-from pdcorrect.data.folder import Folders
-from pdcorrect.data.reader import TrajectoryDataset
-from pdcorrect.errors import InputError
+from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
 from pdcorrect.fem.problem import Base
+from pdcorrect.training.distributed import ProcessGroup
+from pdcorrect.training.losses import body_losses, network_precision
+from pdcorrect.training.recipe import Stage
 from pdcorrect.training.recordings import Recording, base_errors
 
 Numbers = NDArray[np.int64]
@@ -38,15 +41,9 @@ _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 class StepBatch:
     """A step of B bodies with n nodes.
 
-    Attributes
-    ----------
-    bodies : BodyGraph
-    snapshot : Snapshot
-    target : (n, 3)
-        The correction that leads to the reference, m; for placement "guess" to the base
-        model's answer.
-    scale : (B,)
-        Mean squared one-step error of the base model on each trajectory, m2.
+    ``target`` (n, 3) is the correction that leads to the reference, m; for placement "guess" to
+    the base model's answer.  ``scale`` (B,) is the mean squared one-step error of the base model
+    on each trajectory, m2.
     """
 
     bodies: BodyGraph
@@ -73,28 +70,13 @@ class StepWindows:
 
     There is one table for each quantity, with all nodes of all frames.  It is on the device, or
     on the CPU if all would fill more than 0.3 of what is free on a GPU.  Of bodies all that is
-    known at rest is computed once.
-
-    Parameters
-    ----------
-    folder : path, or sequence of paths
-    recordings : sequence of Recording
-        All of the split, for the base model's errors.
-    config : CorrectorConfig
-    base : {"plain", "best", "total-mass"}
-    device : str or torch.device
-    without : collection of str
-        Files of each data set that are left out, see `pdcorrect.data.folder.shard_paths`.
-
-    Raises
-    ------
-    InputError
-        If the recordings are not those of the split.
+    known at rest is computed once.  ``recordings`` are all of the split, for the base model's
+    errors, and ``without`` are files that are left out, see `pdcorrect.data.folder.shard_paths`.
     """
 
     def __init__(
         self,
-        folder: Folders,
+        folder: str | Path,
         recordings: Sequence[Recording],
         config: CorrectorConfig,
         base: Base,
@@ -108,18 +90,11 @@ class StepWindows:
             folder, TRAINING, window=2 if self._history else 1, base=base, without=without
         )
         headers = self.dataset.headers
-        wanted = [(h.path, k) for h in headers for k in range(len(h.steps))]
-        if sorted((r.path, r.number) for r in recordings) != sorted(wanted):
-            raise InputError(
-                f"{len(recordings)} recordings for {len(wanted)} simulations: expected those of "
-                "the same files, one each."
-            )
         files = {header.path: k for k, header in enumerate(headers)}
         self._numbers = np.zeros((len(headers), max(len(h.steps) for h in headers)), dtype=np.int64)
         for k, r in enumerate(recordings):
             self._numbers[files[r.path], r.number] = k
         self._errors = base_errors(recordings, self.device)
-        masses = {files[r.path]: r.total_mass for r in recordings}
         self._nodes = np.array([h.nodes for h in headers])
         rows = np.zeros(self._numbers.shape, dtype=np.int64)
         for row, h in zip(rows, headers, strict=True):
@@ -130,7 +105,8 @@ class StepWindows:
         self._bodies: dict[int, BodyGraph] = {}
         for window in self.of_each_file().tolist():
             file = int(self.dataset.places([window])[0][0])
-            self._bodies[file] = self._alone(window, masses[file])
+            body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
+            self._bodies[file] = body.to(dtype=torch.float64)
             self._keep(file)
             self.dataset.forget()
 
@@ -141,15 +117,6 @@ class StepWindows:
         free = torch.cuda.mem_get_info(self.device)[0]
         fits = int(self.dataset.shard_bytes().sum()) < _SHARE_OF_DEVICE * free
         return self.device if fits else torch.device("cpu")
-
-    def _alone(self, window: int, mass: float | None) -> BodyGraph:
-        """The body of a window, float64, of the base model's mass (kg)."""
-        body = BodyGraph.of_batch(self.dataset.batch([window]).to(self.device))
-        body = body.to(dtype=torch.float64)
-        if mass is None:
-            return body
-        factor = mass / body.mass.sum()
-        return replace(body, mass=factor * body.mass, density=factor * body.density)
 
     def _keep(self, file: int) -> None:
         """Copy a file's frames to their places; a last frame has no step that follows it."""
@@ -230,3 +197,64 @@ def joined(bodies: Sequence[BodyGraph]) -> BodyGraph:
     known = {name: torch.cat([getattr(b, name) for b in bodies]) for name in _AT_REST}
     vars(found).update(known)
     return found
+
+
+class OneStepBatches:
+    """Losses of windows of the training split in random order, epoch after epoch.
+
+    The last few of an epoch, fewer than a batch, are left out.
+    """
+
+    failed = 0
+    """Scenes whose step failed: none is taken."""
+
+    def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
+        self._windows, self._stage, self._seed = windows, stage, (seed, world.rank)
+        self._shuffle = TrajectoryLoader(
+            windows.dataset, stage.batch, seed=seed, block=len(windows.dataset.headers), rank=world.rank,
+            world_size=world.size,
+        )  # fmt: skip
+        self._order = self._shuffle.order()
+        self._generator = torch.Generator(windows.device)
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        return max(1, len(self._order) // self._stage.batch)
+
+    def batch(self, iteration: int) -> StepBatch:
+        """Batch number ``iteration`` of the stage."""
+        epoch, place = divmod(iteration, len(self))
+        if epoch != self._shuffle.epoch:
+            self._shuffle.set_epoch(epoch)
+            self._order = self._shuffle.order()
+        first = place * self._stage.batch
+        batch = self._windows.batch(self._order[first : first + self._stage.batch])
+        if self._stage.noise.tau == 0.0:
+            return batch
+        self._generator.manual_seed(seed_of(*self._seed, iteration))
+        return batch.with_noise(self._stage.noise.tau, self._generator)
+
+    def loss(self, corrector: Corrector, iteration: int, steps: int) -> Tensor:
+        """The mean loss of a batch; what is drawn depends on ``iteration``."""
+        return one_step_loss(corrector, self.batch(iteration), self._stage)
+
+    def state_dict(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """Nothing: all depends on the number of the batch."""
+        return {}, {}
+
+    def load_state_dict(self, numbers: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+        """Nothing to do."""
+
+
+def one_step_loss(corrector: Corrector, batch: StepBatch, stage: Stage) -> Tensor:
+    """Mean loss of the bodies of a batch."""
+    with network_precision(corrector, stage.amp):
+        correction = corrector(batch.bodies, batch.snapshot)
+    bodies, errors = batch.bodies, correction - batch.target
+    each = body_losses(stage.loss, errors, bodies.node_sums, bodies.node_counts, batch.scale)
+    return each.mean()
+
+
+def seed_of(*names: int) -> int:
+    """A seed for a stream of random numbers that is named by numbers."""
+    return int(np.random.SeedSequence(names).generate_state(1, np.uint32)[0])
