@@ -21,7 +21,7 @@ from pdcorrect.batch.correction import STATE, BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.shared_matrices import DistinctBodies, of_all, of_some, with_rows
+from pdcorrect.batch.shared_matrices import DistinctBodies, of_all
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 
@@ -92,7 +92,6 @@ class CellBatch:
         distinct = self.bodies.distinct
         self._owners = torch.as_tensor(self.bodies.owners, device=device)
         self.node_counts = [len(p.positions) for p in problems]
-        self.mode_counts = [p.space.internal for p in problems]
         self.device, self.dtype = device, dtype
         n = self.sizes
         self.rest = self.repeated([p.positions for p in distinct], n.unknowns, 3)
@@ -116,22 +115,6 @@ class CellBatch:
         self._gradients = self._gradient_sets(quadratures)
         written = [p.correction for p in problems if p.correction is not None]
         self.correction = BatchCorrection(written, n.cells, self.rest) if written else None
-
-    def narrowed(self, rows: Tensor) -> CellBatch:
-        """Of some scenes."""
-        n, numbers = self.sizes, rows.tolist()
-        return with_rows(
-            self, rows,
-            "rest", "present_nodes", "present_cells", "_gradients", "_owners", "_corners",
-            sizes=n._replace(scenes=len(rows)),
-            bodies=DistinctBodies(self.bodies.distinct, self.bodies.owners[numbers]),
-            node_counts=[self.node_counts[i] for i in numbers],
-            mode_counts=[self.mode_counts[i] for i in numbers],
-            _slots=of_some(self._slots, self._corners[0].numel(), n.scenes, rows),
-            point_weights=self.of_scenes(self.point_weights, rows),
-            volumes=self.of_scenes(self.volumes, rows),
-            correction=self.correction and self.correction.narrowed(rows),
-        )  # fmt: skip
 
     # --- arrays to and from tensors -----------------------------------------------------
 
@@ -209,10 +192,6 @@ class CellBatch:
     def tangent_sizes(self) -> tuple[int, ...]:
         """Numbers that the parts of a tangent have at each point, and in each cell."""
         return (9, 9, 12) if self.correction is None else (9, 9, 12, STATE)
-
-    def of_scenes(self, x: Tensor, rows: Tensor) -> Tensor:
-        """What is known at points, (k, B C, Q), of some scenes."""
-        return self._by_scene(x)[:, rows].flatten(1, 2)
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""

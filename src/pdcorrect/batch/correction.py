@@ -15,7 +15,6 @@ from torch import Tensor
 from pdcorrect.batch.decomposition import product, signed_svd, transposed
 from pdcorrect.batch.gpu import small_products
 from pdcorrect.batch.points import Components, computed, moved
-from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
 from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE, SHARES
@@ -77,10 +76,6 @@ class BatchCorrection:
         """Take their matrices from now on."""
         for i, c in enumerate(corrections):
             self._matrices[i, : len(c.sizes)] = torch.as_tensor(c.matrices)
-
-    def narrowed(self, rows: Tensor) -> BatchCorrection:
-        """Of some scenes."""
-        return with_rows(self, rows, "_shapes", "_matrices", "_sizes")
 
     def energy_and_forces(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""

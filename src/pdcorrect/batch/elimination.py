@@ -11,7 +11,7 @@ from torch import Tensor, cat
 
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.gpu import small_products
-from pdcorrect.batch.shared_matrices import Sharing, with_rows
+from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
@@ -82,11 +82,6 @@ class Elimination:
         self.blocks = [kept for kept, _, _ in parts]
         self._inverse = self._stored([inverse for _, inverse, _ in parts])[owners]
         self._solved = self._stored([solved for _, _, solved in parts])[owners]
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> Elimination:
-        """Of some scenes, with their cells."""
-        names = ("_inverse", "_solved") if cells.sizes.modes else ()
-        return with_rows(self, rows, *names, _cells=cells)
 
     def reduced(self, r: Tensor) -> Tensor:
         """Right-hand side (B, N, 3) of the nodes for that of configurations (B, U, 3)."""
@@ -185,12 +180,6 @@ class DenseInverse:
             inverse = torch.cholesky_inverse(factor).mul_(keep[:, None]).mul_(keep)
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
         return True
-
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> DenseInverse:
-        """Of some scenes, with the matrices that they have."""
-        return with_rows(
-            self, kept, "_inverse", _sharing=sharing, _free=[self._free[k] for k in kept.tolist()]
-        )
 
     def __call__(self, r: Tensor) -> Tensor:
         """Scenes with one inverse side by side."""

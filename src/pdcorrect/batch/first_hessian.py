@@ -32,7 +32,7 @@ from pdcorrect.batch.elimination import (
 )
 from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
-from pdcorrect.batch.shared_matrices import Sharing, with_rows
+from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
@@ -176,19 +176,6 @@ class FirstHessian:
             add_mass(matrix, problem, mass_factor)
             regular.append(solver.fill(i, matrix))
         return regular
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> FirstHessian:
-        """Of some scenes with their cells, turned as it is now."""
-        sharing, numbers = self._sharing.narrowed(rows)
-        kept = torch.tensor(numbers, device=rows.device)
-        solver = self._solver.narrowed(sharing, kept, rows)
-        turning = ("_shares", "_held") if self._turned else ()
-        return with_rows(
-            self, rows, "_free", "regular", *turning,
-            _cells=cells, _sharing=sharing, _solver=solver,
-            _modes=self._modes.narrowed(cells, rows),
-            _rotations=[a[rows] for a in self._rotations],
-        )  # fmt: skip
 
     def turn(self, y: Tensor) -> None:
         """Turn the rest Hessian to a configuration, see `first_hessian.Rotations`."""

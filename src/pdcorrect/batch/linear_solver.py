@@ -52,7 +52,7 @@ class BatchConjugateGradients:
         self.steps = 0
         self._tangent: Tangents
         self._begin = recorder(self._set_up)
-        self._advance = recorder(self._next)
+        self._advance = recorder(self._step)
 
     def solve(
         self,
@@ -119,10 +119,6 @@ class BatchConjugateGradients:
         self._active.copy_(self._which & (self._r_z > 0.0))
         self._busy.copy_(self._active.any())
 
-    def _next(self) -> None:
-        self._step()
-        self._busy.copy_(self._active.any())
-
     def _step(self) -> None:
         image = self._product(self._d)
         curvature = dot(self._d, image)
@@ -139,6 +135,7 @@ class BatchConjugateGradients:
         self._r_z.copy_(r_z)
         self.converged.logical_or_(active & done)
         self._active.copy_(active & ~done & (r_z > 0.0) & torch.isfinite(r_z))
+        self._busy.copy_(self._active.any())
 
 
 @one_kernel

@@ -21,7 +21,7 @@ from pdcorrect.batch.cells import padded
 from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
 from pdcorrect.batch.gpu import one_kernel, rows_of, sums
 from pdcorrect.batch.mesh_levels import Level, Numbers, hierarchy, places, table
-from pdcorrect.batch.shared_matrices import Sharing, of_all, of_some, with_rows
+from pdcorrect.batch.shared_matrices import Sharing, of_all
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -93,26 +93,6 @@ class Grid:
         self.regular = [bool(inverse.any()) for inverse in inverses]
         self._inverse = real(inverses, nodes, 3, 3)[owners]
         self._up, self._down = weighted(False, nodes, coarse), weighted(True, coarse, nodes)
-
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Grid:
-        """Of some scenes, with the matrices that they have."""
-        scenes, nodes, _ = self._free.shape
-        values, coarse = self._cells.numel() // scenes, len(self._down[0]) // scenes
-
-        def numbers(table: Tensor, size: int) -> Tensor:
-            return of_some(table, size, scenes, rows)
-
-        def weights(table: Tensor) -> Tensor:
-            return table.reshape(scenes, -1, table.shape[-1])[rows].flatten(0, 1)
-
-        return with_rows(
-            self, rows, "_nodal", "_free", "_inverse", _sharing=sharing,
-            _cells=numbers(self._cells, nodes),
-            _slots=numbers(self._slots, values),
-            _blocks=self._blocks[rows if self._alike else kept],
-            _up=(numbers(self._up[0], coarse), weights(self._up[1])),
-            _down=(numbers(self._down[0], nodes), weights(self._down[1])),
-        )  # fmt: skip
 
     def residual(self, b: Tensor, x: Tensor) -> Tensor:
         """B - A x; of no meaning where clamped."""
@@ -279,13 +259,6 @@ class BatchMultigrid:
             and all(grid.regular[i] for grid in self._grids)
             for i, level in enumerate(coarsest)
         ]
-
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> BatchMultigrid:
-        """Of some scenes, with the matrices that they have."""
-        return with_rows(
-            self, rows, _coarsest=self._coarsest.narrowed(sharing, kept, rows),
-            _grids=[grid.narrowed(sharing, kept, rows) for grid in self._grids],
-        )  # fmt: skip
 
     def __call__(self, r: Tensor) -> Tensor:
         return self._cycle(0, r.to(self._storage)).to(r.dtype)

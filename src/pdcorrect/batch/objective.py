@@ -14,7 +14,6 @@ from pdcorrect.batch import viscosity
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.gpu import one_kernel, small_products
 from pdcorrect.batch.points import Tangent
-from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.scene import Damping
 
 
@@ -40,10 +39,6 @@ class BatchMass:
         self._diagonal = all(p.mass_is_diagonal for p in distinct)
         self.density = cells.rest.new_zeros(n.scenes, n.cells)
         self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> BatchMass:
-        """Of some scenes, with their cells."""
-        return with_rows(self, rows, "_blocks", "_plain", "density", "nodal", _cells=cells)
 
     def write(self, masses: Sequence[NDArray[np.float64]]) -> None:
         """Add what learned elements add in each scene, (C, K, K) at density 1, from now on."""
@@ -134,17 +129,6 @@ class BatchObjective:
         n = cells.sizes
         self.strains_before = cells.rest.new_zeros(n.scenes, n.cells if written else 0, 18)
         self.whole = torch.ones_like(self.strains_before[..., :1])
-
-    def narrowed(self, rows: Tensor) -> BatchObjective:
-        """Of some scenes, as it is now."""
-        cells = self.cells.narrowed(rows)
-        mass = self.mass.narrowed(cells, rows)
-        names = ("free", "target", "origin", "forces", "strains_before", "whole")
-        return with_rows(
-            self, rows, *names, cells=cells, mass=mass,
-            tangent=self.tangent and tuple(self.cells.of_scenes(x, rows) for x in self.tangent),
-            before=self.cells.of_scenes(self.before, rows),
-        )  # fmt: skip
 
     def __call__(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import hashlib
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -77,16 +76,6 @@ class Sharing:
         self.owners: list[int] = [kinds[body] for body in bodies.owners]
         self._arrange(device)
 
-    def narrowed(self, rows: Tensor) -> tuple[Sharing, list[int]]:
-        """Of some scenes; and the numbers of the matrices that they have."""
-        owners = [self.owners[i] for i in rows.tolist()]
-        kept = sorted(set(owners))
-        out = copy.copy(self)
-        out.distinct = [self.distinct[k] for k in kept]
-        out.owners = [kept.index(k) for k in owners]
-        out._arrange(rows.device)
-        return out, kept
-
     def _arrange(self, device: torch.device) -> None:
         members: list[list[int]] = [[] for _ in self.distinct]
         for scene, owner in enumerate(self.owners):
@@ -136,22 +125,4 @@ def of_all(numbers: Tensor, size: int) -> Tensor:
     return torch.where(numbers < 0, size * len(numbers), of_its_own).flatten(0, 1)
 
 
-def of_some(table: Tensor, size: int, scenes: int, rows: Tensor) -> Tensor:
-    """What `of_all` makes of some scenes' numbers, from what it made of all."""
-    scene = torch.arange(scenes, device=table.device)[:, None, None]
-    by_scene = table.reshape(scenes, -1, table.shape[1])
-    numbers = torch.where(by_scene == size * scenes, -1, by_scene - size * scene)
-    return of_all(numbers[rows], size)
-
-
 Batch = TypeVar("Batch")
-
-
-def with_rows(batch: Batch, rows: Tensor, *names: str, **others: Any) -> Batch:
-    """A copy with only some rows of the tensors ``names``, and other values of ``others``."""
-    out = copy.copy(batch)
-    for name in names:
-        setattr(out, name, getattr(batch, name)[rows])
-    for name, value in others.items():
-        setattr(out, name, value)
-    return out
