@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.correction import STATE, BatchCorrection
+from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
@@ -187,18 +187,14 @@ class CellBatch:
         tangent = self.points.tangent(self.gradients(u), self.point_weights, project)
         if self.correction is None:
             return tangent
-        return *tangent, self.correction.linearise(self.local(u), project)
-
-    def tangent_sizes(self) -> tuple[int, ...]:
-        """Numbers that the parts of a tangent have at each point, and in each cell."""
-        return (9, 9, 12) if self.correction is None else (9, 9, 12, STATE)
+        return *tangent, *self.correction.linearise(self.local(u), project)
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
         out = self.gathered(self.points.product(tangent[:3], self.gradients(x)))
         if self.correction is None:
             return out
-        return out + self.of_corners(self.correction.apply(tangent[3], self.local(x)))
+        return out + self.of_corners(self.correction.apply(tangent[3:], self.local(x)))
 
     def of_corners(self, by_cell: Tensor) -> Tensor:
         """Values (B, C, K, 3) of corners summed, and none for modes, (B, U, 3)."""

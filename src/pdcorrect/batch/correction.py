@@ -1,7 +1,6 @@
 """What a learned element adds to a batch: `pdcorrect.fem.turned_strains` for B scenes, in torch.
 
-Kept of a configuration, see `state`: R, S, (tr S - S)^-1 and z of each cell, and what its own
-derivative y = K z needs; all lengths are times the cell's size.
+All lengths are times the cell's size.
 """
 
 from __future__ import annotations
@@ -19,16 +18,12 @@ from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
 from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE, SHARES
 
-_SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 8)
-"""Of what `_State` has."""
-STATE = sum(_SIZES)
-
 
 class _State(NamedTuple):
-    """R, S, (tr S - S)^-1 and S's adjugate; z before it fades, and the derivatives by what is left
-    of it.
+    """Of each cell at a configuration: R, S, (tr S - S)^-1, S's adjugate and z before it fades.
 
-    Those by S and the vectors of z, their tensor, and w; what `_measures` tells.
+    Then the derivatives by what is left of z, those by S and z's vectors, their tensor, and w;
+    and what `_measures` tells.
     """
 
     R: Tensor
@@ -100,9 +95,9 @@ class BatchCorrection:
         conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
         return energy, self._spread(conjugates)
 
-    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> Tensor:
+    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, ...]:
         """What `apply` needs of it, with the same rate."""
-        return _kept(self._against(self._state(local), before, rate))
+        return self._against(self._state(local), before, rate)
 
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
@@ -125,21 +120,18 @@ class BatchCorrection:
         """Times a rate, and with the part of K that viscosity has, see `WrittenViscous`."""
         return rate * without_trace(self.stress(without_trace(z)))
 
-    def linearise(self, local: Tensor, project: bool = False) -> Tensor:
-        """What `apply` needs, (STATE, B C, 1); ``project`` as in `CellCorrection.tangent`."""
+    def linearise(self, local: Tensor, project: bool = False) -> tuple[Tensor, ...]:
+        """What `apply` needs; ``project`` as in `CellCorrection.tangent`."""
         state = self._state(local)
-        if project:
-            state = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
-        return _kept(state)
+        if not project:
+            return state
+        own = {k: torch.zeros_like(getattr(state, k)) for k in ("raw", "y", "tensor", "w")}
+        return state._replace(**own)
 
-    def apply(self, kept: Tensor, local: Tensor, rate: Tensor | None = None) -> Tensor:
+    def apply(self, tangent: Sequence[Tensor], local: Tensor, rate: Tensor | None = None) -> Tensor:
         """The second derivative times changes (B, C, 8, 3), by cell; the rate is of viscosity."""
-        scenes, cells = self._sizes.shape
-        flat = kept[..., 0].T.reshape(scenes, cells, STATE)
-        parts = torch.split(flat, list(_SIZES), dim=2)
-        square = [x.reshape(*x.shape[:2], 3, 3) if x.shape[2] == 9 else x for x in parts]
-        changes = self._changes(_State(*square), small_products(self._shapes, local), rate)
-        return self._spread(changes)
+        dv = small_products(self._shapes, local)
+        return self._spread(self._changes(_State(*tangent), dv, rate))
 
     def _spread(self, conjugates: Tensor) -> Tensor:
         return small_products(self._shapes.transpose(-1, -2), conjugates)
@@ -239,9 +231,6 @@ class BatchCorrection:
         return _conjugates(at.R, dT, dw, torch.cat([dy[..., :6], dy_vectors.flatten(2)], dim=2))
 
 
-_OWN = ("raw", "y", "tensor", "w")
-
-
 def without_trace(z: Tensor) -> Tensor:
     """Strains (..., 18) whose first three numbers have no mean."""
     axial = z[..., :3] - z[..., :3].mean(dim=-1, keepdim=True)
@@ -289,11 +278,6 @@ def _trace(A: Tensor) -> Tensor:
 def _contracted(A: Tensor, B: Tensor) -> Tensor:
     """A : B, (B, C, 1)."""
     return (A * B).sum(dim=(-2, -1))[..., None]
-
-
-def _kept(state: _State) -> Tensor:
-    flat = [x.flatten(2).flatten(0, 1) for x in state]
-    return torch.cat(flat, dim=1).T[..., None].contiguous()
 
 
 def _stretch(H: Components) -> list[Components]:

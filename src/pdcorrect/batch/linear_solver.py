@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,6 @@ from torch import Tensor
 from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.objective import (
     BatchObjective,
-    Tangents,
     by_scene,
     dot,
     largest_displacement,
@@ -50,7 +50,7 @@ class BatchConjugateGradients:
         self._tolerance, self._share, self._settled = rest.new_zeros(3)
         self._busy = torch.zeros((), dtype=torch.bool, device=rest.device)
         self.steps = 0
-        self._tangent: Tangents
+        self._tangent: tuple[Any, ...] = ()
         self._begin = recorder(self._set_up)
         self._advance = recorder(self._step)
 

@@ -33,12 +33,10 @@ from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
 from pdcorrect.batch.minimise import BatchMinimiser, Phase
-from pdcorrect.batch.modes import relaxed
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.states import BatchResult, BatchState, state_of, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
-from pdcorrect.batch.viscosity import stretches
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
@@ -382,7 +380,10 @@ class BatchStepper:
         stage, objective = self.staging(state), self.objective
         objective.factors.copy_(self.cells.tensor(np.array(self._factors(stage.scheme))))
         objective.target.copy_(stage.target)
-        self._damp(stage)
+        if objective.rayleigh is not None:
+            objective.rayleigh.prepare(stage.origin, stage.foreseen)
+        if objective.viscous is not None:
+            objective.viscous.prepare(stage.strains)
         self._push(stage, forces, stage.start if y is None else y[:, : self.cells.sizes.nodes])
         return stage
 
@@ -412,27 +413,6 @@ class BatchStepper:
         moved = self.objective.mass(y - stage.target)
         out = stage.scheme.inertia * moved - self.objective.forces
         return out[:, : self.cells.sizes.nodes] * self.staging.free
-
-    def _damp(self, stage: BatchStepEquation) -> None:
-        objective, cells = self.objective, self.cells
-        if objective.tangent is not None:
-            tangent = cells.linearise(relaxed(cells, stage.foreseen), project=True)
-            for kept, new in zip(objective.tangent, tangent, strict=True):
-                kept.copy_(new)
-            objective.origin.copy_(relaxed(cells, stage.origin))
-        elif objective.damped:
-            objective.origin.copy_(self.staging.extended(stage.origin))
-        if objective.viscous:
-            objective.before.zero_()
-            for a, place in stage.strains:
-                objective.before.add_(stretches(cells, relaxed(cells, place))[0], alpha=a)
-            if cells.correction is not None:
-                nodes = cells.rest[:, : cells.sizes.nodes]
-                local = [(a, cells.local(x - nodes)) for a, x in stage.strains]
-                parts = [a * cells.correction.strains(u) for a, u in local]
-                objective.strains_before.copy_(torch.stack(parts).sum(dim=0))
-                whole = [cells.correction.whole(u) for _, u in local]
-                objective.whole.copy_(torch.stack(whole).all(dim=0))
 
     @cached_property
     def _minimiser(self) -> BatchMinimiser:
