@@ -13,8 +13,8 @@ import torch
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
 from pdcorrect.batch import decomposition, gpu
+from pdcorrect.batch.cells import DistinctBodies
 from pdcorrect.batch.points import Points
-from pdcorrect.batch.shared_matrices import DistinctBodies
 from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies

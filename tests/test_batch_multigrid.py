@@ -9,8 +9,7 @@ import pdcorrect as pc
 from conftest import beam, box_mesh
 from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, summed_blocks
 from pdcorrect.batch.first_hessian import LARGEST_REST, FirstHessian, chosen
-from pdcorrect.batch.mesh_levels import hierarchy
-from pdcorrect.batch.multigrid import largest_eigenvalue, with_mass
+from pdcorrect.batch.multigrid import hierarchy, largest_eigenvalue, with_mass
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import interpolation, refine
 

@@ -1,6 +1,6 @@
 """Elastic energy, forces and tangents of many bodies at once.
 
-DistinctBodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
+Bodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
 first, then, from a common place on, its internal modes, cell by cell.  Cells and nodes that
 a body does not have carry no weight and stay at zero.  What is known at quadrature points
 is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
@@ -9,7 +9,8 @@ is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,11 +20,11 @@ from torch import Tensor
 
 from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
-from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.shared_matrices import DistinctBodies, of_all
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
+
+Numbers = NDArray[np.int64]
 
 
 class Sizes(NamedTuple):
@@ -285,3 +286,73 @@ class CellBatch:
         """Leading shape of the products with gradients: by scene where its cells are alike."""
         n = self.sizes
         return (n.scenes, 3 * n.cells) if self._gradients.ndim == 3 else (n.scenes, n.cells, 3)
+
+
+def kinds(
+    problems: Sequence[Problem], key: Callable[[Problem], Hashable]
+) -> tuple[list[Problem], list[int]]:
+    """One problem of each key, and which of them each problem is like."""
+    seen: dict[Hashable, int] = {}
+    owners = [seen.setdefault(key(p), len(seen)) for p in problems]
+    firsts = [owners.index(k) for k in range(len(seen))]
+    return [problems[i] for i in firsts], owners
+
+
+@dataclass(frozen=True, eq=False)
+class DistinctBodies:
+    """The problems of a batch without their loads, each once.
+
+    What depends on nothing else is computed once a body.
+
+    Attributes
+    ----------
+    distinct : list of Problem
+        One of each body.
+    owners : (B,) int
+        Which of them each scene is.
+    """
+
+    distinct: list[Problem]
+    owners: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, problems: Sequence[Problem]) -> DistinctBodies:
+        """Known by the objects that `Problem.with_loads` shares; numbers are not compared."""
+
+        def key(p: Problem) -> tuple[Hashable, ...]:
+            parts = (p.mesh, p.space, p.quadrature, p.materials, p.mass_matrix, p.clamps)
+            return p.mass_rule, *map(id, parts)
+
+        distinct, owners = kinds(problems, key)
+        return cls(distinct, np.array(owners, dtype=np.int64))
+
+    @property
+    def one_a_scene(self) -> bool:
+        """Whether the scenes are the distinct bodies in their order."""
+        return np.array_equal(self.owners, np.arange(len(self.distinct)))
+
+
+def of_all(numbers: Tensor, size: int) -> Tensor:
+    """Numbers (B, R, n) of each scene's own ``size`` rows as those of all scenes, (B R, n).
+
+    Those below zero stand for nothing, and become B times ``size``.
+    """
+    scene = torch.arange(len(numbers), device=numbers.device)[:, None, None]
+    of_its_own = numbers + size * scene
+    return torch.where(numbers < 0, size * len(numbers), of_its_own).flatten(0, 1)
+
+
+def places(cells: Numbers, count: int) -> Numbers:
+    """Where each node occurs in the raveled cells, (N, most), filled up with -1."""
+    flat = cells.ravel()
+    order = np.argsort(flat, kind="stable")
+    return table_rows(flat[order], order, count, -1)[0]
+
+
+def table_rows(rows: Numbers, values: Numbers, count: int, fill: int) -> tuple[Numbers, Numbers]:
+    """Values by sorted rows as a table (count, most), and the place of each in its row."""
+    counts = np.bincount(rows, minlength=count)
+    places = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
+    out = np.full((count, counts.max()), fill, dtype=np.int64)
+    out[rows, places] = values
+    return out, places

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, cat
 
-from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.cells import CellBatch, DistinctBodies, kinds, padded
 from pdcorrect.batch.gpu import small_products
-from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.batch.triton_kernels import tall_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
@@ -131,6 +131,62 @@ def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
     solved = inverse @ blocks[:, nodes:, :nodes]
     kept = blocks[:, :nodes, :nodes] - blocks[:, :nodes, nodes:] @ solved
     return np.ascontiguousarray(kept), inverse, solved
+
+
+class Sharing:
+    """Which scenes have the same mesh, material and clamps.
+
+    Attributes
+    ----------
+    distinct : list of Problem
+        One of each kind.
+    owners : list of int
+        Which of them each scene is.
+    """
+
+    def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
+        bodies = DistinctBodies.of(problems)
+        self.distinct, owners = kinds(bodies.distinct, _key)
+        self.owners: list[int] = [owners[body] for body in bodies.owners]
+        self._arrange(device)
+
+    def _arrange(self, device: torch.device) -> None:
+        members: list[list[int]] = [[] for _ in self.distinct]
+        for scene, owner in enumerate(self.owners):
+            members[owner].append(scene)
+        most = max(map(len, members))
+        self._scenes = len(self.owners)
+        filled = [row + [self._scenes] * (most - len(row)) for row in members]
+        self._members = torch.tensor(filled, device=device)
+        self._alone = most == 1
+        self._full = len(members) * most == self._scenes
+
+    def gathered(self, x: Tensor) -> Tensor:
+        """(B, ...) -> (K, m, ...): side by side what shares a matrix, filled up with zeros."""
+        if self._alone:
+            return x[:, None]
+        if not self._full:
+            x = torch.cat([x, x.new_zeros(1, *x.shape[1:])])
+        return x[self._members]
+
+    def scattered(self, x: Tensor) -> Tensor:
+        """The reverse of `gathered`."""
+        if self._alone:
+            return x[:, 0]
+        out = x.new_zeros(self._scenes + 1, *x.shape[2:])
+        out[self._members] = x
+        return out[: self._scenes]
+
+
+def _key(problem: Problem) -> bytes:
+    digest = hashlib.blake2b()
+    materials, mass = problem.materials, problem.mass_matrix
+    for array in (
+        problem.positions, problem.cells, problem.free, materials.mu, materials.volume_weight,
+        mass.data, mass.indices,
+    ):  # fmt: skip
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
 
 
 class DenseInverse:

@@ -24,6 +24,7 @@ from pdcorrect.batch.decomposition import transposed
 from pdcorrect.batch.elimination import (
     DenseInverse,
     Elimination,
+    Sharing,
     add_mass,
     alike_cells,
     rest_blocks,
@@ -32,7 +33,6 @@ from pdcorrect.batch.elimination import (
 )
 from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
-from pdcorrect.batch.shared_matrices import Sharing
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE

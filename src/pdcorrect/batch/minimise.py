@@ -10,7 +10,7 @@ the true Hessian, by conjugate gradients, for all scenes that wait for it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
 import torch
@@ -20,6 +20,7 @@ from pdcorrect.batch.first_hessian import FirstHessian
 from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement, node_dot
+from pdcorrect.solvers.follower import MOST, Anderson
 from pdcorrect.solvers.minimise import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
 
 _CURVATURE = 1e-12
@@ -342,3 +343,64 @@ def _accept(moved: Tensor, known: Sequence[Tensor], found: Sequence[Tensor]) -> 
     """Put what was found, (B, U, 3) each, in the place of what was known, where moved (B,)."""
     for old, new in zip(known, found, strict=True):
         old.copy_(torch.where(by_scene(moved), new, old))
+
+
+# --- loads that follow the body ------------------------------------------------------------------
+
+
+def settle(
+    minimiser: BatchMinimiser, alive: Tensor, follow: Callable[[Tensor], None]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Go on from a minimum with the loads as they are there, scene by scene, until both agree.
+
+    Parameters
+    ----------
+    minimiser : BatchMinimiser
+        After a run from the first iterate.
+    alive : (B,) bool
+        Scenes that take part.
+    follow : callable
+        Samples the loads at configurations (B, U, 3).
+
+    Returns
+    -------
+    y, phase, iterations, evaluations, estimate
+        As the minimiser's, of all runs together.
+    """
+    m = minimiser
+    start = m.start
+    y, phase, estimate = m.y.clone(), m.phase.clone(), m.estimate.clone()
+    iterations, evaluations = m.iterations.clone(), m.evaluations.clone()
+    mixed = Mixing(len(y))
+    for _ in range(MOST):
+        going = alive & (phase == Phase.CONVERGED)
+        if not bool(going.any()):
+            break
+        start = mixed(start, y, going)
+        follow(start)
+        m.run(start, going, unmoved=1.0)
+        here = going[:, None, None]
+        y = torch.where(here, m.y, y)
+        phase = torch.where(going, m.phase, phase)
+        estimate = torch.where(going, m.estimate, estimate)
+        iterations, evaluations = iterations + m.iterations * going, evaluations + m.evaluations
+        settled = going & (m.phase == Phase.CONVERGED) & (m.iterations == 0)
+        alive = alive & ~settled
+    else:
+        phase = torch.where(alive & (phase == Phase.CONVERGED), int(Phase.LIMIT), phase)
+    return y, phase, iterations, evaluations, estimate
+
+
+class Mixing:
+    """`Anderson`'s acceleration of each scene, on the CPU as the loads are."""
+
+    def __init__(self, scenes: int) -> None:
+        self._scenes = [Anderson() for _ in range(scenes)]
+
+    def __call__(self, y: Tensor, image: Tensor, which: Tensor) -> Tensor:
+        """The next iterates of the scenes where ``which`` (B,) holds; others stay at ``y``."""
+        before, after = (x.detach().to("cpu", torch.float64).numpy() for x in (y, image))
+        out = before.copy()
+        for i in which.nonzero()[:, 0].tolist():
+            out[i] = self._scenes[i](before[i].ravel(), after[i].ravel()).reshape(out[i].shape)
+        return torch.as_tensor(out, dtype=y.dtype, device=y.device)

@@ -27,12 +27,11 @@ from pdcorrect.batch.checks import (
     usable_device,
 )
 from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
-from pdcorrect.batch.follower import settle
 from pdcorrect.batch.gpu import one_thread
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
-from pdcorrect.batch.minimise import BatchMinimiser, Phase
+from pdcorrect.batch.minimise import BatchMinimiser, Phase, settle
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.states import BatchResult, BatchState, state_of, together
