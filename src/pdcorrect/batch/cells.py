@@ -55,17 +55,10 @@ def padded(arrays: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float =
 class CellBatch:
     """The cells of B problems with the same element and energy, weightless until `set_weights`.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-    device, dtype
-        Of everything that is computed.
-
     Attributes
     ----------
     sizes : Sizes
     bodies : DistinctBodies
-        Of the scenes.
     node_counts : list of int
     volumes : (2, B C, Q)
         Of the points in both terms of the energy, m3.
@@ -300,16 +293,9 @@ def kinds(
 
 @dataclass(frozen=True, eq=False)
 class DistinctBodies:
-    """The problems of a batch without their loads, each once.
+    """The problems of a batch without their loads, each once, and which of them each scene is.
 
     What depends on nothing else is computed once a body.
-
-    Attributes
-    ----------
-    distinct : list of Problem
-        One of each body.
-    owners : (B,) int
-        Which of them each scene is.
     """
 
     distinct: list[Problem]

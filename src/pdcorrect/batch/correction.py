@@ -46,14 +46,7 @@ class _State(NamedTuple):
 class BatchCorrection:
     """Energies, forces and second derivatives of the corrections of B bodies.
 
-    Parameters
-    ----------
-    corrections : sequence of CellCorrection
-        Of the scenes.
-    cells : int
-        To which their numbers are filled up.
-    like : Tensor
-        Whose type and device are used.
+    Filled up to so many ``cells``, in the type and on the device of ``like``.
     """
 
     def __init__(self, corrections: Sequence[CellCorrection], cells: int, like: Tensor) -> None:

@@ -53,22 +53,10 @@ def rest_blocks(problem: Problem, stiffness: float, one: bool) -> Array:
 class Elimination:
     """The internal modes of cells, eliminated from a system and found afterwards.
 
-    Parameters
-    ----------
-    cells : CellBatch
-    blocks : sequence of (C or 1, w L, w L)
-        Of each distinct problem's cells; one stands for all.
-    owners : (B,) tensor
-        Which of them each scene has.
-    nodes : int
-        Of a cell, K; its other shape functions are modes.
-    width : int
-        Unknowns a node, w: 1 where the blocks are the same for all coordinates, or 3.
-
-    Attributes
-    ----------
-    blocks : list of (C or 1, w K, w K)
-        Of the nodes, with the modes eliminated.
+    ``blocks`` (C or 1, w L, w L) are of each distinct problem's cells, one for all; ``owners`` (B,)
+    which of them each scene has; ``nodes`` K a cell has, its other shape functions are modes; a
+    node has ``width`` w unknowns: 1 where blocks are the same for all coordinates, or 3.  The
+    attribute ``blocks`` is of the nodes, (C or 1, w K, w K), with the modes eliminated.
     """
 
     def __init__(
@@ -134,23 +122,15 @@ def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
 
 
 class Sharing:
-    """Which scenes have the same mesh, material and clamps.
+    """Which scenes have the same mesh, material and clamps, and so one matrix.
 
-    Attributes
-    ----------
-    distinct : list of Problem
-        One of each kind.
-    owners : list of int
-        Which of them each scene is.
+    ``distinct`` is one of each kind, ``owners`` which of them each scene is.
     """
 
     def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
         bodies = DistinctBodies.of(problems)
         self.distinct, owners = kinds(bodies.distinct, _key)
         self.owners: list[int] = [owners[body] for body in bodies.owners]
-        self._arrange(device)
-
-    def _arrange(self, device: torch.device) -> None:
         members: list[list[int]] = [[] for _ in self.distinct]
         for scene, owner in enumerate(self.owners):
             members[owner].append(scene)
@@ -192,17 +172,8 @@ def _key(problem: Problem) -> bytes:
 class DenseInverse:
     """R -> A^-1 r on nodal fields (B, N, 3), zero where clamped.
 
-    Parameters
-    ----------
-    sharing : Sharing
-        Which scenes have one matrix.
-    free : sequence of (N, 3) bool
-        Components that may move, of each distinct problem.
-    width : int
-        Unknowns a node of the matrices: 3, or 1 where one is the same for all coordinates.
-    storage : torch.dtype
-        Of the inverses.
-    device : torch.device
+    ``free`` (N, 3) are the components of each distinct problem that may move; matrices have
+    ``width`` unknowns a node: 3, or 1 where one is the same for all coordinates.
     """
 
     def __init__(

@@ -97,15 +97,7 @@ LARGEST_REST = 1500
 class FirstHessian:
     """R -> H^-1 r, about, on configurations (B, U, 3), zero where clamped.
 
-    Parameters
-    ----------
-    cells : CellBatch
-    problems : sequence of Problem
-    factors : (float, float)
-        On mass (1/s2) and stiffness.
-    kind : {"G", "G-scaled", "multigrid", "rest"}
-    storage : torch.dtype
-        Of the inverse.
+    ``factors`` are on mass (1/s2) and stiffness, ``storage`` is the inverse's type.
 
     Attributes
     ----------

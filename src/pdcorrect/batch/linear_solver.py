@@ -68,32 +68,17 @@ class BatchConjugateGradients:
     ) -> None:
         """Set ``x`` and ``converged`` for the scenes where ``which`` (B,) holds.
 
-        Parameters
-        ----------
-        y, b : (B, U, 3)
-            Where the Hessian is taken, and the right-hand side, zero where clamped.
-        start : (B, U, 3) or None
-            First iterate.
-        tolerance : float
-            Of the residual in the preconditioner's norm, relative to its first value.
-        residual_share : float
-            Largest Euclidean norm of the residual, of b's.
-        settled : float
-            Largest displacement of the last change, of the solution's.
+        The Hessian is taken at ``y``; ``b`` is zero where clamped; both (B, U, 3), as ``start``.
+        The rest is as in `pdcorrect.fem.multigrid.conjugate_gradients`, with ``settled`` the
+        largest displacement of the last change, of the solution's.
         """
         self._y.copy_(y)
         self._b.copy_(b)
-        if start is None:
-            self.x.zero_()
-        else:
-            self.x.copy_(start)
+        self.x.zero_() if start is None else self.x.copy_(start)
         self._which.copy_(which)
-        for room, value in (
-            (self._tolerance, tolerance),
-            (self._share, residual_share),
-            (self._settled, settled),
-        ):
-            room.fill_(value)
+        self._tolerance.fill_(tolerance)
+        self._share.fill_(residual_share)
+        self._settled.fill_(settled)
         self._begin()
         self.steps = 0
         while self.steps < max_steps and bool(self._busy):

@@ -149,13 +149,7 @@ class Phase(IntEnum):
 class BatchMinimiser:
     """L-BFGS on a `BatchObjective`.
 
-    Parameters
-    ----------
-    objective : BatchObjective
-    inverse : FirstHessian
-    tolerance : (B,)
-        m, of each scene's estimated largest displacement from its minimum.
-    max_iterations : int
+    The ``tolerance`` (B,), m, is of each scene's estimated largest displacement from its minimum.
 
     Attributes
     ----------
@@ -353,19 +347,9 @@ def settle(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Go on from a minimum with the loads as they are there, scene by scene, until both agree.
 
-    Parameters
-    ----------
-    minimiser : BatchMinimiser
-        After a run from the first iterate.
-    alive : (B,) bool
-        Scenes that take part.
-    follow : callable
-        Samples the loads at configurations (B, U, 3).
-
-    Returns
-    -------
-    y, phase, iterations, evaluations, estimate
-        As the minimiser's, of all runs together.
+    ``follow`` samples the loads at configurations (B, U, 3), ``alive`` (B,) are the scenes that
+    take part.  Returns the minimiser's y, phase, iterations, evaluations and estimate, of all runs
+    together.
     """
     m = minimiser
     start = m.start

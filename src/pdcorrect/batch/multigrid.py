@@ -1,9 +1,11 @@
 """A V-cycle of geometric multigrid for the rest Hessian on refined meshes.
 
-The levels are the meshes that the body's own one was refined from (`levels`).  On each but
-the coarsest, rough errors are damped before and after the coarse correction by the same
-Chebyshev polynomial (`grid`); the coarsest matrix, of the scene's own coarse mesh, has a dense
-inverse.  So the cycle B is symmetric, and positive definite since the polynomial's bound of
+The levels are the meshes that the body's own one was refined from: nested, and so are their
+trilinear functions.  A coarse cell's matrix is the sum over its children of W^T A W with W the
+weights of a child's corners on the cell's (Galerkin's coarse matrix, cell by cell).  On each level
+but the coarsest, rough errors are damped before and after the coarse correction by the same
+Chebyshev polynomial; the coarsest matrix, of the scene's own coarse mesh, has a dense inverse.
+  So the cycle B is symmetric, and positive definite since the polynomial's bound of
 the eigenvalues is never too small; where the clamps are those of the coarse mesh too, no
 eigenvalue of B A is above 1.
 """
@@ -67,14 +69,7 @@ def factors_of(refine: int) -> list[int]:
 def hierarchy(
     cells: Numbers, free: NDArray[np.bool_], blocks: Array, nodal: Array, refine: int
 ) -> list[Level]:
-    """The levels of a mesh whose cells are cut into ``refine ** 3``, finest first.
-
-    Parameters
-    ----------
-    cells, free, blocks, nodal
-        Of the finest `Level`.
-    refine : int
-    """
+    """The levels of a mesh whose cells are cut into ``refine ** 3``, from the finest's arrays."""
     out = []
     for q in factors_of(refine):
         parents, families, kept = _parents(cells, refine, q)
@@ -159,21 +154,10 @@ SMOOTHED = 16.0
 
 
 class Grid:
-    """A level; nodal fields are (B, N, 3), padded.
+    """A level of the distinct problems; nodal fields are (B, N, 3), padded.
 
-    Parameters
-    ----------
-    levels : sequence of Level
-        Of the distinct problems.
-    coarse : int
-        Nodes of the largest next coarser level.
-    sharing, storage, device
-        See `BatchMultigrid`.
-
-    Attributes
-    ----------
-    regular : list of bool
-        Whether each distinct problem has a smoother.
+    ``coarse`` are the nodes of the largest next coarser level.  ``regular`` says of each distinct
+    problem whether it has a smoother.
     """
 
     def __init__(
@@ -185,7 +169,7 @@ class Grid:
         device: torch.device,
     ) -> None:
         self._sharing = sharing
-        self._factors = torch.tensor(chebyshev(DEGREE, SMOOTHED), dtype=storage, device=device)
+        self._factors = torch.tensor(_chebyshev(), dtype=storage, device=device)
         owners = torch.as_tensor(sharing.owners, device=device)
         nodes = max(len(level.free) for level in levels)
         count = max(len(level.cells) for level in levels)
@@ -277,14 +261,14 @@ def _weighted(values: Tensor, numbers: Tensor, weights: Tensor) -> Tensor:
     return total
 
 
-def chebyshev(degree: int, smoothed: float) -> list[tuple[float, float]]:
-    """Factors of the last step and of D^-1 r in each step, for eigenvalues from 1/smoothed to 1.
+def _chebyshev() -> list[tuple[float, float]]:
+    """Factors of the last step and of D^-1 r in each step, for eigenvalues from 1/SMOOTHED to 1.
 
     Saad, Iterative methods for sparse linear systems (2003), algorithm 12.1.
     """
-    middle, half = (1.0 + 1.0 / smoothed) / 2.0, (1.0 - 1.0 / smoothed) / 2.0
+    middle, half = (1.0 + 1.0 / SMOOTHED) / 2.0, (1.0 - 1.0 / SMOOTHED) / 2.0
     out, ratio = [(0.0, 1.0 / middle)], half / middle
-    for _ in range(degree - 1):
+    for _ in range(DEGREE - 1):
         before, ratio = ratio, 1.0 / (2.0 * middle / half - ratio)
         out.append((ratio * before, 2.0 * ratio / half))
     return out
@@ -341,23 +325,10 @@ _ROUNDING = 1e-9
 class BatchMultigrid:
     """R -> B r on nodal fields (B, N, 3), zero where clamped; B is about A^-1.
 
-    Parameters
-    ----------
-    sharing : Sharing
-        Which scenes have one matrix.
-    blocks : sequence of (C or 1, 24, 24)
-        Stiffness of each distinct problem's cells, N/m; one stands for all.
-    mass_factor : float
-        1/s2.
-    storage : torch.dtype
-        Of all that is stored and computed here.
-    device : torch.device
-
-    Attributes
-    ----------
-    regular : list of bool
-        Whether each distinct problem's coarsest matrix is positive definite, and the nodes'
-        blocks on the other levels.
+    ``blocks`` (C or 1, 24, 24) are the stiffness of each distinct problem's cells, N/m, one for
+    all; the mass's factor is in 1/s2, and all is stored and computed in ``storage``.  ``regular``
+    says of each distinct problem whether its coarsest matrix is positive definite, and the nodes'
+    blocks on the other levels.
     """
 
     def __init__(

@@ -30,16 +30,9 @@ Components = list[Tensor]
 
 
 class Points:
-    """Energy densities, stresses and tangents of one energy.
+    """Energy densities, stresses and tangents of one energy, see `energy_code`.
 
-    Parameters
-    ----------
-    model : int
-        See `energy_code`.
-    first : int
-        Points of a cell below it have no volume term.
-    points : int
-        Of each cell.
+    Of a cell's ``points`` those below the ``first`` have no volume term.
     """
 
     def __init__(self, model: int, first: int, points: int) -> None:
@@ -65,14 +58,7 @@ class Points:
         return out
 
     def rotations(self, F: Tensor, moved: bool = False) -> Tensor:
-        """Nearest rotations (9, L); the identity where F is not finite.
-
-        Parameters
-        ----------
-        F : (9, L)
-        moved : bool
-            Whether F is the gradient H of a displacement.
-        """
+        """Nearest rotations (9, L) of F, or of H if ``moved``; the identity where not finite."""
         finite = torch.nan_to_num(F)[..., None]
         (R,) = computed(_rotation_of_moved if moved else _rotation, [finite], (9,))
         return R[..., 0]
