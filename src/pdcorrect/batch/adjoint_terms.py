@@ -28,10 +28,6 @@ class Written:
     """Derivatives through what learned elements are written from, scene by scene on the CPU.
 
     Those by matrices and masses are gathered; `weights` pulls them back at once.
-
-    Parameters
-    ----------
-    stepper : BatchStepper
     """
 
     def __init__(self, stepper: BatchStepper) -> None:

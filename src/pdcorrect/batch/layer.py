@@ -49,18 +49,9 @@ _CONSTANT = "previous_times"
 class _Call:
     """One call of a layer: what its steps, and later their derivatives, share and record.
 
-    Attributes
-    ----------
-    layer : PDLayer
-    material : BatchMaterial
-    times : tuple of float
-        At the start, s.
-    statuses : list of list of Status
-        Of the steps taken so far.
-    failures : list of (int, int)
-        Step and scene of each derivative that failed.
-    names : list of tuple of str
-        Of the memory before each step taken so far, and after the last one.
+    ``times`` (s) are at the start, ``statuses`` of the steps taken so far, ``failures`` step and
+    scene of each derivative that failed, ``names`` of the memory before each step and after the
+    last.
     """
 
     layer: PDLayer

@@ -74,7 +74,7 @@ class BatchConjugateGradients:
         """
         self._y.copy_(y)
         self._b.copy_(b)
-        self.x.zero_() if start is None else self.x.copy_(start)
+        self.x.copy_(torch.zeros_like(b) if start is None else start)
         self._which.copy_(which)
         self._tolerance.fill_(tolerance)
         self._share.fill_(residual_share)
