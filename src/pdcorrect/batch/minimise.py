@@ -2,7 +2,7 @@
 
 One iteration evaluates every scene once: scenes whose trial step is accepted move and take
 a new direction, the others try a shorter step.  It has no branches that depend on values,
-so a GPU replays it (`recording`); between iterations Python looks at the scenes' progress.
+so a GPU replays it (`Recorder`); between iterations Python looks at the scenes' progress.
 A scene stops when its own step is short; then the remaining displacement is estimated with
 the true Hessian, by conjugate gradients, for all scenes that wait for it.
 """

@@ -2,7 +2,8 @@
 
 `at_points` makes one kernel of all that a function does at a point: a thousand operations, and
 nothing but arithmetic.  `torch.compile` takes a minute and more to find out what may be fused;
-Triton compiles the same lines written out in a second or two.
+Triton compiles the same lines written out in a second or two (torch 2.11 on an H200; a fresh
+machine's first files: ``fresh_machine`` in ``benchmarks/results/nvidia-h200.json``).
 
 `tall_product` multiplies matrices by one to four columns, in which the libraries' products reach
 half of a GPU's memory bandwidth.
