@@ -96,12 +96,12 @@ class BatchGradients:
         with stepper.alone():
             self._stage = stepper.prepare(before, forces, result.y)
             self._material = stepper.present
-            self._factors = stepper.objective.factors.clone()
+            self._inertia = stepper.objective.factors[0].clone()
             by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
             kept = self._sums.pop("internal_forces_after", None)
             if kept is not None:
                 kept = stepper.staging.extended(kept * self._free)
-                by_y = by_y + self._factors[0] * stepper.objective.mass(kept)[:, : self._nodes]
+                by_y = by_y + self._inertia * stepper.objective.mass(kept)[:, : self._nodes]
                 by_y = by_y - self._load_slopes("y", kept)
             fine = torch.tensor(in_one(result.statuses), device=by_y.device)
             solver = self._solve(by_y, fine, tolerance)
@@ -159,11 +159,8 @@ class BatchGradients:
                 f"{', '.join(scheme.memory) or 'of which there are none'}."
             )
         self._pull(scheme.positions, None, self._given("grad_positions", positions))
-        self._pull(
-            scheme.velocities,
-            scheme.clamped_velocities,
-            self._given("grad_velocities", velocities),
-        )
+        by_velocities = self._given("grad_velocities", velocities)
+        self._pull(scheme.velocities, scheme.clamped_velocities, by_velocities)
         for name, g in memory.items():
             self._pull(*scheme.memory[name], self._given(name, g))
         return self._sums.pop("y")
@@ -232,11 +229,8 @@ class BatchGradients:
             fall = self._stepper.loads.acceleration(stage.spans)
             push = stage.scheme.load_factor * self._push
             out = mass.row_slopes((push * fall).sum(dim=-1))
-            out = out - self._factors[0] * mass.slopes(self._push, self._y - stage.target)
-            if self._stepper.objective.rayleigh is not None:
-                origin = self._stepper.staging.extended(stage.origin)
-                out = out - self._factors[1] * mass.slopes(self.x, self._y - origin)
-            return out
+            out = out - self._inertia * mass.slopes(self._push, self._y - stage.target)
+            return out if self._rayleigh is None else out + self._rayleigh.density
 
     # --- by damping ---------------------------------------------------------------------------
 
@@ -267,12 +261,10 @@ class BatchGradients:
 
     def _by_written(self, written: Written) -> tuple[Tensor, Tensor]:
         """Through what learned elements are written from, by mu and omega, (B, C)."""
-        stage, stepper = self._stage, self._stepper
         written.add_forces(self._y, -self.x)
-        written.add_inertia(-self._push, self._factors[0] * (self._y - stage.target))
-        if stepper.objective.rayleigh is not None:
-            origin = stepper.staging.extended(stage.origin)
-            written.add_inertia(-self.x, self._factors[1] * (self._y - origin))
+        written.add_inertia(-self._push, self._inertia * (self._y - self._stage.target))
+        if self._rayleigh is not None:
+            written.add_inertia(-self.x, self._rayleigh.mass_offset)
         return written.weights(self.x)
 
     @property
@@ -312,7 +304,7 @@ class BatchGradients:
         sampled = self._load_slopes("positions", self._push)
         Linear(positions=1.0).transpose(sampled, self._sums)
         if scheme.inertia:
-            self._pull(scheme.target, scheme.clamped_target, self._factors[0] * momentum)
+            self._pull(scheme.target, scheme.clamped_target, self._inertia * momentum)
         if self._rayleigh is not None:
             self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
             self._pull(scheme.foreseen or scheme.start, scheme.clamped, self._rayleigh.place)

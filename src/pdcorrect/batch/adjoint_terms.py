@@ -107,7 +107,8 @@ class RayleighTerm:
         damping = stepper.objective.rayleigh
         assert damping is not None
         self._mass, self._cells, self._x = stepper.objective.mass, stepper.cells, x
-        self._written, self._stiffness = written, stepper.objective.factors[2].clone()
+        self._written = written
+        self._alpha, self._stiffness = stepper.objective.factors[1:3].clone()
         self._origin = damping.origin.clone()
         self._offset = y - self._origin
         self._by_origin = damping.apply(None, x)
@@ -140,6 +141,16 @@ class RayleighTerm:
         total = -self._stiffness * by_mu, -self._stiffness * by_omega
         total = with_modes(self._cells, total, self._at, self._by_place)
         return with_modes(self._cells, total, self._origin, self._by_origin)
+
+    @property
+    def density(self) -> Tensor:
+        """By each cell's density, (B, C)."""
+        return -self._mass.slopes(self._x, self.mass_offset)
+
+    @property
+    def mass_offset(self) -> Tensor:
+        """What the mass matrix is multiplied by, (B, U, 3), N/kg."""
+        return self._alpha * self._offset
 
     @property
     def by_mass(self) -> Tensor:

@@ -65,6 +65,8 @@ class CellBatch:
     point_weights : (2, B C, Q)
         The same times mu and omega, J.
     points : Points
+    free : (B, U, 3)
+        1 where a component may move, 0 where not and in padding.
     present_nodes, present_cells : (B, N), (B, C) bool
         Which are a body's own, not padding.
     """
@@ -94,6 +96,7 @@ class CellBatch:
         found = [places(p.cells, len(p.positions)) for p in distinct]
         slots = self._numbers(found, -1, n.nodes, max(table.shape[1] for table in found))
         self._slots = of_all(slots, n.cells * corners)
+        self.free = self.configurations([p.free_unknowns for p in problems])
         self.present_cells = self._first([len(p.cells) for p in problems], n.cells)
         self.present_nodes = self._first(self.node_counts, n.nodes)
         quadratures = [p.quadrature for p in distinct]
@@ -122,24 +125,15 @@ class CellBatch:
 
     def configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
         """Configurations (N + B, 3), or nodal arrays, of the scenes, padded to (B, U, 3)."""
-        return self._spread(arrays, self.node_counts)
+        out = np.zeros((len(arrays), self.sizes.unknowns, 3))
+        for row, array, nodes in zip(out, arrays, self.node_counts, strict=True):
+            row[: min(nodes, len(array))] = array[:nodes]
+            row[self.sizes.nodes :][: len(array) - nodes] = array[nodes:]
+        return self.tensor(out)
 
     def repeated(self, arrays: Sequence[NDArray[Any]], *shape: int) -> Tensor:
         """An array of each of the ``bodies``, padded, for all scenes: (B, *shape)."""
         return self._of_scenes(self.tensor(padded(arrays, shape)))
-
-    def repeated_configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        """Configurations (N + B, 3) of the ``bodies``, padded, for all scenes: (B, U, 3)."""
-        counts = [len(p.positions) for p in self.bodies.distinct]
-        return self._of_scenes(self._spread(arrays, counts))
-
-    def _spread(self, arrays: Sequence[NDArray[Any]], node_counts: Sequence[int]) -> Tensor:
-        out = np.zeros((len(arrays), self.sizes.unknowns, 3))
-        for i, (array, nodes) in enumerate(zip(arrays, node_counts, strict=True)):
-            modes = array[nodes:]
-            out[i, : len(array[:nodes])] = array[:nodes]
-            out[i, self.sizes.nodes : self.sizes.nodes + len(modes)] = modes
-        return self.tensor(out)
 
     def _of_scenes(self, x: Tensor) -> Tensor:
         """Rows of the bodies for all scenes."""

@@ -69,8 +69,7 @@ class BatchCorrection:
         """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""
         state = self._state(local)
         energy = 0.5 * (state.strains * state.raw).sum(dim=(1, 2))
-        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
-        return energy, -self._spread(conjugates)
+        return energy, -self._pulled(state)
 
     def strains(self, local: Tensor) -> Tensor:
         """z, (B, C, 18)."""
@@ -83,14 +82,14 @@ class BatchCorrection:
 
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """See `WrittenViscous`: (B,), and its derivatives by cell (B, C, 8, 3)."""
-        state = self._against(self._state(local), before, rate)
+        state = self.linearise_viscous(local, before, rate)
         energy = 0.5 * ((state.strains - before) * state.raw).sum(dim=(1, 2))
-        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
-        return energy, self._spread(conjugates)
+        return energy, self._pulled(state)
 
-    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, ...]:
+    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> _State:
         """What `apply` needs of it, with the same rate."""
-        return self._against(self._state(local), before, rate)
+        at = self._state(local)
+        return self._with(at, self.viscous_stress(at.strains - before, rate))
 
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
@@ -102,8 +101,7 @@ class BatchCorrection:
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
-        state = self._with(self._state(local), stress)
-        return self._spread(_conjugates(state.R, state.tensor, state.w, state.y))
+        return self._pulled(self._with(self._state(local), stress))
 
     def stress(self, z: Tensor) -> Tensor:
         """K z, (B, C, 18)."""
@@ -113,7 +111,7 @@ class BatchCorrection:
         """Times a rate, and with the part of K that viscosity has, see `WrittenViscous`."""
         return rate * without_trace(self.stress(without_trace(z)))
 
-    def linearise(self, local: Tensor, project: bool = False) -> tuple[Tensor, ...]:
+    def linearise(self, local: Tensor, project: bool = False) -> _State:
         """What `apply` needs; ``project`` as in `CellCorrection.tangent`."""
         state = self._state(local)
         if not project:
@@ -125,6 +123,9 @@ class BatchCorrection:
         """The second derivative times changes (B, C, 8, 3), by cell; the rate is of viscosity."""
         dv = small_products(self._shapes, local)
         return self._spread(self._changes(_State(*tangent), dv, rate))
+
+    def _pulled(self, at: _State) -> Tensor:
+        return self._spread(_conjugates(at.R, at.tensor, at.w, at.y))
 
     def _spread(self, conjugates: Tensor) -> Tensor:
         return small_products(self._shapes.transpose(-1, -2), conjugates)
@@ -173,9 +174,6 @@ class BatchCorrection:
         more = torch.einsum("nij,bcij->bcn", self._mandel, tensor)
         return torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
 
-    def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
-        return self._with(at, self.viscous_stress(at.strains - before, rate))
-
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
 
@@ -216,8 +214,7 @@ class BatchCorrection:
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
-        trace = dS.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True)
-        torque = torque - trace * at.w + small_products(dS, at.w[..., None])[..., 0]
+        torque = torque - _trace(dS) * at.w + small_products(dS, at.w[..., None])[..., 0]
         dw = small_products(at.inverse, torque[..., None])[..., 0]
         dT = dT + _cross_columns(turn, _without(at.tensor, at.w))
         dy_vectors = _vectors(dy) + torch.linalg.cross(turn[..., None, :], y)
@@ -232,10 +229,9 @@ def without_trace(z: Tensor) -> Tensor:
 
 def _adjugates(A: Tensor, B: Tensor) -> Tensor:
     """Half the change of A's adjugate by B; A's own where B is A; both symmetric."""
-    a, b = (x.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] for x in (A, B))
-    identity = torch.eye(3, dtype=A.dtype, device=A.device)
     both = A @ B
-    trace = both.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    a, b, trace = (_trace(x)[..., None] for x in (A, B, both))
+    identity = torch.eye(3, dtype=A.dtype, device=A.device)
     return 0.5 * (both + both.transpose(-1, -2) - a * B - b * A + (a * b - trace) * identity)
 
 

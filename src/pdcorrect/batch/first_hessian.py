@@ -153,12 +153,10 @@ class FirstHessian:
             weights = [p.quadrature.weights for p in cells.bodies.distinct]
             shares = [w / w.sum(axis=1, keepdims=True) for w in weights]
             self._shares = cells.repeated(shares, n.cells, n.points)
-            held = [np.where(p.free.all(axis=1), 0.0, 1.0) for p in cells.bodies.distinct]
-            self._held = cells.repeated(held, n.unknowns) > 0.5
+            self._held = cells.free.amin(dim=2) < 0.5
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
-        every = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
-        self._free = cells.repeated_configurations(every)
+        self._free = cells.free
 
     def _filled(self, solver: DenseInverse, mass_factor: float) -> list[bool]:
         regular = []

@@ -218,8 +218,7 @@ class BatchObjective:
         self.cells = cells
         self.mass = BatchMass(cells)
         self.factors = cells.rest.new_zeros(4)
-        free = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
-        self.free = cells.repeated_configurations(free)
+        self.free = cells.free
         self.target, self.forces = torch.zeros_like(cells.rest), torch.zeros_like(cells.rest)
         self.rayleigh = self.viscous = None
         if damping.mass or damping.stiffness:

@@ -74,7 +74,7 @@ class BatchStaging:
         distinct, nodes = cells.bodies.distinct, cells.sizes.nodes
         self._moving = any(p.clamps.moving for p in distinct)
         self._clamped = cells.repeated([p.clamped_positions(0.0) for p in distinct], nodes, 3)
-        self.free = cells.repeated([p.free.astype(float) for p in distinct], nodes, 3) > 0.5
+        self.free = cells.free[:, :nodes] > 0.5
 
     def extended(self, nodal: Tensor) -> Tensor:
         """(B, N, 3) as configurations (B, U, 3)."""
