@@ -127,8 +127,8 @@ class CellBatch:
         """Configurations (N + B, 3), or nodal arrays, of the scenes, padded to (B, U, 3)."""
         out = np.zeros((len(arrays), self.sizes.unknowns, 3))
         for row, array, nodes in zip(out, arrays, self.node_counts, strict=True):
-            row[: min(nodes, len(array))] = array[:nodes]
-            row[self.sizes.nodes :][: len(array) - nodes] = array[nodes:]
+            modes = slice(self.sizes.nodes, self.sizes.nodes + len(array) - nodes)
+            row[:nodes], row[modes] = array[:nodes], array[nodes:]
         return self.tensor(out)
 
     def repeated(self, arrays: Sequence[NDArray[Any]], *shape: int) -> Tensor:

@@ -59,11 +59,10 @@ class SingleRetry:
         result.error_estimates[i] = step.error_estimate
         result.iterations[i] += step.iterations
         result.smallest_volume_ratios[i] = step.stats["smallest_volume_ratio"]
-        nothing = np.zeros((0, 3))
-        every = [y if k == i else nothing for k in range(len(result.statuses))]
-        result.y[i] = self._cells.configurations(every)[i]
+        nodes = self._cells.node_counts[i]
         rows = [(after.positions, step.state.positions), (after.velocities, step.state.velocities)]
         rows += [(x, step.state.memory[name]) for name, x in after.memory.items()]
+        rows += [(result.y, y[:nodes]), (result.y[:, self._cells.sizes.nodes :], y[nodes:])]
         for x, array in rows:
             x[i, : len(array)] = self._cells.tensor(array)
 
