@@ -175,14 +175,14 @@ class FirstHessian:
         u = y - cells.rest
         u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
         mean = (cells.gradients(u) * self._shares.flatten(0, 1)).sum(dim=-1)
-        turns = cells.points.rotations(mean, moved=True).T
+        turns = cells.points.rotations(mean).T
         by_cell = turns.reshape(n.scenes, n.cells, 1, 9).expand(-1, -1, n.width, -1)
         sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
         total = torch.cat(sums, dim=-1)  # (B, U, 9)
         identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
         still = self._held | (total.abs().sum(dim=-1) == 0.0)
-        total = torch.where(still[..., None], identity, total)
-        out = cells.points.rotations(total.reshape(-1, 9).T.contiguous())
+        moved = torch.where(still[..., None], 0.0, total - identity)
+        out = cells.points.rotations(moved.reshape(-1, 9).T.contiguous())
         for kept, new in zip(self._rotations, out.reshape(9, n.scenes, n.unknowns), strict=True):
             kept.copy_(new)
 

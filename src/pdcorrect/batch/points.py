@@ -57,10 +57,9 @@ class Points:
         (out,) = computed(_product, [*tangent, D], (9,), cell_by_cell=True)
         return out
 
-    def rotations(self, F: Tensor, moved: bool = False) -> Tensor:
-        """Nearest rotations (9, L) of F, or of H if ``moved``; the identity where not finite."""
-        finite = torch.nan_to_num(F)[..., None]
-        (R,) = computed(_rotation_of_moved if moved else _rotation, [finite], (9,))
+    def rotations(self, H: Tensor) -> Tensor:
+        """Nearest rotations (9, L) of I + H; the identity where H is not finite."""
+        (R,) = computed(_rotation, [torch.nan_to_num(H)[..., None]], (9,))
         return R[..., 0]
 
     def volume_ratios(self, H: Tensor) -> Tensor:
@@ -120,12 +119,8 @@ def _decompose(H: Components) -> tuple[Components, Components, Components]:
     return signed_svd(moved(H))
 
 
-def _rotation_of_moved(H: Components) -> list[Components]:
-    return _rotation(moved(H))
-
-
-def _rotation(F: Components) -> list[Components]:
-    U, _, V = signed_svd(F)
+def _rotation(H: Components) -> list[Components]:
+    U, _, V = signed_svd(moved(H))
     return [product(U, transposed(V))]
 
 
