@@ -20,12 +20,7 @@ from pdcorrect.scene import Damping
 class BatchMass:
     """M x for nodal fields (B, U, 3), kg, after `set_density`; internal modes have no mass.
 
-    Attributes
-    ----------
-    nodal : (B, U)
-        Row sums, kg.
-    density : (B, C)
-        kg/m3.
+    ``nodal`` (B, U), kg, are the row sums, ``density`` (B, C) is in kg/m3.
     """
 
     def __init__(self, cells: CellBatch) -> None:
@@ -157,10 +152,8 @@ class Viscous:
         S, frames = viscosity.stretches(cells, y)
         change = S - self.before
         stress = viscosity.stress(change, self._weights)
-        energy, forces = (
-            viscosity.energies(cells, change, stress),
-            viscosity.forces(cells, frames, stress),
-        )
+        energy = viscosity.energies(cells, change, stress)
+        forces = viscosity.forces(cells, frames, stress)
         if cells.correction is None:
             return energy, forces
         more, by_cell = cells.correction.viscous(

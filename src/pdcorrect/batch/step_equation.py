@@ -28,23 +28,11 @@ from pdcorrect.solvers.schemes import Linear, Scheme, by_component
 
 @dataclass(frozen=True, eq=False)
 class BatchStepEquation:
-    """One step's equation and what it was made of.
+    """One step's equation and what it was made of, see `Scheme`.
 
-    Attributes
-    ----------
-    scheme : Scheme
-    known : dict
-        What the scheme's sums are of, see `Scheme`.
-    spans : sequence of (float, float)
-        Time intervals over which each scene's loads act, s.
-    target : (B, U, 3)
-        q, m; not changed later.
-    origin, start, foreseen : (B, N, 3)
-        See `Scheme`, m; the last two prescribed where clamped.
-    past_forces : (B, N, 3) or 0
-        See `Scheme`, N.
-    strains : list of (float, (B, N, 3))
-        See `Scheme`.
+    ``known`` is what the scheme's sums are of, ``spans`` are the time intervals (s) over which each
+    scene's loads act.  The target q (B, U, 3), m, is not changed later; other fields are nodal
+    (B, N, 3), start and foreseen with prescribed values where clamped.
     """
 
     scheme: Scheme
