@@ -39,12 +39,12 @@ class BatchMaterial:
 def own_material(cells: CellBatch) -> BatchMaterial:
     """What the problems have."""
     every = [p.materials for p in cells.bodies.distinct]
-    values = (
-        cells.repeated([getattr(m, name) for m in every], cells.sizes.cells)
+    values = {
+        name: cells.repeated([getattr(m, name) for m in every], cells.sizes.cells)
         for name in (*NAMES, "mu", "volume_weight")
-    )
+    }
     sound = torch.ones(cells.sizes.scenes, dtype=torch.bool, device=cells.device)
-    return BatchMaterial(*values, sound)
+    return BatchMaterial(**values, sound=sound)
 
 
 def changed(

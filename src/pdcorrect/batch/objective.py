@@ -81,7 +81,8 @@ class Rayleigh:
 
     def __init__(self, cells: CellBatch, mass: BatchMass, factors: Tensor, stiff: bool) -> None:
         self._cells, self._mass, self._factors = cells, mass, factors
-        self.origin, self.tangent = torch.zeros_like(cells.rest), ()
+        self.origin = torch.zeros_like(cells.rest)
+        self.tangent: tuple[Tensor, ...] = ()
         if stiff:
             self.tangent = tuple(map(torch.zeros_like, cells.linearise(cells.rest, project=True)))
 
