@@ -15,7 +15,7 @@ from conftest import beam, box_mesh, held, problem_on
 from pdcorrect.batch import decomposition, gpu
 from pdcorrect.batch.cells import DistinctBodies
 from pdcorrect.batch.points import Points
-from pdcorrect.batch.triton_kernels import tall_product
+from pdcorrect.batch.triton_kernels import skinny_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
@@ -153,7 +153,7 @@ def test_products_with_few_columns_are_matrix_products(device):
     for size, columns in ((300, 3), (517, 1), (261, 4), (64, 7)):
         A = torch.randn(3, size, size, device=device)
         x = torch.randn(3, size, columns, device=device)
-        torch.testing.assert_close(tall_product(A, x), A @ x, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(skinny_product(A, x), A @ x, rtol=1e-4, atol=1e-4)
 
 
 # --- batch and single ---------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from torch import Tensor, cat
 
 from pdcorrect.batch.cells import CellBatch, DistinctBodies, kinds, padded
 from pdcorrect.batch.gpu import small_products
-from pdcorrect.batch.triton_kernels import tall_product
+from pdcorrect.batch.triton_kernels import skinny_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
 
@@ -218,7 +218,7 @@ class DenseInverse:
             columns = shared.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
         else:
             columns = shared.permute(0, 3, 2, 1)
-        flat = tall_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
+        flat = skinny_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
         x = flat.reshape(count, self._axes, *flat.shape[1:])
         if self._width == 3:
             x = x.permute(0, 3, 1, 2).reshape(count, most, nodes, 3)

@@ -5,7 +5,7 @@ nothing but arithmetic.  `torch.compile` takes a minute and more to find out wha
 Triton compiles the same lines written out in a second or two (torch 2.11 on an H200; a fresh
 machine's first files: ``fresh_machine`` in ``benchmarks/results/nvidia-h200.json``).
 
-`tall_product` multiplies matrices by one to four columns, in which the libraries' products reach
+`skinny_product` multiplies matrices by one to four columns, in which the libraries' products reach
 half of a GPU's memory bandwidth.
 """
 
@@ -278,7 +278,7 @@ _MOST_COLUMNS = 4
 _ROWS, _COLUMNS, _WARPS = 8, 256, 4
 
 
-def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
+def skinny_product(matrices: Tensor, columns: Tensor) -> Tensor:
     """(K, n, n) @ (K, n, m) -> (K, n, m)."""
     count, size, _ = matrices.shape
     few = columns.shape[2] <= _MOST_COLUMNS
@@ -289,7 +289,7 @@ def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
     columns = columns.contiguous()
     out = torch.empty_like(columns)
     grid = (triton.cdiv(size, _ROWS), count)
-    _tall_kernel()[grid](
+    _skinny_kernel()[grid](
         matrices, columns, out, size, M=columns.shape[2], ROWS=_ROWS, COLUMNS=_COLUMNS,
         num_warps=_WARPS,
     )  # fmt: skip
@@ -297,7 +297,7 @@ def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
 
 
 @cache
-def _tall_kernel() -> Any:
+def _skinny_kernel() -> Any:
     import triton
     import triton.language as tl
 
