@@ -84,7 +84,9 @@ class Rayleigh:
         self.origin = torch.zeros_like(cells.rest)
         self.tangent: tuple[Tensor, ...] = ()
         if stiff:
-            self.tangent = tuple(map(torch.zeros_like, cells.linearise(cells.rest, project=True)))
+            with torch.no_grad():  # or kernels are compiled for work with derivatives too
+                like = cells.linearise(cells.rest, project=True)
+            self.tangent = tuple(map(torch.zeros_like, like))
 
     def prepare(self, origin: Tensor, foreseen: Tensor) -> None:
         """Take these positions (B, N, 3) of a step, see `Scheme`, from now on."""
