@@ -12,10 +12,10 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on
-from pdcorrect.batch import decomposition, gpu, minimise
+from pdcorrect.batch import decomposition, gpu
+from pdcorrect.batch.cells import DistinctBodies
 from pdcorrect.batch.points import Points
-from pdcorrect.batch.shared_matrices import DistinctBodies
-from pdcorrect.batch.triton_kernels import tall_product
+from pdcorrect.batch.triton_kernels import skinny_product
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
@@ -153,7 +153,7 @@ def test_products_with_few_columns_are_matrix_products(device):
     for size, columns in ((300, 3), (517, 1), (261, 4), (64, 7)):
         A = torch.randn(3, size, size, device=device)
         x = torch.randn(3, size, columns, device=device)
-        torch.testing.assert_close(tall_product(A, x), A @ x, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(skinny_product(A, x), A @ x, rtol=1e-4, atol=1e-4)
 
 
 # --- batch and single ---------------------------------------------------------------------------
@@ -239,10 +239,6 @@ def test_scenes_that_differ_by_loads_alone_step_as_if_they_shared_nothing(elemen
     assert torch.equal(a.y, b.y)
     assert (a.iterations == b.iterations).all()
     assert torch.equal(one.objective.mass.nodal, other.objective.mass.nodal)
-    rows = torch.tensor([1, 5, 6])
-    y = a.y[rows]
-    found, expected = (s.objective.narrowed(rows)(y) for s in (one, other))
-    assert all(torch.equal(x, z) for x, z in zip(found, expected, strict=True))
 
 
 def test_bodies_with_other_materials_or_mass_rules_are_not_one():
@@ -253,15 +249,6 @@ def test_bodies_with_other_materials_or_mass_rules_are_not_one():
     assert [p is q for p, q in zip(found.distinct, (twins[0], twins[2]), strict=False)] == [
         True
     ] * 2
-
-
-def test_what_is_known_of_bodies_reaches_the_scenes_that_are_left():
-    one, other = pc.discretise(unlike(0)), pc.discretise(unlike(1))
-    cells = pc.BatchStepper([one, one, other]).cells
-    numbers = [np.full(1, 5.0), np.full(1, 7.0)]
-    for rows, expected in (([0, 1, 2], [5, 5, 7]), ([0, 1], [5, 5]), ([2, 0], [7, 5]), ([2], [7])):
-        left = cells.narrowed(torch.tensor(rows))
-        assert left.repeated(numbers, 1).ravel().tolist() == expected
 
 
 def test_scenes_with_the_same_matrix_share_one_inverse():
@@ -472,52 +459,6 @@ def test_a_scene_without_a_minimum_fails_alone():
         stepper = pc.BatchStepper(problems, integrator="quasi-static", recover=recover)
         statuses = stepper(stepper.rest_state()).statuses
         assert [s.ok for s in statuses] == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("element", "first_hessian"),
-    [
-        ("hex8", "rest"),
-        ("hex8", "G"),
-        ("hex8", "multigrid"),
-        ("hex8-bubble-mean", "rest"),
-        pytest.param("hex8-bubble-mean", "G", marks=pytest.mark.slow),
-        pytest.param("hex8-bubble-mean", "multigrid", marks=pytest.mark.slow),
-    ],
-)
-def test_scenes_that_take_long_go_on_in_a_smaller_batch(element, first_hessian, monkeypatch):
-    """With the same iterates, whatever scenes share a matrix."""
-    refine = 2 if first_hessian == "multigrid" else 1
-    problems = [pc.discretise(unlike(seed, element), refine) for seed in (3, 4, 0, 0, 1, 1)]
-    strength = -1e4 if first_hessian == "multigrid" else -1e5
-    hard = [{"kind": "gravity", "acceleration": [0.0, 0.0, strength]}]
-    problems[3] = pc.discretise(unlike(0, element, loads=hard), refine)
-    states = moving_states(problems)
-    if refine > 1:  # noise of the same size would turn small cells inside out
-        states = [replace(s, velocities=0.2 * s.velocities) for s in states]
-    found = []
-    for few in (minimise._FEW, 10**9):
-        monkeypatch.setattr(minimise, "_FEW", few)
-        stepper = pc.BatchStepper(problems, 1e-9, first_hessian=first_hessian, recover=False)
-        calls = []
-        whole = stepper.prepare
-
-        def counted(*arguments, whole=whole, stepper=stepper, calls=calls):
-            out = whole(*arguments)
-            narrow = stepper._minimiser._finish_narrowed
-            stepper._minimiser._finish_narrowed = lambda: (calls.append(1), narrow())
-            return out
-
-        stepper.prepare = counted
-        result = stepper(stepper.state(states))
-        found.append((result, bool(calls)))
-    (narrowed, did), (whole, did_not) = found
-    assert did
-    assert not did_not
-    assert narrowed.statuses == whole.statuses
-    assert narrowed.statuses[3].ok
-    torch.testing.assert_close(narrowed.y, whole.y, rtol=0, atol=1e-9)
-    assert (narrowed.evaluations <= 1.3 * whole.evaluations + 5).all()
 
 
 def test_steps_of_another_length_start_bdf2_anew():

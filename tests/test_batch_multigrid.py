@@ -9,8 +9,7 @@ import pdcorrect as pc
 from conftest import beam, box_mesh
 from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, summed_blocks
 from pdcorrect.batch.first_hessian import LARGEST_REST, FirstHessian, chosen
-from pdcorrect.batch.mesh_levels import hierarchy
-from pdcorrect.batch.multigrid import largest_eigenvalue, with_mass
+from pdcorrect.batch.multigrid import hierarchy, largest_eigenvalue, with_mass
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import interpolation, refine
 
@@ -215,22 +214,6 @@ def test_unlike_cells_and_single_precision_change_little():
     rough = single(r)
     assert not torch.equal(rough, expected)
     torch.testing.assert_close(rough, expected, rtol=0, atol=1e-5 * float(expected.abs().max()))
-
-
-@pytest.mark.parametrize("materials", [[], STIFF_END])
-def test_some_scenes_of_a_batch_have_the_same_cycle(materials):
-    """Whatever scenes share."""
-    found = [scene.with_changes(materials=materials) for scene in scenes("hex8-bubble")]
-    problems = [pc.discretise(found[i], 2) for i in (3, 0, 2, 0, 1)]
-    whole, cells = inverse(problems, "multigrid", strained=True)
-    assert whole.count == 4
-    r = torch.randn(cells.rest.shape, generator=torch.manual_seed(0), dtype=cells.dtype)
-    expected = whole(r)
-    for rows in (torch.tensor([1, 3]), torch.tensor([0, 2, 4])):
-        some = whole.narrowed(cells.narrowed(rows), rows)
-        scale = float(expected.abs().max())
-        torch.testing.assert_close(some(r[rows]), expected[rows], rtol=0, atol=1e-13 * scale)
-        assert some.regular.all()
 
 
 # --- steps ---------------------------------------------------------------------------------------

@@ -281,18 +281,6 @@ def test_a_failed_scene_raises_by_name_or_gives_no_gradient():
     assert not p.grad[1].any()
 
 
-def test_wrong_input_is_refused_by_name():
-    stepper = small_batch()
-    p, v, f = inputs(stepper)
-    layer = pc.PDLayer(stepper)
-    with pytest.raises(InputError, match="positions: "):
-        layer(p[:, 1:], v)
-    with pytest.raises(InputError, match=r"velocities: .*torch\.float32"):
-        layer(p, v.float())
-    with pytest.raises(InputError, match="forces: "):
-        layer(p, v, f[:1])
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -306,6 +294,10 @@ def test_options_that_make_no_sense_are_refused(name, value):
 
 
 WRONG = {
+    "fewer nodes": (lambda r, p, v: ((p[:, 1:], v), {}), r"positions: \(2, 11, 3\)"),
+    "float32": (lambda r, p, v: ((p, v.float()), {}), r"velocities: torch\.float32"),
+    "forces of one scene": (lambda r, p, v: ((p, v, p[:1]), {}), r"forces: \(1, 12, 3\)"),
+    "forces of 5 steps": (lambda r, p, v: ((p, v, p.expand(5, -1, -1, -1)), {}), "of 5 steps"),
     "flat forces": (lambda r, p, v: ((p, v, p[0, 0]), {}), r"forces: \(3,\); expected \(2, 12"),
     "one scene": (lambda r, p, v: ((p[0], v[0]), {}), r"positions: \(12, 3\); expected \(2, 12, 3"),
     "one time": (lambda r, p, v: ((p, v), {"times": 0.5}), r"times = 0\.5: expected 2 finite"),
@@ -589,19 +581,6 @@ def test_steps_in_inference_mode_come_out_the_same():
     after.sum().backward()
     assert torch.equal(first, after)
     assert p.grad.any()
-
-
-def test_inputs_that_do_not_fit_are_refused_by_name():
-    stepper = small_batch()
-    p, v, f = inputs(stepper)
-    layer = pc.PDLayer(stepper, 2)
-    for frames in (1, 5):
-        with pytest.raises(InputError, match=f"forces of {frames} steps"):
-            layer(p, v, torch.stack([f] * frames))
-    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
-        layer(p, v, f, young=torch.ones(4, 7, dtype=torch.float64))
-    with pytest.raises(InputError, match="times = "):
-        layer(p, v, f, times=[0.0])
 
 
 def test_a_layer_with_follower_loads_can_be_copied():

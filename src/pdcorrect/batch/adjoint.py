@@ -8,10 +8,10 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.adjoint_terms import DampingTerms, Written
+from pdcorrect.batch.adjoint_terms import RayleighTerm, ViscousTerm, Written
 from pdcorrect.batch.checks import check_nodal, check_state
-from pdcorrect.batch.follower import Mixing
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
+from pdcorrect.batch.minimise import Mixing
 from pdcorrect.batch.objective import largest_displacement
 from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
@@ -96,18 +96,22 @@ class BatchGradients:
         with stepper.alone():
             self._stage = stepper.prepare(before, forces, result.y)
             self._material = stepper.present
-            self._factors = stepper.objective.factors.clone()
+            self._inertia = stepper.objective.factors[0].clone()
             by_y = self._pull_end(grad_positions, grad_velocities, grad_memory or {})
             kept = self._sums.pop("internal_forces_after", None)
             if kept is not None:
                 kept = stepper.staging.extended(kept * self._free)
-                by_y = by_y + self._factors[0] * stepper.objective.mass(kept)[:, : self._nodes]
+                by_y = by_y + self._inertia * stepper.objective.mass(kept)[:, : self._nodes]
                 by_y = by_y - self._load_slopes("y", kept)
             fine = torch.tensor(in_one(result.statuses), device=by_y.device)
             solver = self._solve(by_y, fine, tolerance)
             kept = None if kept is None else torch.where(self.ok[:, None, None], kept, 0.0)
             self._push = self.x if kept is None else self.x - kept
-            self._damping = DampingTerms(stepper, self._stage, self._y, self.x)
+            objective = stepper.objective
+            self._written = Written(stepper) if stepper.cells.correction is not None else None
+            given = stepper, self._stage, self._y, self.x, self._written
+            self._rayleigh = RayleighTerm(*given) if objective.rayleigh is not None else None
+            self._viscous = ViscousTerm(*given) if objective.viscous is not None else None
             self._pull_stage(by_y, solver.hessian(self.x)[:, : self._nodes])
 
     def _solve(self, by_y: Tensor, fine: Tensor, tolerance: float) -> BatchConjugateGradients:
@@ -155,11 +159,8 @@ class BatchGradients:
                 f"{', '.join(scheme.memory) or 'of which there are none'}."
             )
         self._pull(scheme.positions, None, self._given("grad_positions", positions))
-        self._pull(
-            scheme.velocities,
-            scheme.clamped_velocities,
-            self._given("grad_velocities", velocities),
-        )
+        by_velocities = self._given("grad_velocities", velocities)
+        self._pull(scheme.velocities, scheme.clamped_velocities, by_velocities)
         for name, g in memory.items():
             self._pull(*scheme.memory[name], self._given(name, g))
         return self._sums.pop("y")
@@ -228,48 +229,42 @@ class BatchGradients:
             fall = self._stepper.loads.acceleration(stage.spans)
             push = stage.scheme.load_factor * self._push
             out = mass.row_slopes((push * fall).sum(dim=-1))
-            out = out - self._factors[0] * mass.slopes(self._push, self._y - stage.target)
-            if self._stepper.objective.damped:
-                origin = self._stepper.staging.extended(stage.origin)
-                out = out - self._factors[1] * mass.slopes(self.x, self._y - origin)
-            return out
+            out = out - self._inertia * mass.slopes(self._push, self._y - stage.target)
+            return out if self._rayleigh is None else out + self._rayleigh.density
 
     # --- by damping ---------------------------------------------------------------------------
 
     @property
     def viscosity(self) -> Tensor:
         """By ``damping.viscosity``, (B,), 1/s."""
-        return self._stage.scheme.strain_rate * self._damping.by_viscosity
+        return self._stage.scheme.strain_rate * self._by(self._viscous, "by_rate")
 
     @property
     def rayleigh_mass(self) -> Tensor:
         """By ``damping.mass``, (B,), s."""
-        return self._stage.scheme.rate * self._damping.by_mass
+        return self._stage.scheme.rate * self._by(self._rayleigh, "by_mass")
 
     @property
     def rayleigh_stiffness(self) -> Tensor:
         """By ``damping.stiffness``, (B,), 1/s."""
-        return self._stage.scheme.rate * self._damping.by_stiffness
+        return self._stage.scheme.rate * self._by(self._rayleigh, "by_stiffness")
 
     @cached_property
     def _weights(self) -> tuple[Tensor, Tensor]:
         with self._stepper.alone():
-            by_mu, by_omega = self._stepper.cells.weight_slopes(self._y, -self.x)
-            more = self._damping.weights
-            by_mu, by_omega = by_mu + more[0], by_omega + more[1]
-            if self._damping.written is not None:
-                more = self._written(self._damping.written)
-                by_mu, by_omega = by_mu + more[0], by_omega + more[1]
+            parts = [self._stepper.cells.weight_slopes(self._y, -self.x)]
+            parts += [term.weights for term in (self._rayleigh, self._viscous) if term is not None]
+            if self._written is not None:
+                parts.append(self._by_written(self._written))
+            by_mu, by_omega = (torch.stack(each).sum(dim=0) for each in zip(*parts, strict=True))
             return by_mu * self._rule.has_shear_term, by_omega * self._rule.has_volume_term
 
-    def _written(self, written: Written) -> tuple[Tensor, Tensor]:
+    def _by_written(self, written: Written) -> tuple[Tensor, Tensor]:
         """Through what learned elements are written from, by mu and omega, (B, C)."""
-        stage, stepper = self._stage, self._stepper
         written.add_forces(self._y, -self.x)
-        written.add_inertia(-self._push, self._factors[0] * (self._y - stage.target))
-        if stepper.objective.damped:
-            origin = stepper.staging.extended(stage.origin)
-            written.add_inertia(-self.x, self._factors[1] * (self._y - origin))
+        written.add_inertia(-self._push, self._inertia * (self._y - self._stage.target))
+        if self._rayleigh is not None:
+            written.add_inertia(-self.x, self._rayleigh.mass_offset)
         return written.weights(self.x)
 
     @property
@@ -284,6 +279,11 @@ class BatchGradients:
         return torch.where(present, self.mu * mu + self.lam * lam, 0.0)
 
     # --- internals --------------------------------------------------------------------------------
+
+    def _by(self, term: RayleighTerm | ViscousTerm | None, name: str) -> Tensor:
+        """One of a term's derivatives (B,); zero without the term."""
+        found: Tensor = self.x.new_zeros(len(self.x)) if term is None else getattr(term, name)
+        return found
 
     def _sum(self, name: str) -> Tensor:
         found = self._sums.get(name)
@@ -304,14 +304,13 @@ class BatchGradients:
         sampled = self._load_slopes("positions", self._push)
         Linear(positions=1.0).transpose(sampled, self._sums)
         if scheme.inertia:
-            self._pull(scheme.target, scheme.clamped_target, self._factors[0] * momentum)
-        damping = self._damping
-        if damping.has_rayleigh:
-            self._pull(scheme.origin, scheme.clamped_origin, damping.origin)
-            self._pull(scheme.foreseen or scheme.start, scheme.clamped, damping.place)
-        pairs = zip(scheme.strains, damping.places, strict=False)
-        for (_, place), slope in pairs:
-            place.transpose(slope, self._sums)
+            self._pull(scheme.target, scheme.clamped_target, self._inertia * momentum)
+        if self._rayleigh is not None:
+            self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
+            self._pull(scheme.foreseen or scheme.start, scheme.clamped, self._rayleigh.place)
+        if self._viscous is not None:
+            for (_, place), slope in zip(scheme.strains, self._viscous.places, strict=True):
+                place.transpose(slope, self._sums)
         back = torch.where(self._free, 0.0, by_y - image)
         if stepper.loads.follow:
             back = back + torch.where(self._free, 0.0, self._load_slopes("y", self.x))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch import viscosity
+from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.correction import without_trace
 from pdcorrect.batch.modes import Following, relaxed
 from pdcorrect.batch.objective import dot
@@ -17,20 +18,16 @@ from pdcorrect.batch.step_equation import BatchStepEquation
 from pdcorrect.batch.stepper import BatchStepper
 
 Array = NDArray[np.float64]
+Weights = tuple[Tensor, Tensor]
 
 _STEP = {torch.float64: 1e-4, torch.float32: 1e-2}
 """Of a deformation gradient's entry, for differences of fourth order of projected tangents."""
-_PLACES, _FACTORS = (1, -1, 2, -2), (8.0, -8.0, -1.0, 1.0)
 
 
 class Written:
     """Derivatives through what learned elements are written from, scene by scene on the CPU.
 
     Those by matrices and masses are gathered; `weights` pulls them back at once.
-
-    Parameters
-    ----------
-    stepper : BatchStepper
     """
 
     def __init__(self, stepper: BatchStepper) -> None:
@@ -93,48 +90,32 @@ class Written:
         return self._nodal(y, i) - self._stepper.problems[i].positions
 
 
-class DampingTerms:
-    """- x . (damping force at y) of the step that was prepared last, by what it starts from.
+class RayleighTerm:
+    """- x . (Rayleigh damping's force at y) of the step that was prepared last.
 
-    Parameters
-    ----------
-    stepper : BatchStepper
-    stage : BatchStepEquation
-    y, x : (B, U, 3)
-        The solution and the adjoint state.
+    By what the step starts from, for its solution and adjoint state y and x (B, U, 3).
     """
 
     def __init__(
-        self, stepper: BatchStepper, stage: BatchStepEquation, y: Tensor, x: Tensor
+        self,
+        stepper: BatchStepper,
+        stage: BatchStepEquation,
+        y: Tensor,
+        x: Tensor,
+        written: Written | None,
     ) -> None:
-        objective = stepper.objective
-        self._stepper, self._cells, self._x = stepper, stepper.cells, x
-        self.written = Written(stepper) if stepper.cells.correction is not None else None
-        self._stiff, self._viscous = objective.stiff, objective.viscous
-        self.has_rayleigh = objective.damped or objective.stiff
-        _, _, self._stiffness, self._rate = objective.factors.clone()
-        if self.has_rayleigh:
-            self._origin = objective.origin.clone()
-            self._offset = y - self._origin
-            self._by_origin = objective.rayleigh(x)
-        if objective.tangent is not None:
+        damping = stepper.objective.rayleigh
+        assert damping is not None
+        self._mass, self._cells, self._x = stepper.objective.mass, stepper.cells, x
+        self._written = written
+        self._alpha, self._stiffness = stepper.objective.factors[1:3].clone()
+        self._origin = damping.origin.clone()
+        self._offset = y - self._origin
+        self._by_origin = damping.apply(None, x)
+        self._stiff = bool(damping.tangent)
+        if self._stiff:
             self._at = relaxed(self._cells, stage.foreseen)
-            self._along = self._cells.apply(objective.tangent, self._offset)
-        if self._viscous:
-            S, frames = viscosity.stretches(self._cells, y)
-            self._change = S - objective.before
-            self._rates = viscosity.rates(self._cells, frames, x)
-            weights = self._rate * self._cells.point_weights
-            self._stress = viscosity.stress(self._rates, weights)
-            self._strains = [(a, relaxed(self._cells, place)) for a, place in stage.strains]
-        self._against: Tensor | None = None
-        if self._viscous and self._cells.correction is not None:
-            here = self._cells.local(y - self._cells.rest)
-            self._y = y
-            correction = self._cells.correction
-            self._against = without_trace(correction.strains(here) - objective.strains_before)
-            rates = correction.rates(here, self._cells.local(x))
-            self._written_rates = objective.whole * without_trace(rates)
+            self._along = self._cells.apply(damping.tangent, self._offset)
 
     @cached_property
     def origin(self) -> Tensor:
@@ -151,79 +132,35 @@ class DampingTerms:
         return Following(self._cells, self._at).reduced(self._by_place)
 
     @cached_property
-    def places(self) -> list[Tensor]:
-        """By each of the earlier positions that stretches are of, (B, N, 3)."""
-        if not self._viscous:
-            return []
-        return [
-            Following(self._cells, place).reduced(slope)
-            for (_, place), slope in zip(self._strains, self._by_strains, strict=True)
-        ]
-
-    @cached_property
-    def weights(self) -> tuple[Tensor, Tensor]:
+    def weights(self) -> Weights:
         """By mu and omega, each (B, C)."""
-        nothing = self._x.new_zeros(self._cells.sizes.scenes, self._cells.sizes.cells)
-        total = [nothing, nothing]
-        if self._viscous:
-            slopes = viscosity.stress_slopes(self._cells, self._change, self._rates)
-            total = [-self._rate * slope for slope in slopes]
-            if self._against is not None and self.written is not None:
-                self.written.add_products(-self._rate * self._written_rates, self._against)
-            for (_, place), slope in zip(self._strains, self._by_strains, strict=True):
-                total = self._with_modes(total, place, slope)
-        if self._stiff:
-            by_weights = self._tangent_slopes[1:]
-            total = [a - self._stiffness * b for a, b in zip(total, by_weights, strict=True)]
-            total = self._with_modes(total, self._at, self._by_place)
-            total = self._with_modes(total, self._origin, self._by_origin)
-        return total[0], total[1]
-
-    def _with_modes(self, total: list[Tensor], y: Tensor, slope: Tensor) -> list[Tensor]:
-        """Plus what the modes at y, which depend on the material, add."""
-        modes = Following(self._cells, y).response(slope)
-        more = self._cells.weight_slopes(y, -modes)
-        return [a + b for a, b in zip(total, more, strict=True)]
+        n = self._cells.sizes
+        if not self._stiff:
+            return self._x.new_zeros(n.scenes, n.cells), self._x.new_zeros(n.scenes, n.cells)
+        _, by_mu, by_omega = self._tangent_slopes
+        total = -self._stiffness * by_mu, -self._stiffness * by_omega
+        total = with_modes(self._cells, total, self._at, self._by_place)
+        return with_modes(self._cells, total, self._origin, self._by_origin)
 
     @property
-    def by_viscosity(self) -> Tensor:
-        """By the strain rate's factor times the viscosity, (B,)."""
-        if not self._viscous:
-            return self._x.new_zeros(len(self._x))
-        out = -2.0 / self._rate * viscosity.energies(self._cells, self._change, self._stress)
-        if self._against is None or self._cells.correction is None:
-            return out
-        stress = self._cells.correction.stress(self._against)
-        return out - (self._written_rates * stress).sum(dim=(1, 2))
+    def density(self) -> Tensor:
+        """By each cell's density, (B, C)."""
+        return -self._mass.slopes(self._x, self.mass_offset)
+
+    @property
+    def mass_offset(self) -> Tensor:
+        """What the mass matrix is multiplied by, (B, U, 3), N/kg."""
+        return self._alpha * self._offset
 
     @property
     def by_mass(self) -> Tensor:
         """By d alpha, (B,)."""
-        if not self.has_rayleigh:
-            return self._x.new_zeros(len(self._x))
-        return -dot(self._x, self._stepper.objective.mass(self._offset))
+        return -dot(self._x, self._mass(self._offset))
 
     @property
     def by_stiffness(self) -> Tensor:
         """By d beta, (B,)."""
-        if not self._stiff:
-            return self._x.new_zeros(len(self._x))
-        return -dot(self._x, self._along)
-
-    @cached_property
-    def _by_strains(self) -> list[Tensor]:
-        """By the configurations there."""
-        found = []
-        for a, place in self._strains:
-            _, frames = viscosity.stretches(self._cells, place)
-            slope = viscosity.forces(self._cells, frames, self._stress)
-            correction = self._cells.correction
-            if correction is not None:
-                stress = correction.viscous_stress(self._written_rates, self._rate)
-                local = self._cells.local(place - self._cells.rest)
-                slope = slope + self._cells.of_corners(correction.pulled(local, stress))
-            found.append(a * slope)
-        return found
+        return -dot(self._x, self._along) if self._stiff else self._x.new_zeros(len(self._x))
 
     @cached_property
     def _by_place(self) -> Tensor:
@@ -236,32 +173,104 @@ class DampingTerms:
         H = cells.gradients(self._at - cells.rest)
         D, E = cells.gradients(self._x), cells.gradients(self._offset)
 
-        def product(H: Tensor, weights: Tensor) -> Tensor:
-            tangent = cells.points.tangent(H, weights, project=True)
-            return (D * cells.points.product(tangent, E)).sum(dim=0)
+        def slope(unit: Tensor, weight: Tensor) -> Tensor:
+            """By central differences of fourth order along changes of H and of the weights."""
+            total = torch.zeros_like(unit[0])
+            for t, c in ((1, 8.0), (-1, -8.0), (2, -1.0), (-2, 1.0)):
+                weights = cells.point_weights + t * weight
+                tangent = cells.points.tangent(H + t * unit, weights, project=True)
+                total += c * (D * cells.points.product(tangent, E)).sum(dim=0)
+            return total / 12.0
 
-        step, slope = _STEP[H.dtype], torch.empty_like(H)
+        step, by_H, none = _STEP[H.dtype], torch.empty_like(H), torch.zeros_like(H)
         for i in range(9):
             unit = torch.zeros_like(H)
             unit[i] = step
-            slope[i] = self._difference(lambda t, e=unit: product(H + t * e, cells.point_weights))
+            by_H[i] = slope(unit, torch.zeros_like(cells.point_weights))
         n, found = cells.sizes, []
         for term in (0, 1):
             unit = torch.zeros_like(cells.point_weights)
             unit[term] = step * (cells.point_weights[term] + cells.volumes[term])
-            change = self._difference(lambda t, e=unit: product(H, cells.point_weights + t * e))
             share = torch.where(unit[term] > 0.0, cells.volumes[term] / unit[term], 0.0)
-            found.append((change * share).reshape(n.scenes, n.cells, n.points).sum(dim=2))
-        by_place, by_mu, by_omega = cells.gathered(slope / step), found[0], found[1]
-        if self.written is not None:
-            more = self.written.add_tangents(
+            change = slope(none, unit) * share
+            found.append(change.reshape(n.scenes, n.cells, n.points).sum(dim=2))
+        by_place = cells.gathered(by_H / step)
+        if self._written is not None:
+            by_place = by_place + self._written.add_tangents(
                 self._at, self._x, self._offset, -float(self._stiffness)
             )
-            by_place = by_place + more
-        return by_place, by_mu, by_omega
+        return by_place, found[0], found[1]
 
-    @staticmethod
-    def _difference(function) -> Tensor:  # type: ignore[no-untyped-def]
-        """Derivative at 0 of a function of t by central differences of fourth order."""
-        terms = [c * function(t) for t, c in zip(_PLACES, _FACTORS, strict=True)]
-        return torch.stack(terms).sum(dim=0) / 12.0
+
+class ViscousTerm:
+    """- x . (viscosity's force at y), likewise."""
+
+    def __init__(
+        self,
+        stepper: BatchStepper,
+        stage: BatchStepEquation,
+        y: Tensor,
+        x: Tensor,
+        written: Written | None,
+    ) -> None:
+        damping, cells = stepper.objective.viscous, stepper.cells
+        assert damping is not None
+        self._cells, self._written, self._rate = cells, written, damping.rate.clone()
+        S, frames = viscosity.stretches(cells, y)
+        self._change = S - damping.before
+        self._rates = viscosity.rates(cells, frames, x)
+        self._stress = viscosity.stress(self._rates, self._rate * cells.point_weights)
+        self._strains = [(a, relaxed(cells, place)) for a, place in stage.strains]
+        if cells.correction is not None:
+            here = cells.local(y - cells.rest)
+            self._against = without_trace(cells.correction.strains(here) - damping.strains_before)
+            rates = cells.correction.rates(here, cells.local(x))
+            self._learned_rates = damping.whole * without_trace(rates)
+
+    @cached_property
+    def places(self) -> list[Tensor]:
+        """By each of the earlier positions that stretches are of, (B, N, 3)."""
+        return [
+            Following(self._cells, place).reduced(slope)
+            for (_, place), slope in zip(self._strains, self._slopes, strict=True)
+        ]
+
+    @cached_property
+    def weights(self) -> Weights:
+        """By mu and omega, each (B, C)."""
+        by_mu, by_omega = viscosity.stress_slopes(self._cells, self._change, self._rates)
+        total = -self._rate * by_mu, -self._rate * by_omega
+        if self._written is not None:
+            self._written.add_products(-self._rate * self._learned_rates, self._against)
+        for (_, place), slope in zip(self._strains, self._slopes, strict=True):
+            total = with_modes(self._cells, total, place, slope)
+        return total
+
+    @property
+    def by_rate(self) -> Tensor:
+        """By the strain rate's factor times the viscosity, (B,)."""
+        out = -2.0 / self._rate * viscosity.energies(self._cells, self._change, self._stress)
+        if self._cells.correction is None:
+            return out
+        stress = self._cells.correction.stress(self._against)
+        return out - (self._learned_rates * stress).sum(dim=(1, 2))
+
+    @cached_property
+    def _slopes(self) -> list[Tensor]:
+        """By the configurations there."""
+        found, correction = [], self._cells.correction
+        for a, place in self._strains:
+            _, frames = viscosity.stretches(self._cells, place)
+            slope = viscosity.forces(self._cells, frames, self._stress)
+            if correction is not None:
+                stress = correction.viscous_stress(self._learned_rates, self._rate)
+                local = self._cells.local(place - self._cells.rest)
+                slope = slope + self._cells.of_corners(correction.pulled(local, stress))
+            found.append(a * slope)
+        return found
+
+
+def with_modes(cells: CellBatch, total: Weights, y: Tensor, slope: Tensor) -> Weights:
+    """Plus what the modes at y, which depend on the material, add."""
+    more = cells.weight_slopes(y, -Following(cells, y).response(slope))
+    return total[0] + more[0], total[1] + more[1]

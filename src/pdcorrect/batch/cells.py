@@ -1,6 +1,6 @@
 """Elastic energy, forces and tangents of many bodies at once.
 
-DistinctBodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
+Bodies of different sizes are padded: configurations are (B, U, 3) with each body's nodes
 first, then, from a common place on, its internal modes, cell by cell.  Cells and nodes that
 a body does not have carry no weight and stay at zero.  What is known at quadrature points
 is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
@@ -9,7 +9,8 @@ is (k, B C, Q); on a GPU the k numbers of a cell are side by side in memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,13 +18,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.correction import STATE, BatchCorrection
+from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
-from pdcorrect.batch.mesh_levels import places
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.batch.shared_matrices import DistinctBodies, of_all, of_some, with_rows
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
+
+Numbers = NDArray[np.int64]
 
 
 class Sizes(NamedTuple):
@@ -54,23 +55,18 @@ def padded(arrays: Sequence[NDArray[Any]], shape: tuple[int, ...], fill: float =
 class CellBatch:
     """The cells of B problems with the same element and energy, weightless until `set_weights`.
 
-    Parameters
-    ----------
-    problems : sequence of Problem
-    device, dtype
-        Of everything that is computed.
-
     Attributes
     ----------
     sizes : Sizes
     bodies : DistinctBodies
-        Of the scenes.
     node_counts : list of int
     volumes : (2, B C, Q)
         Of the points in both terms of the energy, m3.
     point_weights : (2, B C, Q)
         The same times mu and omega, J.
     points : Points
+    free : (B, U, 3)
+        1 where a component may move, 0 where not and in padding.
     present_nodes, present_cells : (B, N), (B, C) bool
         Which are a body's own, not padding.
     """
@@ -92,7 +88,6 @@ class CellBatch:
         distinct = self.bodies.distinct
         self._owners = torch.as_tensor(self.bodies.owners, device=device)
         self.node_counts = [len(p.positions) for p in problems]
-        self.mode_counts = [p.space.internal for p in problems]
         self.device, self.dtype = device, dtype
         n = self.sizes
         self.rest = self.repeated([p.positions for p in distinct], n.unknowns, 3)
@@ -101,6 +96,7 @@ class CellBatch:
         found = [places(p.cells, len(p.positions)) for p in distinct]
         slots = self._numbers(found, -1, n.nodes, max(table.shape[1] for table in found))
         self._slots = of_all(slots, n.cells * corners)
+        self.free = self.configurations([p.free_unknowns for p in problems])
         self.present_cells = self._first([len(p.cells) for p in problems], n.cells)
         self.present_nodes = self._first(self.node_counts, n.nodes)
         quadratures = [p.quadrature for p in distinct]
@@ -117,22 +113,6 @@ class CellBatch:
         written = [p.correction for p in problems if p.correction is not None]
         self.correction = BatchCorrection(written, n.cells, self.rest) if written else None
 
-    def narrowed(self, rows: Tensor) -> CellBatch:
-        """Of some scenes."""
-        n, numbers = self.sizes, rows.tolist()
-        return with_rows(
-            self, rows,
-            "rest", "present_nodes", "present_cells", "_gradients", "_owners", "_corners",
-            sizes=n._replace(scenes=len(rows)),
-            bodies=DistinctBodies(self.bodies.distinct, self.bodies.owners[numbers]),
-            node_counts=[self.node_counts[i] for i in numbers],
-            mode_counts=[self.mode_counts[i] for i in numbers],
-            _slots=of_some(self._slots, self._corners[0].numel(), n.scenes, rows),
-            point_weights=self.of_scenes(self.point_weights, rows),
-            volumes=self.of_scenes(self.volumes, rows),
-            correction=self.correction and self.correction.narrowed(rows),
-        )  # fmt: skip
-
     # --- arrays to and from tensors -----------------------------------------------------
 
     def tensor(self, array: NDArray[Any]) -> Tensor:
@@ -145,24 +125,15 @@ class CellBatch:
 
     def configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
         """Configurations (N + B, 3), or nodal arrays, of the scenes, padded to (B, U, 3)."""
-        return self._spread(arrays, self.node_counts)
+        out = np.zeros((len(arrays), self.sizes.unknowns, 3))
+        for row, array, nodes in zip(out, arrays, self.node_counts, strict=True):
+            modes = slice(self.sizes.nodes, self.sizes.nodes + len(array) - nodes)
+            row[:nodes], row[modes] = array[:nodes], array[nodes:]
+        return self.tensor(out)
 
     def repeated(self, arrays: Sequence[NDArray[Any]], *shape: int) -> Tensor:
         """An array of each of the ``bodies``, padded, for all scenes: (B, *shape)."""
         return self._of_scenes(self.tensor(padded(arrays, shape)))
-
-    def repeated_configurations(self, arrays: Sequence[NDArray[Any]]) -> Tensor:
-        """Configurations (N + B, 3) of the ``bodies``, padded, for all scenes: (B, U, 3)."""
-        counts = [len(p.positions) for p in self.bodies.distinct]
-        return self._of_scenes(self._spread(arrays, counts))
-
-    def _spread(self, arrays: Sequence[NDArray[Any]], node_counts: Sequence[int]) -> Tensor:
-        out = np.zeros((len(arrays), self.sizes.unknowns, 3))
-        for i, (array, nodes) in enumerate(zip(arrays, node_counts, strict=True)):
-            modes = array[nodes:]
-            out[i, : len(array[:nodes])] = array[:nodes]
-            out[i, self.sizes.nodes : self.sizes.nodes + len(modes)] = modes
-        return self.tensor(out)
 
     def _of_scenes(self, x: Tensor) -> Tensor:
         """Rows of the bodies for all scenes."""
@@ -204,22 +175,14 @@ class CellBatch:
         tangent = self.points.tangent(self.gradients(u), self.point_weights, project)
         if self.correction is None:
             return tangent
-        return *tangent, self.correction.linearise(self.local(u), project)
-
-    def tangent_sizes(self) -> tuple[int, ...]:
-        """Numbers that the parts of a tangent have at each point, and in each cell."""
-        return (9, 9, 12) if self.correction is None else (9, 9, 12, STATE)
-
-    def of_scenes(self, x: Tensor, rows: Tensor) -> Tensor:
-        """What is known at points, (k, B C, Q), of some scenes."""
-        return self._by_scene(x)[:, rows].flatten(1, 2)
+        return *tangent, *self.correction.linearise(self.local(u), project)
 
     def apply(self, tangent: Tangent, x: Tensor) -> Tensor:
         """Tangent times x, both (B, U, 3)."""
         out = self.gathered(self.points.product(tangent[:3], self.gradients(x)))
         if self.correction is None:
             return out
-        return out + self.of_corners(self.correction.apply(tangent[3], self.local(x)))
+        return out + self.of_corners(self.correction.apply(tangent[3:], self.local(x)))
 
     def of_corners(self, by_cell: Tensor) -> Tensor:
         """Values (B, C, K, 3) of corners summed, and none for modes, (B, U, 3)."""
@@ -310,3 +273,66 @@ class CellBatch:
         """Leading shape of the products with gradients: by scene where its cells are alike."""
         n = self.sizes
         return (n.scenes, 3 * n.cells) if self._gradients.ndim == 3 else (n.scenes, n.cells, 3)
+
+
+def kinds(
+    problems: Sequence[Problem], key: Callable[[Problem], Hashable]
+) -> tuple[list[Problem], list[int]]:
+    """One problem of each key, and which of them each problem is like."""
+    seen: dict[Hashable, int] = {}
+    owners = [seen.setdefault(key(p), len(seen)) for p in problems]
+    firsts = [owners.index(k) for k in range(len(seen))]
+    return [problems[i] for i in firsts], owners
+
+
+@dataclass(frozen=True, eq=False)
+class DistinctBodies:
+    """The problems of a batch without their loads, each once, and which of them each scene is.
+
+    What depends on nothing else is computed once a body.
+    """
+
+    distinct: list[Problem]
+    owners: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, problems: Sequence[Problem]) -> DistinctBodies:
+        """Known by the objects that `Problem.with_loads` shares; numbers are not compared."""
+
+        def key(p: Problem) -> tuple[Hashable, ...]:
+            parts = (p.mesh, p.space, p.quadrature, p.materials, p.mass_matrix, p.clamps)
+            return p.mass_rule, *map(id, parts)
+
+        distinct, owners = kinds(problems, key)
+        return cls(distinct, np.array(owners, dtype=np.int64))
+
+    @property
+    def one_a_scene(self) -> bool:
+        """Whether the scenes are the distinct bodies in their order."""
+        return np.array_equal(self.owners, np.arange(len(self.distinct)))
+
+
+def of_all(numbers: Tensor, size: int) -> Tensor:
+    """Numbers (B, R, n) of each scene's own ``size`` rows as those of all scenes, (B R, n).
+
+    Those below zero stand for nothing, and become B times ``size``.
+    """
+    scene = torch.arange(len(numbers), device=numbers.device)[:, None, None]
+    of_its_own = numbers + size * scene
+    return torch.where(numbers < 0, size * len(numbers), of_its_own).flatten(0, 1)
+
+
+def places(cells: Numbers, count: int) -> Numbers:
+    """Where each node occurs in the raveled cells, (N, most), filled up with -1."""
+    flat = cells.ravel()
+    order = np.argsort(flat, kind="stable")
+    return table_rows(flat[order], order, count, -1)[0]
+
+
+def table_rows(rows: Numbers, values: Numbers, count: int, fill: int) -> tuple[Numbers, Numbers]:
+    """Values by sorted rows as a table (count, most), and the place of each in its row."""
+    counts = np.bincount(rows, minlength=count)
+    places = np.arange(len(rows)) - (np.cumsum(counts) - counts)[rows]
+    out = np.full((count, counts.max()), fill, dtype=np.int64)
+    out[rows, places] = values
+    return out, places

@@ -73,12 +73,6 @@ def usable_device(device: str | torch.device) -> torch.device:
     return found
 
 
-def check_precision(name: str, dtype: torch.dtype) -> None:
-    """Refuse types in which no batch computes."""
-    if dtype not in (torch.float32, torch.float64):
-        raise InputError(f"{name} = {dtype!r}: expected torch.float32 or torch.float64.")
-
-
 # --- tensors -------------------------------------------------------------------------------------
 
 
@@ -103,13 +97,7 @@ def check_nodal(cells: CellBatch, name: str, x: Tensor) -> None:
 
 
 def by_cell(cells: CellBatch, name: str, value: Tensor | float | None) -> Tensor | None:
-    """A number, or a tensor that broadcasts to (B, C), as (B, C).
-
-    Raises
-    ------
-    InputError
-        If it has another shape, type or device.
-    """
+    """A number, or a tensor that broadcasts to (B, C), as (B, C); others are refused."""
     if value is None:
         return None
     shape = (cells.sizes.scenes, cells.sizes.cells)
@@ -172,18 +160,17 @@ def check_state(cells: CellBatch, state: BatchState) -> None:
     """Refuse what is no state of the batch."""
     check_nodal(cells, "positions", state.positions)
     check_nodal(cells, "velocities", state.velocities)
-    finite_times(cells, state.times)
+    _finite_times(cells, state.times)
     for name, x in state.memory.items():
         check_nodal(cells, f"memory {name!r}", x)
 
 
 def start_times(cells: CellBatch, times: Sequence[float] | None) -> tuple[float, ...]:
     """One time for each scene, s; zeros if there are none."""
-    return (0.0,) * cells.sizes.scenes if times is None else finite_times(cells, times)
+    return (0.0,) * cells.sizes.scenes if times is None else _finite_times(cells, times)
 
 
-def finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
-    """One time for each scene, s; others are refused."""
+def _finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
     scenes = cells.sizes.scenes
     try:
         found = tuple(float(t) for t in times)

@@ -1,7 +1,6 @@
 """What a learned element adds to a batch: `pdcorrect.fem.turned_strains` for B scenes, in torch.
 
-Kept of a configuration, see `state`: R, S, (tr S - S)^-1 and z of each cell, and what its own
-derivative y = K z needs; all lengths are times the cell's size.
+All lengths are times the cell's size.
 """
 
 from __future__ import annotations
@@ -15,21 +14,16 @@ from torch import Tensor
 from pdcorrect.batch.decomposition import product, signed_svd, transposed
 from pdcorrect.batch.gpu import small_products
 from pdcorrect.batch.points import Components, computed, moved
-from pdcorrect.batch.shared_matrices import with_rows
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.cube_symmetry import MANDEL
 from pdcorrect.fem.turned_strains import FADES, GONE, HUGE, KINK, LARGE, SHARES
 
-_SIZES = (9, 9, 9, 9, 18, 18, 18, 9, 3, 8)
-"""Of what `_State` has."""
-STATE = sum(_SIZES)
-
 
 class _State(NamedTuple):
-    """R, S, (tr S - S)^-1 and S's adjugate; z before it fades, and the derivatives by what is left
-    of it.
+    """Of each cell at a configuration: R, S, (tr S - S)^-1, S's adjugate and z before it fades.
 
-    Those by S and the vectors of z, their tensor, and w; what `_measures` tells.
+    Then the derivatives by what is left of z, those by S and z's vectors, their tensor, and w;
+    and what `_measures` tells.
     """
 
     R: Tensor
@@ -52,14 +46,7 @@ class _State(NamedTuple):
 class BatchCorrection:
     """Energies, forces and second derivatives of the corrections of B bodies.
 
-    Parameters
-    ----------
-    corrections : sequence of CellCorrection
-        Of the scenes.
-    cells : int
-        To which their numbers are filled up.
-    like : Tensor
-        Whose type and device are used.
+    Filled up to so many ``cells``, in the type and on the device of ``like``.
     """
 
     def __init__(self, corrections: Sequence[CellCorrection], cells: int, like: Tensor) -> None:
@@ -78,16 +65,11 @@ class BatchCorrection:
         for i, c in enumerate(corrections):
             self._matrices[i, : len(c.sizes)] = torch.as_tensor(c.matrices)
 
-    def narrowed(self, rows: Tensor) -> BatchCorrection:
-        """Of some scenes."""
-        return with_rows(self, rows, "_shapes", "_matrices", "_sizes")
-
     def energy_and_forces(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""
         state = self._state(local)
         energy = 0.5 * (state.strains * state.raw).sum(dim=(1, 2))
-        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
-        return energy, -self._spread(conjugates)
+        return energy, -self._pulled(state)
 
     def strains(self, local: Tensor) -> Tensor:
         """z, (B, C, 18)."""
@@ -100,14 +82,14 @@ class BatchCorrection:
 
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """See `WrittenViscous`: (B,), and its derivatives by cell (B, C, 8, 3)."""
-        state = self._against(self._state(local), before, rate)
+        state = self.linearise_viscous(local, before, rate)
         energy = 0.5 * ((state.strains - before) * state.raw).sum(dim=(1, 2))
-        conjugates = _conjugates(state.R, state.tensor, state.w, state.y)
-        return energy, self._spread(conjugates)
+        return energy, self._pulled(state)
 
-    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> Tensor:
+    def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> _State:
         """What `apply` needs of it, with the same rate."""
-        return _kept(self._against(self._state(local), before, rate))
+        at = self._state(local)
+        return self._with(at, self.viscous_stress(at.strains - before, rate))
 
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of z (B, C, 18) by displacements x (B, C, 8, 3)."""
@@ -119,8 +101,7 @@ class BatchCorrection:
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
-        state = self._with(self._state(local), stress)
-        return self._spread(_conjugates(state.R, state.tensor, state.w, state.y))
+        return self._pulled(self._with(self._state(local), stress))
 
     def stress(self, z: Tensor) -> Tensor:
         """K z, (B, C, 18)."""
@@ -130,21 +111,21 @@ class BatchCorrection:
         """Times a rate, and with the part of K that viscosity has, see `WrittenViscous`."""
         return rate * without_trace(self.stress(without_trace(z)))
 
-    def linearise(self, local: Tensor, project: bool = False) -> Tensor:
-        """What `apply` needs, (STATE, B C, 1); ``project`` as in `CellCorrection.tangent`."""
+    def linearise(self, local: Tensor, project: bool = False) -> _State:
+        """What `apply` needs; ``project`` as in `CellCorrection.tangent`."""
         state = self._state(local)
-        if project:
-            state = state._replace(**{k: torch.zeros_like(getattr(state, k)) for k in _OWN})
-        return _kept(state)
+        if not project:
+            return state
+        own = {k: torch.zeros_like(getattr(state, k)) for k in ("raw", "y", "tensor", "w")}
+        return state._replace(**own)
 
-    def apply(self, kept: Tensor, local: Tensor, rate: Tensor | None = None) -> Tensor:
+    def apply(self, tangent: Sequence[Tensor], local: Tensor, rate: Tensor | None = None) -> Tensor:
         """The second derivative times changes (B, C, 8, 3), by cell; the rate is of viscosity."""
-        scenes, cells = self._sizes.shape
-        flat = kept[..., 0].T.reshape(scenes, cells, STATE)
-        parts = torch.split(flat, list(_SIZES), dim=2)
-        square = [x.reshape(*x.shape[:2], 3, 3) if x.shape[2] == 9 else x for x in parts]
-        changes = self._changes(_State(*square), small_products(self._shapes, local), rate)
-        return self._spread(changes)
+        dv = small_products(self._shapes, local)
+        return self._spread(self._changes(_State(*tangent), dv, rate))
+
+    def _pulled(self, at: _State) -> Tensor:
+        return self._spread(_conjugates(at.R, at.tensor, at.w, at.y))
 
     def _spread(self, conjugates: Tensor) -> Tensor:
         return small_products(self._shapes.transpose(-1, -2), conjugates)
@@ -193,9 +174,6 @@ class BatchCorrection:
         more = torch.einsum("nij,bcij->bcn", self._mandel, tensor)
         return torch.cat([y[..., :6] + more, y[..., 6:]], dim=-1)
 
-    def _against(self, at: _State, before: Tensor, rate: Tensor) -> _State:
-        return self._with(at, self.viscous_stress(at.strains - before, rate))
-
     def _torque(self, S: Tensor, T: Tensor, h: Tensor, y: Tensor) -> Tensor:
         return _axial(small_products(S, T)) + torch.linalg.cross(h, y).sum(dim=2)
 
@@ -236,15 +214,11 @@ class BatchCorrection:
         dT = torch.einsum("nij,bcn->bcij", self._mandel, dy[..., :6])
         torque = self._torque(at.S, dT, h, _vectors(dy))
         torque = torque + self._torque(dS, at.tensor, dh, y)
-        trace = dS.diagonal(dim1=-2, dim2=-1).sum(dim=-1, keepdim=True)
-        torque = torque - trace * at.w + small_products(dS, at.w[..., None])[..., 0]
+        torque = torque - _trace(dS) * at.w + small_products(dS, at.w[..., None])[..., 0]
         dw = small_products(at.inverse, torque[..., None])[..., 0]
         dT = dT + _cross_columns(turn, _without(at.tensor, at.w))
         dy_vectors = _vectors(dy) + torch.linalg.cross(turn[..., None, :], y)
         return _conjugates(at.R, dT, dw, torch.cat([dy[..., :6], dy_vectors.flatten(2)], dim=2))
-
-
-_OWN = ("raw", "y", "tensor", "w")
 
 
 def without_trace(z: Tensor) -> Tensor:
@@ -255,10 +229,9 @@ def without_trace(z: Tensor) -> Tensor:
 
 def _adjugates(A: Tensor, B: Tensor) -> Tensor:
     """Half the change of A's adjugate by B; A's own where B is A; both symmetric."""
-    a, b = (x.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] for x in (A, B))
-    identity = torch.eye(3, dtype=A.dtype, device=A.device)
     both = A @ B
-    trace = both.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None]
+    a, b, trace = (_trace(x)[..., None] for x in (A, B, both))
+    identity = torch.eye(3, dtype=A.dtype, device=A.device)
     return 0.5 * (both + both.transpose(-1, -2) - a * B - b * A + (a * b - trace) * identity)
 
 
@@ -294,11 +267,6 @@ def _trace(A: Tensor) -> Tensor:
 def _contracted(A: Tensor, B: Tensor) -> Tensor:
     """A : B, (B, C, 1)."""
     return (A * B).sum(dim=(-2, -1))[..., None]
-
-
-def _kept(state: _State) -> Tensor:
-    flat = [x.flatten(2).flatten(0, 1) for x in state]
-    return torch.cat(flat, dim=1).T[..., None].contiguous()
 
 
 def _stretch(H: Components) -> list[Components]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, cat
 
-from pdcorrect.batch.cells import CellBatch, padded
+from pdcorrect.batch.cells import CellBatch, DistinctBodies, kinds, padded
 from pdcorrect.batch.gpu import small_products
-from pdcorrect.batch.shared_matrices import Sharing, with_rows
-from pdcorrect.batch.triton_kernels import tall_product
+from pdcorrect.batch.triton_kernels import skinny_product
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import alike
 
@@ -53,22 +53,10 @@ def rest_blocks(problem: Problem, stiffness: float, one: bool) -> Array:
 class Elimination:
     """The internal modes of cells, eliminated from a system and found afterwards.
 
-    Parameters
-    ----------
-    cells : CellBatch
-    blocks : sequence of (C or 1, w L, w L)
-        Of each distinct problem's cells; one stands for all.
-    owners : (B,) tensor
-        Which of them each scene has.
-    nodes : int
-        Of a cell, K; its other shape functions are modes.
-    width : int
-        Unknowns a node, w: 1 where the blocks are the same for all coordinates, or 3.
-
-    Attributes
-    ----------
-    blocks : list of (C or 1, w K, w K)
-        Of the nodes, with the modes eliminated.
+    ``blocks`` (C or 1, w L, w L) are of each distinct problem's cells, one for all; ``owners`` (B,)
+    which of them each scene has; ``nodes`` K a cell has, its other shape functions are modes; a
+    node has ``width`` w unknowns: 1 where blocks are the same for all coordinates, or 3.  The
+    attribute ``blocks`` is of the nodes, (C or 1, w K, w K), with the modes eliminated.
     """
 
     def __init__(
@@ -82,11 +70,6 @@ class Elimination:
         self.blocks = [kept for kept, _, _ in parts]
         self._inverse = self._stored([inverse for _, inverse, _ in parts])[owners]
         self._solved = self._stored([solved for _, _, solved in parts])[owners]
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> Elimination:
-        """Of some scenes, with their cells."""
-        names = ("_inverse", "_solved") if cells.sizes.modes else ()
-        return with_rows(self, rows, *names, _cells=cells)
 
     def reduced(self, r: Tensor) -> Tensor:
         """Right-hand side (B, N, 3) of the nodes for that of configurations (B, U, 3)."""
@@ -138,20 +121,59 @@ def _eliminated(blocks: Array, nodes: int) -> tuple[Array, Array, Array]:
     return np.ascontiguousarray(kept), inverse, solved
 
 
+class Sharing:
+    """Which scenes have the same mesh, material and clamps, and so one matrix.
+
+    ``distinct`` is one of each kind, ``owners`` which of them each scene is.
+    """
+
+    def __init__(self, problems: Sequence[Problem], device: torch.device) -> None:
+        bodies = DistinctBodies.of(problems)
+        self.distinct, owners = kinds(bodies.distinct, _key)
+        self.owners: list[int] = [owners[body] for body in bodies.owners]
+        members: list[list[int]] = [[] for _ in self.distinct]
+        for scene, owner in enumerate(self.owners):
+            members[owner].append(scene)
+        most = max(map(len, members))
+        self._scenes = len(self.owners)
+        filled = [row + [self._scenes] * (most - len(row)) for row in members]
+        self._members = torch.tensor(filled, device=device)
+        self._alone = most == 1
+        self._full = len(members) * most == self._scenes
+
+    def gathered(self, x: Tensor) -> Tensor:
+        """(B, ...) -> (K, m, ...): side by side what shares a matrix, filled up with zeros."""
+        if self._alone:
+            return x[:, None]
+        if not self._full:
+            x = torch.cat([x, x.new_zeros(1, *x.shape[1:])])
+        return x[self._members]
+
+    def scattered(self, x: Tensor) -> Tensor:
+        """The reverse of `gathered`."""
+        if self._alone:
+            return x[:, 0]
+        out = x.new_zeros(self._scenes + 1, *x.shape[2:])
+        out[self._members] = x
+        return out[: self._scenes]
+
+
+def _key(problem: Problem) -> bytes:
+    digest = hashlib.blake2b()
+    materials, mass = problem.materials, problem.mass_matrix
+    for array in (
+        problem.positions, problem.cells, problem.free, materials.mu, materials.volume_weight,
+        mass.data, mass.indices,
+    ):  # fmt: skip
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.digest()
+
+
 class DenseInverse:
     """R -> A^-1 r on nodal fields (B, N, 3), zero where clamped.
 
-    Parameters
-    ----------
-    sharing : Sharing
-        Which scenes have one matrix.
-    free : sequence of (N, 3) bool
-        Components that may move, of each distinct problem.
-    width : int
-        Unknowns a node of the matrices: 3, or 1 where one is the same for all coordinates.
-    storage : torch.dtype
-        Of the inverses.
-    device : torch.device
+    ``free`` (N, 3) are the components of each distinct problem that may move; matrices have
+    ``width`` unknowns a node: 3, or 1 where one is the same for all coordinates.
     """
 
     def __init__(
@@ -186,12 +208,6 @@ class DenseInverse:
             self._inverse[i, axis, :size, :size] = inverse.to(self._inverse.dtype)
         return True
 
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> DenseInverse:
-        """Of some scenes, with the matrices that they have."""
-        return with_rows(
-            self, kept, "_inverse", _sharing=sharing, _free=[self._free[k] for k in kept.tolist()]
-        )
-
     def __call__(self, r: Tensor) -> Tensor:
         """Scenes with one inverse side by side."""
         shared = self._sharing.gathered(r.to(self._inverse.dtype))
@@ -202,7 +218,7 @@ class DenseInverse:
             columns = shared.permute(0, 2, 1, 3).reshape(count, 1, nodes, 3 * most)
         else:
             columns = shared.permute(0, 3, 2, 1)
-        flat = tall_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
+        flat = skinny_product(self._inverse.flatten(0, 1), columns.flatten(0, 1))
         x = flat.reshape(count, self._axes, *flat.shape[1:])
         if self._width == 3:
             x = x.permute(0, 3, 1, 2).reshape(count, most, nodes, 3)

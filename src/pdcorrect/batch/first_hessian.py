@@ -24,6 +24,7 @@ from pdcorrect.batch.decomposition import transposed
 from pdcorrect.batch.elimination import (
     DenseInverse,
     Elimination,
+    Sharing,
     add_mass,
     alike_cells,
     rest_blocks,
@@ -32,7 +33,6 @@ from pdcorrect.batch.elimination import (
 )
 from pdcorrect.batch.gpu import one_kernel
 from pdcorrect.batch.multigrid import BatchMultigrid
-from pdcorrect.batch.shared_matrices import Sharing, with_rows
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.projective import VOLUME_SCALE
@@ -97,15 +97,7 @@ LARGEST_REST = 1500
 class FirstHessian:
     """R -> H^-1 r, about, on configurations (B, U, 3), zero where clamped.
 
-    Parameters
-    ----------
-    cells : CellBatch
-    problems : sequence of Problem
-    factors : (float, float)
-        On mass (1/s2) and stiffness.
-    kind : {"G", "G-scaled", "multigrid", "rest"}
-    storage : torch.dtype
-        Of the inverse.
+    ``factors`` are on mass (1/s2) and stiffness, ``storage`` is the inverse's type.
 
     Attributes
     ----------
@@ -161,12 +153,10 @@ class FirstHessian:
             weights = [p.quadrature.weights for p in cells.bodies.distinct]
             shares = [w / w.sum(axis=1, keepdims=True) for w in weights]
             self._shares = cells.repeated(shares, n.cells, n.points)
-            held = [np.where(p.free.all(axis=1), 0.0, 1.0) for p in cells.bodies.distinct]
-            self._held = cells.repeated(held, n.unknowns) > 0.5
+            self._held = cells.free.amin(dim=2) < 0.5
             room = torch.zeros(9, n.scenes, n.unknowns, dtype=cells.dtype, device=cells.device)
             self._rotations = list(room)
-        every = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
-        self._free = cells.repeated_configurations(every)
+        self._free = cells.free
 
     def _filled(self, solver: DenseInverse, mass_factor: float) -> list[bool]:
         regular = []
@@ -177,19 +167,6 @@ class FirstHessian:
             regular.append(solver.fill(i, matrix))
         return regular
 
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> FirstHessian:
-        """Of some scenes with their cells, turned as it is now."""
-        sharing, numbers = self._sharing.narrowed(rows)
-        kept = torch.tensor(numbers, device=rows.device)
-        solver = self._solver.narrowed(sharing, kept, rows)
-        turning = ("_shares", "_held") if self._turned else ()
-        return with_rows(
-            self, rows, "_free", "regular", *turning,
-            _cells=cells, _sharing=sharing, _solver=solver,
-            _modes=self._modes.narrowed(cells, rows),
-            _rotations=[a[rows] for a in self._rotations],
-        )  # fmt: skip
-
     def turn(self, y: Tensor) -> None:
         """Turn the rest Hessian to a configuration, see `first_hessian.Rotations`."""
         if not self._turned:
@@ -198,14 +175,14 @@ class FirstHessian:
         u = y - cells.rest
         u = torch.cat([u[:, : n.nodes], torch.zeros_like(u[:, n.nodes :])], dim=1)
         mean = (cells.gradients(u) * self._shares.flatten(0, 1)).sum(dim=-1)
-        turns = cells.points.rotations(mean, moved=True).T
+        turns = cells.points.rotations(mean).T
         by_cell = turns.reshape(n.scenes, n.cells, 1, 9).expand(-1, -1, n.width, -1)
         sums = [cells.summed(by_cell[..., 3 * i : 3 * i + 3]) for i in range(3)]
         total = torch.cat(sums, dim=-1)  # (B, U, 9)
         identity = torch.eye(3, dtype=y.dtype, device=y.device).reshape(9)
         still = self._held | (total.abs().sum(dim=-1) == 0.0)
-        total = torch.where(still[..., None], identity, total)
-        out = cells.points.rotations(total.reshape(-1, 9).T.contiguous())
+        moved = torch.where(still[..., None], 0.0, total - identity)
+        out = cells.points.rotations(moved.reshape(-1, 9).T.contiguous())
         for kept, new in zip(self._rotations, out.reshape(9, n.scenes, n.unknowns), strict=True):
             kept.copy_(new)
 

@@ -189,10 +189,7 @@ def _unowned(method: Callable[[], None]) -> Callable[[], None]:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Work that Python's garbage collection does not interrupt.
-
-    It might free another recording, which is not allowed while one is made.
-    """
+    """Garbage collection might free another recording, which is not allowed while one is made."""
     enabled = gc.isenabled()
     gc.disable()
     try:

@@ -49,18 +49,9 @@ _CONSTANT = "previous_times"
 class _Call:
     """One call of a layer: what its steps, and later their derivatives, share and record.
 
-    Attributes
-    ----------
-    layer : PDLayer
-    material : BatchMaterial
-    times : tuple of float
-        At the start, s.
-    statuses : list of list of Status
-        Of the steps taken so far.
-    failures : list of (int, int)
-        Step and scene of each derivative that failed.
-    names : list of tuple of str
-        Of the memory before each step taken so far, and after the last one.
+    ``times`` (s) are at the start, ``statuses`` of the steps taken so far, ``failures`` step and
+    scene of each derivative that failed, ``names`` of the memory before each step and after the
+    last.
     """
 
     layer: PDLayer
@@ -230,7 +221,8 @@ class PDLayer(nn.Module):
         ConvergenceError
             If a scene fails otherwise, unless ``on_failure`` is "zero".
         """
-        frame, _ = self._run(positions, velocities, forces, young, poisson, density, times, memory)
+        material = young, poisson, density
+        frame, _ = self._run(positions, velocities, forces, material, times, memory)
         return frame[0], frame[1]
 
     def trajectory(
@@ -240,7 +232,8 @@ class PDLayer(nn.Module):
 
         Frame 0 is as given.
         """
-        _, frames = self._run(positions, velocities, forces, keep=True, **options)
+        material = [options.pop(name, None) for name in NAMES]
+        _, frames = self._run(positions, velocities, forces, material, keep=True, **options)
         out = [torch.stack(parts) for parts in zip(*frames, strict=True)]
         return out[0], out[1]
 
@@ -249,12 +242,9 @@ class PDLayer(nn.Module):
         positions: Tensor,
         velocities: Tensor,
         forces: Tensor | None,
-        young: Tensor | float | None = None,
-        poisson: Tensor | float | None = None,
-        density: Tensor | float | None = None,
+        material: Sequence[Tensor | float | None],
         times: Sequence[float] | None = None,
         memory: Mapping[str, Tensor] | None = None,
-        *,
         keep: bool = False,
     ) -> tuple[Frame, list[Frame]]:
         """The last frame and, if they are to be kept, all."""
@@ -265,7 +255,7 @@ class PDLayer(nn.Module):
         start = BatchState(positions, velocities, start_times(cells, times), remembered)
         check_state(cells, start)
         pushes = self._pushes(forces, single)
-        pairs = zip(NAMES, (young, poisson, density), strict=True)
+        pairs = zip(NAMES, material, strict=True)
         given = [by_cell(cells, name, value) for name, value in pairs]
         values = stepper.with_material(given)
         if self.on_failure == "raise" and values is not stepper.present:

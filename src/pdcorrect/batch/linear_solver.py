@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,7 +12,6 @@ from torch import Tensor
 from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.objective import (
     BatchObjective,
-    Tangents,
     by_scene,
     dot,
     largest_displacement,
@@ -50,9 +50,9 @@ class BatchConjugateGradients:
         self._tolerance, self._share, self._settled = rest.new_zeros(3)
         self._busy = torch.zeros((), dtype=torch.bool, device=rest.device)
         self.steps = 0
-        self._tangent: Tangents
+        self._tangent: tuple[Any, ...] = ()
         self._begin = recorder(self._set_up)
-        self._advance = recorder(self._next)
+        self._advance = recorder(self._step)
 
     def solve(
         self,
@@ -68,32 +68,17 @@ class BatchConjugateGradients:
     ) -> None:
         """Set ``x`` and ``converged`` for the scenes where ``which`` (B,) holds.
 
-        Parameters
-        ----------
-        y, b : (B, U, 3)
-            Where the Hessian is taken, and the right-hand side, zero where clamped.
-        start : (B, U, 3) or None
-            First iterate.
-        tolerance : float
-            Of the residual in the preconditioner's norm, relative to its first value.
-        residual_share : float
-            Largest Euclidean norm of the residual, of b's.
-        settled : float
-            Largest displacement of the last change, of the solution's.
+        The Hessian is taken at ``y``; ``b`` is zero where clamped; both (B, U, 3), as ``start``.
+        The rest is as in `pdcorrect.fem.multigrid.conjugate_gradients`, with ``settled`` the
+        largest displacement of the last change, of the solution's.
         """
         self._y.copy_(y)
         self._b.copy_(b)
-        if start is None:
-            self.x.zero_()
-        else:
-            self.x.copy_(start)
+        self.x.copy_(torch.zeros_like(b) if start is None else start)
         self._which.copy_(which)
-        for room, value in (
-            (self._tolerance, tolerance),
-            (self._share, residual_share),
-            (self._settled, settled),
-        ):
-            room.fill_(value)
+        self._tolerance.fill_(tolerance)
+        self._share.fill_(residual_share)
+        self._settled.fill_(settled)
         self._begin()
         self.steps = 0
         while self.steps < max_steps and bool(self._busy):
@@ -119,10 +104,6 @@ class BatchConjugateGradients:
         self._active.copy_(self._which & (self._r_z > 0.0))
         self._busy.copy_(self._active.any())
 
-    def _next(self) -> None:
-        self._step()
-        self._busy.copy_(self._active.any())
-
     def _step(self) -> None:
         image = self._product(self._d)
         curvature = dot(self._d, image)
@@ -139,6 +120,7 @@ class BatchConjugateGradients:
         self._r_z.copy_(r_z)
         self.converged.logical_or_(active & done)
         self._active.copy_(active & ~done & (r_z > 0.0) & torch.isfinite(r_z))
+        self._busy.copy_(self._active.any())
 
 
 @one_kernel

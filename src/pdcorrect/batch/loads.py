@@ -30,16 +30,12 @@ class BatchLoads:
         self._fixed = [
             [k for k in p.loads if k.sample is None and k.acceleration is None] for p in problems
         ]
-        most = max(map(len, self._fixed))
-        self._patterns = [
-            cells.configurations(
-                [
-                    loads[k].pattern if k < len(loads) else np.zeros_like(p.positions)
-                    for loads, p in zip(self._fixed, problems, strict=True)
-                ]
-            )
-            for k in range(most)
-        ]
+        most, n = max(map(len, self._fixed)), cells.sizes
+        patterns = np.zeros((n.scenes, most, n.unknowns, 3))
+        for scene, loads in zip(patterns, self._fixed, strict=True):
+            for row, load in zip(scene, loads, strict=False):
+                row[: len(load.pattern)] = load.pattern
+        self._patterns = cells.tensor(patterns)
         self._known: tuple[tuple[float, ...], ...] | None = None
         self._sum, self._acceleration = torch.zeros_like(cells.rest), cells.rest[:, :1] * 0.0
 
@@ -85,20 +81,15 @@ class BatchLoads:
         return self._cells.nodal(out)
 
     def _update(self, amplitudes: tuple[tuple[float, ...], ...]) -> None:
-        total = torch.zeros_like(self._cells.rest)
-        for k, pattern in enumerate(self._patterns):
-            factors = [
-                row[k] if k < len(fixed) else 0.0
-                for row, fixed in zip(amplitudes, self._fixed, strict=True)
-            ]
-            total = total + self._cells.tensor(np.array(factors))[:, None, None] * pattern
+        factors = np.zeros(self._patterns.shape[:2])
         fall = np.zeros((len(amplitudes), 1, 3))
-        for i, (row, fixed, gravity) in enumerate(
-            zip(amplitudes, self._fixed, self._gravity, strict=True)
-        ):
-            for factor, load in zip(row[len(fixed) :], gravity, strict=True):
+        for i, (row, gravity) in enumerate(zip(amplitudes, self._gravity, strict=True)):
+            fixed = len(row) - len(gravity)
+            factors[i, :fixed] = row[:fixed]
+            for factor, load in zip(row[fixed:], gravity, strict=True):
                 fall[i, 0] += factor * np.asarray(load.acceleration)
-        self._sum, self._acceleration = total, self._cells.tensor(fall)
+        self._sum = torch.einsum("bk,bkui->bui", self._cells.tensor(factors), self._patterns)
+        self._acceleration = self._cells.tensor(fall)
         self._known = amplitudes
 
     def _host(self, x: Tensor) -> list[np.ndarray]:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from pdcorrect.batch.cells import CellBatch
@@ -21,14 +19,8 @@ NAMES = ("young", "poisson", "density")
 class BatchMaterial:
     """Values of each cell, (B, C); its tensors are not changed.
 
-    Attributes
-    ----------
-    young, poisson, density : (B, C)
-        Pa, dimensionless, kg/m3.
-    mu, volume_weight : (B, C)
-        Of the two energy terms, Pa; zero where the energy leaves a term out.
-    sound : (B,) bool
-        Whether all of a scene's values are in their range.
+    Moduli in Pa, density in kg/m3; the weights of the two energy terms, Pa, are zero where the
+    energy leaves a term out.  ``sound`` (B,) says whether all of a scene's values are in range.
     """
 
     young: Tensor
@@ -46,19 +38,13 @@ class BatchMaterial:
 
 def own_material(cells: CellBatch) -> BatchMaterial:
     """What the problems have."""
-
-    def tensor(arrays: Sequence[NDArray[np.float64]]) -> Tensor:
-        return cells.repeated(arrays, cells.sizes.cells)
-
     every = [p.materials for p in cells.bodies.distinct]
-    return BatchMaterial(
-        tensor([m.young for m in every]),
-        tensor([m.poisson for m in every]),
-        tensor([m.density for m in every]),
-        tensor([m.mu for m in every]),
-        tensor([m.volume_weight for m in every]),
-        torch.ones(cells.sizes.scenes, dtype=torch.bool, device=cells.device),
-    )
+    values = {
+        name: cells.repeated([getattr(m, name) for m in every], cells.sizes.cells)
+        for name in (*NAMES, "mu", "volume_weight")
+    }
+    sound = torch.ones(cells.sizes.scenes, dtype=torch.bool, device=cells.device)
+    return BatchMaterial(**values, sound=sound)
 
 
 def changed(

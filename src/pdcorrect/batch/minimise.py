@@ -2,11 +2,9 @@
 
 One iteration evaluates every scene once: scenes whose trial step is accepted move and take
 a new direction, the others try a shorter step.  It has no branches that depend on values,
-so a GPU replays it (`recording`); between iterations Python looks at the scenes' progress.
+so a GPU replays it (`Recorder`); between iterations Python looks at the scenes' progress.
 A scene stops when its own step is short; then the remaining displacement is estimated with
-the true Hessian, by conjugate gradients, for all scenes that wait for it.  On the CPU, when
-few scenes are left, the loop goes on with a smaller batch of those (recorded work is for one
-size).
+the true Hessian, by conjugate gradients, for all scenes that wait for it.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from pdcorrect.batch.first_hessian import FirstHessian
 from pdcorrect.batch.gpu import Recorder, one_kernel
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.objective import BatchObjective, by_scene, dot, largest_displacement, node_dot
-from pdcorrect.batch.shared_matrices import with_rows
+from pdcorrect.solvers.follower import MOST, Anderson
 from pdcorrect.solvers.minimise import ARMIJO, BACKTRACKS, FIRST_CHECK, NO_MOTION
 
 _CURVATURE = 1e-12
@@ -44,11 +42,6 @@ class BatchHistory:
         self._sg, self._zg = zeros(scenes, length), zeros(scenes, length)
         self._age = torch.full((scenes, length), -1, dtype=torch.int64, device=like.device)
         self._scenes = torch.arange(scenes, device=like.device)
-
-    def narrowed(self, rows: Tensor) -> BatchHistory:
-        """Of some scenes, as it is now."""
-        names = ("_S", "_Z", "_r_inverse", "_yz", "_d", "_sg", "_zg", "_age")
-        return with_rows(self, rows, *names, _scenes=self._scenes[: len(rows)])
 
     def clear(self, which: Tensor) -> None:
         """Forget all pairs of the scenes where ``which`` (B,) holds."""
@@ -140,11 +133,6 @@ def _pair_products(s: Tensor, z: Tensor, old: Tensor, new: Tensor) -> Tensor:
 _ROUND_OFF = {torch.float64: 1e-13, torch.float32: 1e-5}
 HISTORY = 12
 _CG_STEPS = 60
-_FEW = 4
-"""One in so many scenes or less are few."""
-
-_OUTCOME = ("y", "gradient", "phase", "iterations", "evaluations", "estimate")
-_PROGRESS = ("_x", "_d", "_value", "_scale", "_step", "_slope", "_threshold", "_tried")
 
 
 class Phase(IntEnum):
@@ -158,31 +146,14 @@ class Phase(IntEnum):
     LIMIT = 5
 
 
-def _improved(inverse: FirstHessian, history: BatchHistory) -> Callable[[Tensor], Tensor]:
-    """The first Hessian's inverse, improved by the pairs of the steps since the start."""
-
-    def product(r: Tensor) -> Tensor:
-        return history.improved(r.flatten(1), inverse(r).flatten(1)).reshape(r.shape)
-
-    return product
-
-
 class BatchMinimiser:
     """L-BFGS on a `BatchObjective`.
 
-    Parameters
-    ----------
-    objective : BatchObjective
-    inverse : FirstHessian
-    tolerance : (B,)
-        m, of each scene's estimated largest displacement from its minimum.
-    max_iterations : int
-    history : BatchHistory, optional
-        Of steps under way.
+    The ``tolerance`` (B,), m, is of each scene's estimated largest displacement from its minimum.
 
     Attributes
     ----------
-    y, gradient : (B, U, 3)
+    start, y, gradient : (B, U, 3)
     phase, iterations, evaluations : (B,)
     estimate : (B,)
         m; infinite where there is none.
@@ -195,15 +166,14 @@ class BatchMinimiser:
         inverse: FirstHessian,
         tolerance: Tensor,
         max_iterations: int,
-        history: BatchHistory | None = None,
     ) -> None:
         self._objective, self._inverse = objective, inverse
         self._tolerance, self._most = tolerance, max_iterations
         rest, scenes = objective.cells.rest, len(tolerance)
-        self.y, self._start, self.gradient, self._x, self._d = (
+        self.y, self.start, self.gradient, self._x, self._d = (
             torch.zeros_like(rest) for _ in range(5)
         )
-        self._start.copy_(rest)
+        self.start.copy_(rest)
         numbers = torch.zeros(6, scenes, dtype=rest.dtype, device=rest.device)
         self._value, self._scale, self._step, self._slope, self._threshold, self.estimate = numbers
         counters = torch.zeros(4, scenes, dtype=torch.int64, device=rest.device)
@@ -211,13 +181,15 @@ class BatchMinimiser:
         self._alive = torch.ones(scenes, dtype=torch.bool, device=rest.device)
         self._left = torch.zeros(2, dtype=torch.int64, device=rest.device)
         self._unmoved = torch.full((), NO_MOTION, dtype=rest.dtype, device=rest.device)
-        self._narrows = rest.device.type == "cpu" and scenes >= _FEW
-        self._history = history or BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
+        self._history = BatchHistory(scenes, HISTORY, rest[0].numel(), rest)
         recorder = Recorder(rest.device)
-        improved = _improved(inverse, self._history)
+
+        def improved(r: Tensor, history: BatchHistory = self._history) -> Tensor:
+            return history.improved(r.flatten(1), inverse(r).flatten(1)).reshape(r.shape)
+
         self.linear_solver = BatchConjugateGradients(objective, improved, recorder)
         self._begin = recorder(self._set_up)
-        self._advance = recorder(self._next)
+        self._advance = recorder(self._iterate)
         self._judge = recorder(self._conclude)
 
     def run(self, start: Tensor, alive: Tensor, unmoved: float = NO_MOTION) -> None:
@@ -226,48 +198,14 @@ class BatchMinimiser:
         ``unmoved`` is the share of the tolerance within which a start is accepted as it is.
         """
         self._unmoved.fill_(unmoved)
-        self._start.copy_(start)
+        self.start.copy_(start)
         self._alive.copy_(alive)
         self._begin()
-        self._finish()
-
-    def _finish(self) -> None:
-        """Go on until no scene is left."""
-        while True:
-            running, waiting = self._left.tolist()
-            if not running and not waiting:
-                return
-            if self._few(running + waiting):
-                self._finish_narrowed()
-            elif running and not (waiting and self._few(running)):
+        while any(left := self._left.tolist()):
+            if left[0]:
                 self._advance()
             else:
                 self._estimate()
-
-    def _few(self, scenes: int) -> bool:
-        return self._narrows and _FEW * scenes <= len(self.phase)
-
-    def _finish_narrowed(self) -> None:
-        """The same in a batch of the scenes that are left."""
-        left = (self.phase == Phase.RUNNING) | (self.phase == Phase.WAITING)
-        rows = left.nonzero()[:, 0]
-        objective = self._objective.narrowed(rows)
-        inverse = self._inverse.narrowed(objective.cells, rows)
-        history = self._history.narrowed(rows)
-        part = BatchMinimiser(objective, inverse, self._tolerance[rows], self._most, history)
-        part._unmoved.copy_(self._unmoved)
-        for name in (*_OUTCOME, *_PROGRESS):
-            getattr(part, name).copy_(getattr(self, name)[rows])
-        part._look()
-        part._finish()
-        for name in _OUTCOME:
-            getattr(self, name)[rows] = getattr(part, name)
-        self._look()
-
-    @property
-    def start(self) -> Tensor:
-        """Where the last run began, (B, U, 3); the next one overwrites it."""
-        return self._start
 
     def forget(self, y: Tensor) -> None:
         """Precondition by the first Hessian at y alone, without the last step's pairs."""
@@ -277,9 +215,9 @@ class BatchMinimiser:
     # --- one iteration ------------------------------------------------------------------
 
     def _set_up(self) -> None:
-        self._inverse.turn(self._start)
-        value, gradient, scale = self._objective(self._start)
-        self.y.copy_(self._start)
+        self._inverse.turn(self.start)
+        value, gradient, scale = self._objective(self.start)
+        self.y.copy_(self.start)
         self.gradient.copy_(gradient)
         self._value.copy_(value)
         self._scale.copy_(scale)
@@ -304,10 +242,6 @@ class BatchMinimiser:
         self._left[0] = (self.phase == Phase.RUNNING).sum()
         self._left[1] = (self.phase == Phase.WAITING).sum()
 
-    def _next(self) -> None:
-        self._iterate()
-        self._look()
-
     def _iterate(self) -> None:
         running = self.phase == Phase.RUNNING
         step, trial = _trial(self.y, self._d, self._step, running)
@@ -330,6 +264,7 @@ class BatchMinimiser:
         self.iterations.add_(moved)
         spent = (self.phase == Phase.RUNNING) & (self.iterations >= self._most)
         self.phase.copy_(torch.where(spent, int(Phase.LIMIT), self.phase))
+        self._look()
 
     def _backtrack(self, failed: Tensor, fall: Tensor) -> None:
         """A shorter step; after many, another start along -G^-1 g, and then the end."""
@@ -402,3 +337,54 @@ def _accept(moved: Tensor, known: Sequence[Tensor], found: Sequence[Tensor]) -> 
     """Put what was found, (B, U, 3) each, in the place of what was known, where moved (B,)."""
     for old, new in zip(known, found, strict=True):
         old.copy_(torch.where(by_scene(moved), new, old))
+
+
+# --- loads that follow the body ------------------------------------------------------------------
+
+
+def settle(
+    minimiser: BatchMinimiser, alive: Tensor, follow: Callable[[Tensor], None]
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Go on from a minimum with the loads as they are there, scene by scene, until both agree.
+
+    ``follow`` samples the loads at configurations (B, U, 3), ``alive`` (B,) are the scenes that
+    take part.  Returns the minimiser's y, phase, iterations, evaluations and estimate, of all runs
+    together.
+    """
+    m = minimiser
+    start = m.start
+    y, phase, estimate = m.y.clone(), m.phase.clone(), m.estimate.clone()
+    iterations, evaluations = m.iterations.clone(), m.evaluations.clone()
+    mixed = Mixing(len(y))
+    for _ in range(MOST):
+        going = alive & (phase == Phase.CONVERGED)
+        if not bool(going.any()):
+            break
+        start = mixed(start, y, going)
+        follow(start)
+        m.run(start, going, unmoved=1.0)
+        here = going[:, None, None]
+        y = torch.where(here, m.y, y)
+        phase = torch.where(going, m.phase, phase)
+        estimate = torch.where(going, m.estimate, estimate)
+        iterations, evaluations = iterations + m.iterations * going, evaluations + m.evaluations
+        settled = going & (m.phase == Phase.CONVERGED) & (m.iterations == 0)
+        alive = alive & ~settled
+    else:
+        phase = torch.where(alive & (phase == Phase.CONVERGED), int(Phase.LIMIT), phase)
+    return y, phase, iterations, evaluations, estimate
+
+
+class Mixing:
+    """`Anderson`'s acceleration of each scene, on the CPU as the loads are."""
+
+    def __init__(self, scenes: int) -> None:
+        self._scenes = [Anderson() for _ in range(scenes)]
+
+    def __call__(self, y: Tensor, image: Tensor, which: Tensor) -> Tensor:
+        """The next iterates of the scenes where ``which`` (B,) holds; others stay at ``y``."""
+        before, after = (x.detach().to("cpu", torch.float64).numpy() for x in (y, image))
+        out = before.copy()
+        for i in which.nonzero()[:, 0].tolist():
+            out[i] = self._scenes[i](before[i].ravel(), after[i].ravel()).reshape(out[i].shape)
+        return torch.as_tensor(out, dtype=y.dtype, device=y.device)

@@ -1,9 +1,11 @@
 """A V-cycle of geometric multigrid for the rest Hessian on refined meshes.
 
-The levels are the meshes that the body's own one was refined from (`levels`).  On each but
-the coarsest, rough errors are damped before and after the coarse correction by the same
-Chebyshev polynomial (`grid`); the coarsest matrix, of the scene's own coarse mesh, has a dense
-inverse.  So the cycle B is symmetric, and positive definite since the polynomial's bound of
+The levels are the meshes that the body's own one was refined from: nested, and so are their
+trilinear functions.  A coarse cell's matrix is the sum over its children of W^T A W with W the
+weights of a child's corners on the cell's (Galerkin's coarse matrix, cell by cell).  On each level
+but the coarsest, rough errors are damped before and after the coarse correction by the same
+Chebyshev polynomial; the coarsest matrix, of the scene's own coarse mesh, has a dense inverse.
+  So the cycle B is symmetric, and positive definite since the polynomial's bound of
 the eigenvalues is never too small; where the clamps are those of the coarse mesh too, no
 eigenvalue of B A is above 1.
 """
@@ -11,20 +13,139 @@ eigenvalue of B A is above 1.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import padded
-from pdcorrect.batch.elimination import DenseInverse, cellwise, summed_blocks
+from pdcorrect.batch.cells import of_all, padded, places, table_rows
+from pdcorrect.batch.elimination import DenseInverse, Sharing, cellwise, summed_blocks
 from pdcorrect.batch.gpu import one_kernel, rows_of, sums
-from pdcorrect.batch.mesh_levels import Level, Numbers, hierarchy, places, table
-from pdcorrect.batch.shared_matrices import Sharing, of_all, of_some, with_rows
+from pdcorrect.fem.mesh import VTK_CORNERS
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A mesh and a matrix on it: of its cells, and a multiple of the identity at each node.
+
+    Attributes
+    ----------
+    cells : (C, 8) int
+    free : (N, 3) bool
+    blocks : (C or 1, 24, 24)
+        Of the cells; one stands for all.
+    nodal : (N,)
+        Added to the diagonal of each node.
+    interpolation : (N, M) sparse or None
+        From the nodes of the next coarser level; None on the coarsest.
+    """
+
+    cells: Numbers
+    free: NDArray[np.bool_]
+    blocks: Array
+    nodal: Array
+    interpolation: sp.csr_matrix | None
+
+
+def factors_of(refine: int) -> list[int]:
+    """How many parts an edge is cut into from level to level, finest first: prime factors."""
+    out, factor = [], 2
+    while refine > 1:
+        if refine % factor:
+            factor += 1
+            continue
+        out.append(factor)
+        refine //= factor
+    return out
+
+
+def hierarchy(
+    cells: Numbers, free: NDArray[np.bool_], blocks: Array, nodal: Array, refine: int
+) -> list[Level]:
+    """The levels of a mesh whose cells are cut into ``refine ** 3``, from the finest's arrays."""
+    out = []
+    for q in factors_of(refine):
+        parents, families, kept = _parents(cells, refine, q)
+        P = _interpolation(cells, parents, families, q, len(free))
+        out.append(Level(cells, free, blocks, nodal, P))
+        blocks = coarse_blocks(blocks, families, q)
+        cells, free, nodal, refine = parents, free[kept], P.T @ nodal, refine // q
+    return [*out, Level(cells, free, blocks, nodal, None)]
+
+
+def coarse_blocks(blocks: Array, families: Numbers, q: int) -> Array:
+    """Galerkin's blocks of cells whose children are ``families`` (P, q^3)."""
+    weights = np.kron(corner_weights(q), np.eye(3))  # (q^3, 24, 24)
+    if len(blocks) == 1:
+        children = blocks[np.zeros((1, q**3), dtype=np.int64)]
+    else:
+        children = blocks[families]
+    out = np.zeros((len(children), 24, 24))
+    for i, W in enumerate(weights):
+        out += W.T @ children[:, i] @ W
+    return out
+
+
+def corner_weights(q: int) -> Array:
+    """Of the corners of a cell's q^3 children on the cell's, (q^3, 8, 8)."""
+    places = _offsets(q)[:, None, :] + VTK_CORNERS  # (q^3, 8, 3)
+    far = places[:, :, None, :] / q
+    return np.asarray(np.where(VTK_CORNERS == 1, far, 1.0 - far).prod(axis=-1))
+
+
+def _offsets(q: int) -> Numbers:
+    return np.stack(np.meshgrid(*[np.arange(q)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _parents(cells: Numbers, k: int, q: int) -> tuple[Numbers, Numbers, Numbers]:
+    """Cells (P, 8) of q^3 of a mesh's cells each, those (P, q^3), and the nodes that are kept."""
+    p = k // q
+    places = np.arange(k**3).reshape(p, q, p, q, p, q).transpose(0, 2, 4, 1, 3, 5)
+    begins = k**3 * np.arange(len(cells) // k**3)
+    families = (begins[:, None] + places.reshape(1, -1)).reshape(-1, q**3)
+    corner = np.ravel_multi_index(tuple((q - 1) * VTK_CORNERS.T), (q, q, q))
+    corners = cells[families[:, corner], np.arange(8)]
+    kept, numbers = np.unique(corners, return_inverse=True)
+    return numbers.reshape(-1, 8).astype(np.int64), families, kept
+
+
+def _interpolation(
+    cells: Numbers, parents: Numbers, families: Numbers, q: int, count: int
+) -> sp.csr_matrix:
+    """Trilinear, from the nodes of ``parents`` to all nodes, (N, M)."""
+    nodes = cells[families]  # (P, q^3, 8)
+    numbers, weights = np.empty((count, 8), dtype=np.int64), np.empty((count, 8))
+    numbers[nodes] = parents[:, None, None, :]
+    weights[nodes] = corner_weights(q)
+    row, place = np.nonzero(weights)
+    entries = (weights[row, place], (row, numbers[row, place]))
+    return sp.csr_matrix(entries, shape=(count, int(parents.max()) + 1))
+
+
+# --- as tables, which torch reads ----------------------------------------------------------------
+
+
+def table(P: sp.csr_matrix | None, transposed: bool) -> tuple[Numbers, Array]:
+    """Columns and weights of the rows of P, or of P^T, filled up with zeros."""
+    assert P is not None
+    matrix = sp.coo_matrix(P.T if transposed else P)
+    order = np.argsort(matrix.row, kind="stable")
+    rows, columns = matrix.row[order], matrix.col[order].astype(np.int64)
+    numbers, places = table_rows(rows, columns, matrix.shape[0], 0)
+    weights = np.zeros(numbers.shape)
+    weights[rows, places] = matrix.data[order]
+    return numbers, weights
+
+
+# --- the cycle -------
+
 DEGREE = 3
 """Of the Chebyshev polynomial in D^-1 A times D^-1: products with D^-1 in one smoothing."""
 
@@ -33,21 +154,10 @@ SMOOTHED = 16.0
 
 
 class Grid:
-    """A level; nodal fields are (B, N, 3), padded.
+    """A level of the distinct problems; nodal fields are (B, N, 3), padded.
 
-    Parameters
-    ----------
-    levels : sequence of Level
-        Of the distinct problems.
-    coarse : int
-        Nodes of the largest next coarser level.
-    sharing, storage, device
-        See `BatchMultigrid`.
-
-    Attributes
-    ----------
-    regular : list of bool
-        Whether each distinct problem has a smoother.
+    ``coarse`` are the nodes of the largest next coarser level.  ``regular`` says of each distinct
+    problem whether it has a smoother.
     """
 
     def __init__(
@@ -59,7 +169,7 @@ class Grid:
         device: torch.device,
     ) -> None:
         self._sharing = sharing
-        self._factors = torch.tensor(chebyshev(DEGREE, SMOOTHED), dtype=storage, device=device)
+        self._factors = torch.tensor(_chebyshev(), dtype=storage, device=device)
         owners = torch.as_tensor(sharing.owners, device=device)
         nodes = max(len(level.free) for level in levels)
         count = max(len(level.cells) for level in levels)
@@ -93,26 +203,6 @@ class Grid:
         self.regular = [bool(inverse.any()) for inverse in inverses]
         self._inverse = real(inverses, nodes, 3, 3)[owners]
         self._up, self._down = weighted(False, nodes, coarse), weighted(True, coarse, nodes)
-
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> Grid:
-        """Of some scenes, with the matrices that they have."""
-        scenes, nodes, _ = self._free.shape
-        values, coarse = self._cells.numel() // scenes, len(self._down[0]) // scenes
-
-        def numbers(table: Tensor, size: int) -> Tensor:
-            return of_some(table, size, scenes, rows)
-
-        def weights(table: Tensor) -> Tensor:
-            return table.reshape(scenes, -1, table.shape[-1])[rows].flatten(0, 1)
-
-        return with_rows(
-            self, rows, "_nodal", "_free", "_inverse", _sharing=sharing,
-            _cells=numbers(self._cells, nodes),
-            _slots=numbers(self._slots, values),
-            _blocks=self._blocks[rows if self._alike else kept],
-            _up=(numbers(self._up[0], coarse), weights(self._up[1])),
-            _down=(numbers(self._down[0], nodes), weights(self._down[1])),
-        )  # fmt: skip
 
     def residual(self, b: Tensor, x: Tensor) -> Tensor:
         """B - A x; of no meaning where clamped."""
@@ -171,14 +261,14 @@ def _weighted(values: Tensor, numbers: Tensor, weights: Tensor) -> Tensor:
     return total
 
 
-def chebyshev(degree: int, smoothed: float) -> list[tuple[float, float]]:
-    """Factors of the last step and of D^-1 r in each step, for eigenvalues from 1/smoothed to 1.
+def _chebyshev() -> list[tuple[float, float]]:
+    """Factors of the last step and of D^-1 r in each step, for eigenvalues from 1/SMOOTHED to 1.
 
     Saad, Iterative methods for sparse linear systems (2003), algorithm 12.1.
     """
-    middle, half = (1.0 + 1.0 / smoothed) / 2.0, (1.0 - 1.0 / smoothed) / 2.0
+    middle, half = (1.0 + 1.0 / SMOOTHED) / 2.0, (1.0 - 1.0 / SMOOTHED) / 2.0
     out, ratio = [(0.0, 1.0 / middle)], half / middle
-    for _ in range(degree - 1):
+    for _ in range(DEGREE - 1):
         before, ratio = ratio, 1.0 / (2.0 * middle / half - ratio)
         out.append((ratio * before, 2.0 * ratio / half))
     return out
@@ -235,23 +325,10 @@ _ROUNDING = 1e-9
 class BatchMultigrid:
     """R -> B r on nodal fields (B, N, 3), zero where clamped; B is about A^-1.
 
-    Parameters
-    ----------
-    sharing : Sharing
-        Which scenes have one matrix.
-    blocks : sequence of (C or 1, 24, 24)
-        Stiffness of each distinct problem's cells, N/m; one stands for all.
-    mass_factor : float
-        1/s2.
-    storage : torch.dtype
-        Of all that is stored and computed here.
-    device : torch.device
-
-    Attributes
-    ----------
-    regular : list of bool
-        Whether each distinct problem's coarsest matrix is positive definite, and the nodes'
-        blocks on the other levels.
+    ``blocks`` (C or 1, 24, 24) are the stiffness of each distinct problem's cells, N/m, one for
+    all; the mass's factor is in 1/s2, and all is stored and computed in ``storage``.  ``regular``
+    says of each distinct problem whether its coarsest matrix is positive definite, and the nodes'
+    blocks on the other levels.
     """
 
     def __init__(
@@ -279,13 +356,6 @@ class BatchMultigrid:
             and all(grid.regular[i] for grid in self._grids)
             for i, level in enumerate(coarsest)
         ]
-
-    def narrowed(self, sharing: Sharing, kept: Tensor, rows: Tensor) -> BatchMultigrid:
-        """Of some scenes, with the matrices that they have."""
-        return with_rows(
-            self, rows, _coarsest=self._coarsest.narrowed(sharing, kept, rows),
-            _grids=[grid.narrowed(sharing, kept, rows) for grid in self._grids],
-        )  # fmt: skip
 
     def __call__(self, r: Tensor) -> Tensor:
         return self._cycle(0, r.to(self._storage)).to(r.dtype)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,20 +13,14 @@ from torch import Tensor
 from pdcorrect.batch import viscosity
 from pdcorrect.batch.cells import CellBatch, padded
 from pdcorrect.batch.gpu import one_kernel, small_products
-from pdcorrect.batch.points import Tangent
-from pdcorrect.batch.shared_matrices import with_rows
+from pdcorrect.batch.modes import relaxed
 from pdcorrect.scene import Damping
 
 
 class BatchMass:
     """M x for nodal fields (B, U, 3), kg, after `set_density`; internal modes have no mass.
 
-    Attributes
-    ----------
-    nodal : (B, U)
-        Row sums, kg.
-    density : (B, C)
-        kg/m3.
+    ``nodal`` (B, U), kg, are the row sums, ``density`` (B, C) is in kg/m3.
     """
 
     def __init__(self, cells: CellBatch) -> None:
@@ -40,10 +34,6 @@ class BatchMass:
         self._diagonal = all(p.mass_is_diagonal for p in distinct)
         self.density = cells.rest.new_zeros(n.scenes, n.cells)
         self.nodal = cells.rest.new_zeros(n.scenes, n.unknowns)
-
-    def narrowed(self, cells: CellBatch, rows: Tensor) -> BatchMass:
-        """Of some scenes, with their cells."""
-        return with_rows(self, rows, "_blocks", "_plain", "density", "nodal", _cells=cells)
 
     def write(self, masses: Sequence[NDArray[np.float64]]) -> None:
         """Add what learned elements add in each scene, (C, K, K) at density 1, from now on."""
@@ -78,15 +68,129 @@ class BatchMass:
         return small_products(self._blocks, self._cells.local(x))
 
 
-class Tangents(NamedTuple):
-    """Of the elastic energy and of viscosity, if there is any, at the same configurations.
+class Rayleigh:
+    """`pdcorrect.solvers.damping.Rayleigh` for B scenes.
 
-    The last is that of a learned element's viscosity.
+    Attributes
+    ----------
+    origin : (B, U, 3)
+        m.
+    tangent : tuple of Tensor
+        Where damping by stiffness is taken; none without it.
     """
 
-    elastic: Tangent
-    viscous: tuple[Tensor, ...] | None
-    written: Tensor | None = None
+    def __init__(self, cells: CellBatch, mass: BatchMass, factors: Tensor, stiff: bool) -> None:
+        self._cells, self._mass, self._factors = cells, mass, factors
+        self.origin = torch.zeros_like(cells.rest)
+        self.tangent: tuple[Tensor, ...] = ()
+        if stiff:
+            with torch.no_grad():  # or kernels are compiled for work with derivatives too
+                like = cells.linearise(cells.rest, project=True)
+            self.tangent = tuple(map(torch.zeros_like, like))
+
+    def prepare(self, origin: Tensor, foreseen: Tensor) -> None:
+        """Take these positions (B, N, 3) of a step, see `Scheme`, from now on."""
+        if not self.tangent:
+            self.origin[:, : origin.shape[1]] = origin
+            return
+        self.origin.copy_(relaxed(self._cells, origin))
+        tangent = self._cells.linearise(relaxed(self._cells, foreseen), project=True)
+        for kept, new in zip(self.tangent, tangent, strict=True):
+            kept.copy_(new)
+
+    def value_and_force(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """J (B,) and N (B, U, 3)."""
+        force = self.apply(None, y - self.origin)
+        return 0.5 * dot(y - self.origin, force), force
+
+    def linearise(self, y: Tensor) -> None:
+        """The second derivative does not depend on y."""
+
+    def apply(self, tangent: None, x: Tensor) -> Tensor:
+        """The second derivative times x."""
+        out = self._mass(x, self._factors[0])
+        if not self.tangent:
+            return out
+        return out + self._factors[1] * self._cells.apply(self.tangent, x)
+
+
+class Viscous:
+    """`pdcorrect.solvers.damping.Viscous` for B scenes.
+
+    Attributes
+    ----------
+    rate : Tensor
+        The strain rate's factor times the viscosity.
+    before : (6, B C, Q)
+        The stretches from which those at y are counted.
+    strains_before : (B, C, 18)
+        The same of a learned element's strains.
+    whole : (B, C, 1)
+        Where these do not fade at the step's start.
+    """
+
+    def __init__(self, cells: CellBatch, rate: Tensor) -> None:
+        self._cells, self.rate = cells, rate
+        self.before = cells.rest.new_zeros(6, *cells.volumes.shape[1:])
+        self.strains_before = cells.rest.new_zeros(cells.sizes.scenes, cells.sizes.cells, 18)
+        self.whole = torch.ones_like(self.strains_before[..., :1])
+
+    def prepare(self, strains: Sequence[tuple[float, Tensor]]) -> None:
+        """Count from these positions (B, N, 3), see `Scheme`, from now on."""
+        cells = self._cells
+        self.before.zero_()
+        for a, place in strains:
+            self.before.add_(viscosity.stretches(cells, relaxed(cells, place))[0], alpha=a)
+        if cells.correction is not None:
+            nodes = cells.rest[:, : cells.sizes.nodes]
+            local = [(a, cells.local(x - nodes)) for a, x in strains]
+            parts = [a * cells.correction.strains(u) for a, u in local]
+            self.strains_before.copy_(torch.stack(parts).sum(dim=0))
+            whole = [cells.correction.whole(u) for _, u in local]
+            self.whole.copy_(torch.stack(whole).all(dim=0))
+
+    def value_and_force(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """J (B,) and N (B, U, 3)."""
+        cells = self._cells
+        S, frames = viscosity.stretches(cells, y)
+        change = S - self.before
+        stress = viscosity.stress(change, self._weights)
+        energy = viscosity.energies(cells, change, stress)
+        forces = viscosity.forces(cells, frames, stress)
+        if cells.correction is None:
+            return energy, forces
+        more, by_cell = cells.correction.viscous(
+            cells.local(y - cells.rest), self.strains_before, self._learned_rate
+        )
+        return energy + more, forces + cells.of_corners(by_cell)
+
+    def linearise(self, y: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """What `apply` needs: of the element, and of what a learned one adds."""
+        cells, weights = self._cells, self._weights
+        S, frames = viscosity.stretches(cells, y)
+        tangent = (*frames, viscosity.stress(S - self.before, weights), weights)
+        if cells.correction is None:
+            return tangent, ()
+        return tangent, cells.correction.linearise_viscous(
+            cells.local(y - cells.rest), self.strains_before, self._learned_rate
+        )
+
+    def apply(self, tangent: tuple[tuple[Tensor, ...], tuple[Tensor, ...]], x: Tensor) -> Tensor:
+        """The second derivative times x."""
+        cells = self._cells
+        out = viscosity.apply(cells, tangent[0], x)
+        if cells.correction is None:
+            return out
+        by_cell = cells.correction.apply(tangent[1], cells.local(x), self._learned_rate)
+        return out + cells.of_corners(by_cell)
+
+    @property
+    def _learned_rate(self) -> Tensor:
+        return self.rate * self.whole
+
+    @property
+    def _weights(self) -> Tensor:
+        return self.rate * self._cells.point_weights
 
 
 class BatchObjective:
@@ -98,53 +202,27 @@ class BatchObjective:
     ----------
     factors : (4,)
         c and d alpha, 1/s2; d beta; the strain rate's factor times the viscosity.
-    damped, stiff, viscous : bool
-        Whether the last three are not zero, now and later.
+    rayleigh : Rayleigh or None
+    viscous : Viscous or None
     free : (B, U, 3)
         1 where a component may move.
-    target, origin, forces : (B, U, 3)
-        q, o (m) and the external forces (N).
-    tangent : Tangent or None
-        Where damping by stiffness is taken.
-    before : (6, B C, Q)
-        The stretches from which those of viscosity are counted.
-    strains_before : (B, C, 18)
-        The same of a learned element's strains.
+    target, forces : (B, U, 3)
+        q (m) and the external forces (N).
     """
 
     def __init__(self, cells: CellBatch, damping: Damping) -> None:
         self.cells = cells
         self.mass = BatchMass(cells)
         self.factors = cells.rest.new_zeros(4)
-        self.damped, self.stiff = damping.mass > 0.0, damping.stiffness > 0.0
-        self.viscous = damping.viscosity > 0.0
-        free = [np.where(p.free_unknowns, 1.0, 0.0) for p in cells.bodies.distinct]
-        self.free = cells.repeated_configurations(free)
-        self.target, self.origin, self.forces = (torch.zeros_like(cells.rest) for _ in range(3))
-        points = cells.volumes.shape[1:]
-        self.tangent: Tangent | None = None
-        if self.stiff:
-            in_cells = points[0], 1
-            self.tangent = tuple(
-                cells.rest.new_zeros(k, *(points if i < 3 else in_cells))
-                for i, k in enumerate(cells.tangent_sizes())
-            )
-        self.before = cells.rest.new_zeros(6 if self.viscous else 0, *points)
-        written = self.viscous and cells.correction is not None
-        n = cells.sizes
-        self.strains_before = cells.rest.new_zeros(n.scenes, n.cells if written else 0, 18)
-        self.whole = torch.ones_like(self.strains_before[..., :1])
-
-    def narrowed(self, rows: Tensor) -> BatchObjective:
-        """Of some scenes, as it is now."""
-        cells = self.cells.narrowed(rows)
-        mass = self.mass.narrowed(cells, rows)
-        names = ("free", "target", "origin", "forces", "strains_before", "whole")
-        return with_rows(
-            self, rows, *names, cells=cells, mass=mass,
-            tangent=self.tangent and tuple(self.cells.of_scenes(x, rows) for x in self.tangent),
-            before=self.cells.of_scenes(self.before, rows),
-        )  # fmt: skip
+        self.free = cells.free
+        self.target, self.forces = torch.zeros_like(cells.rest), torch.zeros_like(cells.rest)
+        self.rayleigh = self.viscous = None
+        if damping.mass or damping.stiffness:
+            stiff = damping.stiffness > 0.0
+            self.rayleigh = Rayleigh(cells, self.mass, self.factors[1:3], stiff)
+        if damping.viscosity:
+            self.viscous = Viscous(cells, self.factors[3])
+        self._damping = [term for term in (self.rayleigh, self.viscous) if term is not None]
 
     def __call__(self, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Gamma (B,), its gradient (B, U, 3), zero where clamped, and the size of its terms."""
@@ -156,72 +234,21 @@ class BatchObjective:
         )
         kinetic, work = by_node.sum(dim=-1)
         value, scale = energy + kinetic - work, energy + kinetic + work.abs()
-        if self.damped or self.stiff:
-            offset = y - self.origin
-            drag = self.rayleigh(offset)
-            loss = 0.5 * dot(offset, drag)
-            value, scale, gradient = value + loss, scale + loss, gradient + drag * self.free
-        if self.viscous:
-            loss, drag = self._viscous(y)
-            value, scale, gradient = value + loss, scale + loss, gradient + drag * self.free
+        for term in self._damping:
+            loss, force = term.value_and_force(y)
+            value, scale, gradient = value + loss, scale + loss, gradient + force * self.free
         return value, gradient, scale
 
-    def rayleigh(self, x: Tensor) -> Tensor:
-        """Rayleigh damping's second derivative times x (B, U, 3)."""
-        out = self.mass(x, self.factors[1]) if self.damped else torch.zeros_like(x)
-        if self.tangent is None:
-            return out
-        return out + self.factors[2] * self.cells.apply(self.tangent, x)
+    def linearise(self, y: Tensor) -> tuple[Any, ...]:
+        """What `hessian` needs at configurations, of each term."""
+        return self.cells.linearise(y), *(term.linearise(y) for term in self._damping)
 
-    def _viscous(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        S, frames = viscosity.stretches(self.cells, y)
-        change = S - self.before
-        stress = viscosity.stress(change, self._viscous_weights)
-        energy = viscosity.energies(self.cells, change, stress)
-        forces, cells = viscosity.forces(self.cells, frames, stress), self.cells
-        if cells.correction is None:
-            return energy, forces
-        more, by_cell = cells.correction.viscous(
-            cells.local(y - cells.rest), self.strains_before, self.written_rate
-        )
-        return energy + more, forces + cells.of_corners(by_cell)
-
-    @property
-    def written_rate(self) -> Tensor:
-        """Of what a learned element adds to viscosity, (B, C, 1)."""
-        return self.factors[3] * self.whole
-
-    @property
-    def _viscous_weights(self) -> Tensor:
-        return self.factors[3] * self.cells.point_weights
-
-    def linearise(self, y: Tensor) -> Tangents:
-        """What `hessian` needs at configurations."""
-        if not self.viscous:
-            return Tangents(self.cells.linearise(y), None)
-        S, frames = viscosity.stretches(self.cells, y)
-        weights = self._viscous_weights
-        viscous = (*frames, viscosity.stress(S - self.before, weights), weights)
-        written, cells = None, self.cells
-        if cells.correction is not None:
-            written = cells.correction.linearise_viscous(
-                cells.local(y - cells.rest), self.strains_before, self.written_rate
-            )
-        return Tangents(cells.linearise(y), viscous, written)
-
-    def hessian(self, tangents: Tangents, x: Tensor) -> Tensor:
+    def hessian(self, tangents: tuple[Any, ...], x: Tensor) -> Tensor:
         """H x on all components."""
-        out = self.cells.apply(tangents.elastic, x)
-        out = out + self.mass(x, self.factors[0] + self.factors[1])
-        if self.tangent is not None:
-            out = out + self.factors[2] * self.cells.apply(self.tangent, x)
-        if tangents.viscous is not None:
-            out = out + viscosity.apply(self.cells, tangents.viscous, x)
-        if tangents.written is not None and self.cells.correction is not None:
-            changes = self.cells.correction.apply(
-                tangents.written, self.cells.local(x), self.written_rate
-            )
-            out = out + self.cells.of_corners(changes)
+        elastic, *others = tangents
+        out = self.cells.apply(elastic, x) + self.mass(x, self.factors[0])
+        for term, tangent in zip(self._damping, others, strict=True):
+            out = out + term.apply(tangent, x)
         return out
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
+ProblemOf = Callable[[int], Problem]
 
 _WORTH_IT = (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
 
@@ -26,41 +28,24 @@ _WORTH_IT = (Status.ITERATION_LIMIT, Status.LINE_SEARCH)
 class SingleRetry:
     """Steps single scenes with `ProjectiveDynamics` and its fallbacks, on the CPU.
 
-    Parameters
-    ----------
-    cells : CellBatch
-    tolerances : sequence of float
-        The scenes', of their cell sizes.
-    time_step, integrator
-        Of the steps.
+    The ``options`` are those of `ProjectiveDynamics`.
     """
 
-    def __init__(
-        self,
-        cells: CellBatch,
-        tolerances: Sequence[float],
-        time_step: float,
-        integrator: str,
-    ) -> None:
-        self._cells, self._tolerances = cells, tolerances
-        self._time_step, self._integrator = time_step, integrator
+    def __init__(self, cells: CellBatch, tolerances: Sequence[float], **options: Any) -> None:
+        self._cells, self._tolerances, self._options = cells, tolerances, options
         self._steppers: dict[int, ProjectiveDynamics] = {}
 
     def __call__(
-        self,
-        before: BatchState,
-        forces: Tensor | None,
-        result: BatchResult,
-        problem_now: Callable[[int], Problem],
+        self, before: BatchState, forces: Tensor | None, result: BatchResult, now: ProblemOf
     ) -> None:
         """Write into the result the steps of those scenes that now converge.
 
-        ``problem_now`` gives the problem of a scene, by its number, as it is now.
+        ``now`` gives the problem of a scene, by its number, as it is now.
         """
         for i, status in enumerate(result.statuses):
             if status in _WORTH_IT:
                 state, push = state_of(self._cells, before, i), self._push(i, forces)
-                stepper = self._stepper(i, problem_now(i))
+                stepper = self._stepper(i, now(i))
                 try:
                     step = stepper(state, push)
                 except PdcorrectError:
@@ -74,11 +59,10 @@ class SingleRetry:
         result.error_estimates[i] = step.error_estimate
         result.iterations[i] += step.iterations
         result.smallest_volume_ratios[i] = step.stats["smallest_volume_ratio"]
-        nothing = np.zeros((0, 3))
-        every = [y if k == i else nothing for k in range(len(result.statuses))]
-        result.y[i] = self._cells.configurations(every)[i]
+        nodes = self._cells.node_counts[i]
         rows = [(after.positions, step.state.positions), (after.velocities, step.state.velocities)]
         rows += [(x, step.state.memory[name]) for name, x in after.memory.items()]
+        rows += [(result.y, y[:nodes]), (result.y[:, self._cells.sizes.nodes :], y[nodes:])]
         for x, array in rows:
             x[i, : len(array)] = self._cells.tensor(array)
 
@@ -90,12 +74,7 @@ class SingleRetry:
 
     def _stepper(self, i: int, problem: Problem) -> ProjectiveDynamics:
         if i not in self._steppers or self._steppers[i].problem is not problem:
-            self._steppers[i] = ProjectiveDynamics(
-                problem,
-                self._tolerances[i],
-                time_step=self._time_step,
-                integrator=self._integrator,
-            )
+            self._steppers[i] = ProjectiveDynamics(problem, self._tolerances[i], **self._options)
         return self._steppers[i]
 
 

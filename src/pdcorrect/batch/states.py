@@ -52,14 +52,7 @@ class BatchState:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The solutions of a step's equations, which its derivatives need.
-
-    Attributes
-    ----------
-    y : (B, U, 3) tensor
-        Configurations.
-    statuses : list of Status
-    """
+    """The solutions y (B, U, 3) of a step's equations, which its derivatives need."""
 
     y: Tensor
     statuses: list[Status]
@@ -71,8 +64,9 @@ class BatchResult(Solved):
 
     Attributes
     ----------
-    y, statuses
-        See `Solved`.
+    y : (B, U, 3) tensor
+        Configurations.
+    statuses : list of Status
     state : BatchState
     iterations, evaluations : (B,) int
     error_estimates : (B,)

@@ -28,23 +28,11 @@ from pdcorrect.solvers.schemes import Linear, Scheme, by_component
 
 @dataclass(frozen=True, eq=False)
 class BatchStepEquation:
-    """One step's equation and what it was made of.
+    """One step's equation and what it was made of, see `Scheme`.
 
-    Attributes
-    ----------
-    scheme : Scheme
-    known : dict
-        What the scheme's sums are of, see `Scheme`.
-    spans : sequence of (float, float)
-        Time intervals over which each scene's loads act, s.
-    target : (B, U, 3)
-        q, m; not changed later.
-    origin, start, foreseen : (B, N, 3)
-        See `Scheme`, m; the last two prescribed where clamped.
-    past_forces : (B, N, 3) or 0
-        See `Scheme`, N.
-    strains : list of (float, (B, N, 3))
-        See `Scheme`.
+    ``known`` is what the scheme's sums are of, ``spans`` are the time intervals (s) over which each
+    scene's loads act.  The target q (B, U, 3), m, is not changed later; other fields are nodal
+    (B, N, 3), start and foreseen with prescribed values where clamped.
     """
 
     scheme: Scheme
@@ -64,16 +52,7 @@ class BatchStepEquation:
 
 
 class BatchStaging:
-    """From states of B scenes to the equation of a step, and from its solution to states.
-
-    Parameters
-    ----------
-    cells : CellBatch
-    problems : sequence of Problem
-    integrate : Integrator
-    time_step : float
-        s.
-    """
+    """From states of B scenes to the equation of a step of so many s, and back to states."""
 
     def __init__(
         self, cells: CellBatch, problems: Sequence[Problem], integrate: Integrator, time_step: float
@@ -83,21 +62,17 @@ class BatchStaging:
         distinct, nodes = cells.bodies.distinct, cells.sizes.nodes
         self._moving = any(p.clamps.moving for p in distinct)
         self._clamped = cells.repeated([p.clamped_positions(0.0) for p in distinct], nodes, 3)
-        self.free = cells.repeated([p.free.astype(float) for p in distinct], nodes, 3) > 0.5
+        self.free = cells.free[:, :nodes] > 0.5
 
     def extended(self, nodal: Tensor) -> Tensor:
         """(B, N, 3) as configurations (B, U, 3)."""
-        n = self._cells.sizes
-        if not n.modes:
-            return nodal
-        return torch.cat([nodal, nodal.new_zeros(n.scenes, n.modes, 3)], dim=1)
+        modes = self._cells.sizes.modes
+        return torch.nn.functional.pad(nodal, (0, 0, 0, modes)) if modes else nodal
 
     def __call__(self, state: BatchState) -> BatchStepEquation:
         """The step from a state."""
-        scheme = self._scheme(state)
-        known = self._known(state)
+        scheme, known, h = self._scheme(state), self._known(state), self._h
         first, last = scheme.loads_over
-        h = self._h
         return BatchStepEquation(
             scheme,
             known,
@@ -168,16 +143,16 @@ class BatchStaging:
         return all(started)
 
     def _known(self, state: BatchState) -> dict[str, Any]:
-        known: dict[str, Any] = {
-            "positions": state.positions,
+        like = state.positions
+        times = torch.tensor(state.times, dtype=like.dtype).to(like.device, non_blocking=True)
+        return {
+            "positions": like,
             "velocities": state.velocities,
             "prescribed": self.prescribed([t + self._h for t in state.times]),
-            "time": torch.zeros_like(state.positions)
-            + by_scene(_on_device(state.times, state.positions)),
+            "time": torch.zeros_like(like) + by_scene(times),
             **state.memory,
             **self._clamp_rates(state.times),
         }
-        return known
 
     def _clamp_rates(self, times: Sequence[float]) -> dict[str, Any]:
         """See `integrators.clamp_rates`, (B, N, 3) each."""
@@ -185,9 +160,11 @@ class BatchStaging:
         if not self._moving:
             return clamp_rates(*pairs[0], self._h)
         rates = [clamp_rates(problem, t, self._h) for problem, t in pairs]
-        still = [np.zeros_like(problem.positions) for problem in self._problems]
+        shapes = [problem.positions.shape for problem in self._problems]
         return {
-            name: self._cells.nodal([a[name] + zero for a, zero in zip(rates, still, strict=True)])
+            name: self._cells.nodal(
+                [np.broadcast_to(a[name], shape) for a, shape in zip(rates, shapes, strict=True)]
+            )
             for name in rates[0]
         }
 
@@ -202,8 +179,3 @@ class BatchStaging:
         """A sum (B, N, 3) in memory of its own."""
         values: Tensor = by_component(torch, self.free, known, on_free, on_clamped)
         return values.clone() if any(values is other for other in known.values()) else values
-
-
-def _on_device(numbers: Sequence[float], like: Tensor) -> Tensor:
-    """Numbers (B,) in another tensor's type, on its device, which is not waited for."""
-    return torch.tensor(numbers, dtype=like.dtype).to(like.device, non_blocking=True)

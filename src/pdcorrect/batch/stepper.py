@@ -19,7 +19,6 @@ from pdcorrect.batch.checks import (
     by_cell,
     check_material,
     check_nodal,
-    check_precision,
     check_problems,
     check_state,
     check_states,
@@ -27,18 +26,16 @@ from pdcorrect.batch.checks import (
     usable_device,
 )
 from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
-from pdcorrect.batch.follower import settle
 from pdcorrect.batch.gpu import one_thread
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.loads import BatchLoads
 from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
-from pdcorrect.batch.minimise import BatchMinimiser, Phase
-from pdcorrect.batch.modes import relaxed
+from pdcorrect.batch.minimise import BatchMinimiser, Phase, settle
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
 from pdcorrect.batch.states import BatchResult, BatchState, state_of, together
 from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
-from pdcorrect.batch.viscosity import stretches
+from pdcorrect.errors import InputError
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers import schemes
@@ -125,7 +122,8 @@ class BatchStepper:
     ) -> None:
         self.problems = check_problems(problems, time_step, integrator)
         for name, kind in (("dtype", dtype), ("storage", storage)):
-            check_precision(name, kind)
+            if kind not in (torch.float32, torch.float64):
+                raise InputError(f"{name} = {kind!r}: expected torch.float32 or torch.float64.")
         first = self.problems[0]
         time = first.scene.time
         self.tolerances = tuple(
@@ -153,7 +151,9 @@ class BatchStepper:
     def _forget(self) -> None:
         """Make what is not kept in copies of the stepper, or anew when it is first needed."""
         self._lock = threading.RLock()
-        self._one_by_one = SingleRetry(self.cells, self.tolerances, self.time_step, self.integrator)
+        self._one_by_one = SingleRetry(
+            self.cells, self.tolerances, time_step=self.time_step, integrator=self.integrator
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         left = ("_lock", "_minimiser", "_one_by_one")
@@ -188,9 +188,7 @@ class BatchStepper:
         return BatchState(positions, torch.zeros_like(positions), times)
 
     def states(
-        self,
-        batch: BatchState | tuple[Tensor, Tensor],
-        times: Sequence[float] | None = None,
+        self, batch: BatchState | tuple[Tensor, Tensor], times: Sequence[float] | None = None
     ) -> list[State]:
         """The scenes' states one by one, without padding.
 
@@ -289,20 +287,16 @@ class BatchStepper:
     def corrections(self, material: BatchMaterial | None = None) -> list[CellCorrection]:
         """What the scenes' learned elements add with a material, the present one by default."""
         material = self.present if material is None else material
-        weights = (
-            m.to("cpu", torch.float64).numpy() for m in (material.mu, material.volume_weight)
-        )
-        mu, omega = weights
-        out = []
-        for i, (problem, sound) in enumerate(
-            zip(self.problems, material.sound.tolist(), strict=True)
-        ):
-            correction, count = problem.correction, len(problem.cells)
-            assert correction is not None
-            if material is not self.own and sound and correction.writer is not None:
-                correction = correction.writer.correction(mu[i, :count], omega[i, :count])
-            out.append(correction)
-        return out
+        found = [p.correction for p in self.problems if p.correction is not None]
+        if material is self.own:
+            return found
+        weights = torch.stack([material.mu, material.volume_weight]).to("cpu", torch.float64)
+        mu, omega = weights.numpy()
+        for i, (correction, sound) in enumerate(zip(found, material.sound.tolist(), strict=True)):
+            count = len(correction.cells)
+            if sound and correction.writer is not None:
+                found[i] = correction.writer.correction(mu[i, :count], omega[i, :count])
+        return found
 
     def problem_now(self, i: int) -> Problem:
         """The problem of a scene with the material that it has now."""
@@ -382,12 +376,14 @@ class BatchStepper:
         stage, objective = self.staging(state), self.objective
         objective.factors.copy_(self.cells.tensor(np.array(self._factors(stage.scheme))))
         objective.target.copy_(stage.target)
-        self._damp(stage)
+        if objective.rayleigh is not None:
+            objective.rayleigh.prepare(stage.origin, stage.foreseen)
+        if objective.viscous is not None:
+            objective.viscous.prepare(stage.strains)
         self._push(stage, forces, stage.start if y is None else y[:, : self.cells.sizes.nodes])
         return stage
 
     def _factors(self, scheme: Scheme) -> tuple[float, float, float, float]:
-        """See `BatchObjective`."""
         damping = self.problems[0].scene.damping
         return (
             scheme.inertia,
@@ -412,27 +408,6 @@ class BatchStepper:
         moved = self.objective.mass(y - stage.target)
         out = stage.scheme.inertia * moved - self.objective.forces
         return out[:, : self.cells.sizes.nodes] * self.staging.free
-
-    def _damp(self, stage: BatchStepEquation) -> None:
-        objective, cells = self.objective, self.cells
-        if objective.tangent is not None:
-            tangent = cells.linearise(relaxed(cells, stage.foreseen), project=True)
-            for kept, new in zip(objective.tangent, tangent, strict=True):
-                kept.copy_(new)
-            objective.origin.copy_(relaxed(cells, stage.origin))
-        elif objective.damped:
-            objective.origin.copy_(self.staging.extended(stage.origin))
-        if objective.viscous:
-            objective.before.zero_()
-            for a, place in stage.strains:
-                objective.before.add_(stretches(cells, relaxed(cells, place))[0], alpha=a)
-            if cells.correction is not None:
-                nodes = cells.rest[:, : cells.sizes.nodes]
-                local = [(a, cells.local(x - nodes)) for a, x in stage.strains]
-                parts = [a * cells.correction.strains(u) for a, u in local]
-                objective.strains_before.copy_(torch.stack(parts).sum(dim=0))
-                whole = [cells.correction.whole(u) for _, u in local]
-                objective.whole.copy_(torch.stack(whole).all(dim=0))
 
     @cached_property
     def _minimiser(self) -> BatchMinimiser:

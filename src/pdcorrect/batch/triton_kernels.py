@@ -2,9 +2,10 @@
 
 `at_points` makes one kernel of all that a function does at a point: a thousand operations, and
 nothing but arithmetic.  `torch.compile` takes a minute and more to find out what may be fused;
-Triton compiles the same lines written out in a second or two.
+Triton compiles the same lines written out in a second or two (torch 2.11 on an H200; a fresh
+machine's first files: ``fresh_machine`` in ``benchmarks/results/nvidia-h200.json``).
 
-`tall_product` multiplies matrices by one to four columns, in which the libraries' products reach
+`skinny_product` multiplies matrices by one to four columns, in which the libraries' products reach
 half of a GPU's memory bandwidth.
 """
 
@@ -13,57 +14,38 @@ from __future__ import annotations
 import itertools
 import linecache
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import cache, partial
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from pdcorrect.errors import MissingExtraError
 
-Number = int | float
 PointFunction = Callable[..., Sequence[Sequence[Any]]]
 """Lists of components, one for each argument, to lists of components."""
 
 
-@dataclass(frozen=True, slots=True)
-class Operation:
-    """One line of a program.
-
-    Attributes
-    ----------
-    name : str
-        "constant", "+", "<", "where", ...; see `pdcorrect.batch.triton_kernels`.
-    operands : tuple
-        Numbers of earlier lines; of a constant its value.
-    """
+class Operation(NamedTuple):
+    """One line of a program: "constant" with its value, or "+", "where", ... of earlier lines."""
 
     name: str
     operands: tuple[Any, ...]
 
 
-@dataclass(eq=False)
 class Program:
-    """Operations, each written once.
+    """Operations on numbers of one type, each written once.
 
-    Attributes
-    ----------
-    dtype : torch.dtype
-        Of all numbers.
-    inputs : list of list of int
-        Lines that stand for the components of each argument.
-    outputs : list of list of int
-        Lines that are the components of each result.
-    lines : list of Operation
+    ``inputs`` and ``outputs`` are the lines of each argument's and result's components.
     """
 
-    dtype: torch.dtype
-    inputs: list[list[int]] = field(default_factory=list)
-    outputs: list[list[int]] = field(default_factory=list)
-    lines: list[Operation] = field(default_factory=list)
-    _known: dict[tuple[Any, ...], int] = field(default_factory=dict)
+    def __init__(self, dtype: torch.dtype) -> None:
+        self.dtype = dtype
+        self.inputs: list[list[int]] = []
+        self.outputs: list[list[int]] = []
+        self.lines: list[Operation] = []
+        self._known: dict[tuple[Any, ...], int] = {}
 
     @classmethod
     def of(cls, function: PointFunction, sizes: Sequence[int], dtype: torch.dtype) -> Program:
@@ -75,22 +57,21 @@ class Program:
             If it does to them what no kernel can, or decides by their values.
         """
         program = cls(dtype)
-        arguments = []
-        for number, size in enumerate(sizes):
-            components = [program.add("input", number, i) for i in range(size)]
-            program.inputs.append([value.line for value in components])
-            arguments.append(components)
+        arguments = [
+            [program.add("input", number, i) for i in range(size)]
+            for number, size in enumerate(sizes)
+        ]
+        program.inputs = [[value.line for value in components] for components in arguments]
         for result in function(*arguments):
             program.outputs.append([program.value(x).line for x in result])
         return program
 
     def add(self, name: str, *operands: Any) -> Value:
         """The result of an operation."""
-        operation = Operation(name, operands)
         key = (name, *((type(x), repr(x)) for x in operands))
         if key not in self._known:
             self._known[key] = len(self.lines)
-            self.lines.append(operation)
+            self.lines.append(Operation(name, operands))
         return Value(self, self._known[key])
 
     def value(self, x: Any) -> Value:
@@ -162,17 +143,13 @@ class Value:
     __hash__ = object.__hash__
 
 
-def _clamp(x: Value, *, min: Number) -> Value:
-    return _do("maximum", x, min)
-
-
 _FUNCTIONS: dict[Any, Callable[..., Value]] = {
     torch.where: lambda condition, x, y: _do("where", condition, x, y),
     torch.sqrt: lambda x: _do("sqrt", x),
     torch.rsqrt: lambda x: _do("rsqrt", x),
     torch.maximum: lambda x, y: _do("maximum", x, y),
     torch.minimum: lambda x, y: _do("minimum", x, y),
-    torch.clamp: _clamp,
+    torch.clamp: lambda x, *, min: _do("maximum", x, min),
     torch.zeros_like: lambda x: x.program.value(0.0),
     torch.ones_like: lambda x: x.program.value(1.0),
 }
@@ -197,21 +174,11 @@ _ROOTS = {torch.float64: "tl.sqrt({})", torch.float32: "tl.sqrt_rn({})"}
 _files = itertools.count()
 
 
-def at_points(
-    function: PointFunction,
-    inputs: Sequence[Tensor],
-    outputs: Sequence[Tensor],
-) -> None:
+def at_points(function: PointFunction, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
     """Fill ``outputs`` with the function of ``inputs`` at every point, on a GPU.
 
-    Parameters
-    ----------
-    function : callable
-        Of lists of components.  Its kernel is found again by its identity: pass the same object
-        each time.
-    inputs, outputs : sequence of tensor
-        Each (k, C, Q) for k components at Q points of C cells, of one type, anywhere in memory;
-        k may differ.
+    All tensors are (k, C, Q) for k components at Q points of C cells, anywhere in memory.  The
+    function's kernel is found again by its identity: pass the same object each time.
 
     Raises
     ------
@@ -238,13 +205,14 @@ def at_points(
 def _kernel(function: PointFunction, sizes: tuple[int, ...], dtype: torch.dtype) -> Any:
     try:
         import triton
+        from triton import language
     except ImportError as error:
         raise MissingExtraError(
             f"triton is needed on a GPU and could not be imported ({error}): expected a PyTorch "
             "for CUDA on Linux, which brings it."
         ) from error
     program, name = Program.of(function, sizes, dtype), _name(function)
-    plain = as_function(kernel_source(program, name), name)
+    plain = as_function(kernel_source(program, name), name, language)
     names = plain.__code__.co_varnames[: plain.__code__.co_argcount]
     return triton.jit(plain, do_not_specialize=[n for n in names if n != "BLOCK"])
 
@@ -259,9 +227,8 @@ def _name(function: PointFunction) -> str:
 
 def kernel_source(program: Program, name: str) -> str:
     """A Triton kernel in Python: tensors, their strides, how many points, and points of a cell."""
-    tensors = [f"x{i}" for i in range(len(program.inputs))]
-    results = [f"y{i}" for i in range(len(program.outputs))]
-    every = [*tensors, *results]
+    every = [f"x{i}" for i in range(len(program.inputs))]
+    every += [f"y{i}" for i in range(len(program.outputs))]
     strides = [f"{x}_{axis}" for x in every for axis in ("component", "cell", "point")]
     lines = [
         f"def {name}({', '.join([*every, *strides, 'count', 'points', 'BLOCK: tl.constexpr'])}):",
@@ -294,15 +261,11 @@ def _place(tensor: str, component: int) -> str:
     return f"{tensor} + {component} * {tensor}_component.to(tl.int64)"
 
 
-def as_function(text: str, name: str, language: Any = None) -> Callable[..., None]:
-    """The function of this name that a source defines, with ``triton.language`` or another.
+def as_function(text: str, name: str, language: Any) -> Callable[..., None]:
+    """The function of this name that a source defines, with ``triton.language`` as tl.
 
     Triton compiles what `inspect.getsource` finds, which looks where the lines are left here.
     """
-    if language is None:
-        from triton import language as triton_language
-
-        language = triton_language
     file = f"<pdcorrect {name} {next(_files)}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     space: dict[str, Any] = {"tl": language, "__name__": __name__}
@@ -315,7 +278,7 @@ _MOST_COLUMNS = 4
 _ROWS, _COLUMNS, _WARPS = 8, 256, 4
 
 
-def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
+def skinny_product(matrices: Tensor, columns: Tensor) -> Tensor:
     """(K, n, n) @ (K, n, m) -> (K, n, m)."""
     count, size, _ = matrices.shape
     few = columns.shape[2] <= _MOST_COLUMNS
@@ -326,7 +289,7 @@ def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
     columns = columns.contiguous()
     out = torch.empty_like(columns)
     grid = (triton.cdiv(size, _ROWS), count)
-    _tall_kernel()[grid](
+    _skinny_kernel()[grid](
         matrices, columns, out, size, M=columns.shape[2], ROWS=_ROWS, COLUMNS=_COLUMNS,
         num_warps=_WARPS,
     )  # fmt: skip
@@ -334,7 +297,7 @@ def tall_product(matrices: Tensor, columns: Tensor) -> Tensor:
 
 
 @cache
-def _tall_kernel() -> Any:
+def _skinny_kernel() -> Any:
     import triton
     import triton.language as tl
 
