@@ -211,8 +211,8 @@ class OneStepBatches:
     def __init__(self, windows: StepWindows, stage: Stage, seed: int, world: ProcessGroup) -> None:
         self._windows, self._stage, self._seed = windows, stage, (seed, world.rank)
         self._shuffle = TrajectoryLoader(
-            windows.dataset, stage.batch, seed=seed, block=len(windows.dataset.headers), rank=world.rank,
-            world_size=world.size,
+            windows.dataset, stage.batch, seed=seed, block=len(windows.dataset.headers),
+            rank=world.rank, world_size=world.size,
         )  # fmt: skip
         self._order = self._shuffle.order()
         self._generator = torch.Generator(windows.device)
