@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -57,13 +57,7 @@ class Strict(BaseModel):
 
 
 class Checked(Strict):
-    """Settings whose constructor answers wrong values with the package's own error.
-
-    Raises
-    ------
-    InputError
-        As the class's ``error``, naming each wrong key, its value and what was expected.
-    """
+    """Settings whose constructor answers wrong values with the package's own ``error``."""
 
     source: ClassVar[str] = "configuration"
     error: ClassVar[type[InputError]] = InputError
@@ -80,13 +74,7 @@ class TomlConfig(Checked):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read settings from a TOML file.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, is not TOML, or a key is wrong.
-        """
+        """Read settings from a TOML file; the class's ``error`` says what is wrong with it."""
         if not isinstance(path, (str, Path)) or not str(path).strip() or "\n" in str(path):
             raise cls.error(f"path is {_shown(path)}: expected the path of a TOML file.")
         try:
@@ -120,14 +108,7 @@ class TomlConfig(Checked):
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Read TOML.
-
-    Raises
-    ------
-    ValueError
-        If it is not TOML, nested so deeply that reading it overflows the stack, or holds
-        integers so long that Python does not write them out.
-    """
+    """Read TOML; `ValueError` also where Python could not show or nest what it holds."""
     try:
         data = tomllib.loads(text)
     except RecursionError:
@@ -174,8 +155,13 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
     return " ".join(" ".join(sentences).split())
 
 
-_Table = tuple[str, str, frozenset[str]]
-"""Header as in TOML ("" for the top), what chooses it of several kinds, and its keys."""
+class _Table(NamedTuple):
+    """Its dotted place, how a message names it ("" for the top), whether a key chooses its kind."""
+
+    place: str
+    name: str
+    tagged: bool
+    keys: frozenset[str]
 
 
 def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
@@ -183,7 +169,7 @@ def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
     context = item.get("ctx", {})
     key = _key(location, tables, kind == "extra_forbidden")
     if kind == "extra_forbidden":
-        return f"{key}: unknown key; {_advice(location, key, tables)}"
+        return f"{key}: unknown key; {_advice(key, tables)}"
     if kind in ("union_tag_not_found", "union_tag_invalid"):  # wrong is the key that chooses
         chooses = str(context["discriminator"]).strip("'")
         key, value = f"{key}.{chooses}", value.get(chooses) if isinstance(value, dict) else value
@@ -199,18 +185,18 @@ def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
 
 def _key(location: tuple[int | str, ...], tables: Sequence[_Table], unknown: bool) -> str:
     """A key as the user wrote it, ``loads[0].force``: pydantic also names union members."""
-    known = frozenset().union(*(keys for _, _, keys in tables))
-    tagged = {header.strip("[]") for header, choice, _ in tables if choice}
-    text, names, tag_is_next = "", "", False
-    for place, part in enumerate(location, 1):
+    known = frozenset().union(*(table.keys for table in tables))
+    tagged = {table.place for table in tables if table.tagged}
+    text, place, tag_is_next = "", "", False
+    for number, part in enumerate(location, 1):
         if isinstance(part, int):
             text += f"[{part}]"
         elif tag_is_next:
             tag_is_next = False
-        elif part in known or (unknown and place == len(location)):
+        elif part in known or (unknown and number == len(location)):
             text += f".{part}"
-            names = f"{names}.{part}".lstrip(".")
-            tag_is_next = names in tagged
+            place = f"{place}.{part}".lstrip(".")
+            tag_is_next = place in tagged
     return _cut(text.lstrip("."))
 
 
@@ -228,29 +214,21 @@ def _listed(names: Iterable[str]) -> str:
     return _cut(", ".join(names))
 
 
-def _advice(location: tuple[int | str, ...], key: str, tables: Sequence[_Table]) -> str:
-    """What an unknown key was probably meant for."""
-    name = str(location[-1])
-    own = ".".join(part.partition("[")[0] for part in key.split(".")[:-1])
-    here = [table for table in tables if table[0].strip("[]") == own]
-    homes = [table for table in tables if name in table[2]]
-    kinds = dict.fromkeys(choice for _, choice, keys in here if choice and name in keys)
-    if kinds:
-        return f"it goes with {' or '.join(kinds)}."
-    near = [table for table in homes if own and table[0].strip("[]").startswith(f"{own}.")]
+def _advice(key: str, tables: Sequence[_Table]) -> str:
+    """Where an unknown key belongs, or which one was probably meant."""
+    *above, name = key.split(".")
+    homes = [table.name or "the top" for table in tables if name in table.keys]
     if homes:
-        headers = dict.fromkeys(header or "the top" for header, _, _ in near or homes)
-        return f"it belongs to {' or '.join(headers)}."
-    chosen = [t for t in here if not t[1] or any(t[1].endswith(f'"{x}"') for x in location[:-1])]
-    for group, cutoff in ((chosen, 0.65), (here, 0.65), (tables, 0.8)):
-        known = sorted({k for _, _, keys in group for k in keys})
+        return f"it belongs to {' or '.join(dict.fromkeys(homes))}."
+    place = ".".join(part.partition("[")[0] for part in above)
+    here = [table for table in tables if table.place == place]
+    for group, cutoff in ((here, 0.65), (tables, 0.8)):
+        known = sorted({key for table in group for key in table.keys})
         close = get_close_matches(name, known, n=1, cutoff=cutoff)
-        close = close or [k for k in known if name in k.split("_")][:1]
+        close = close or [key for key in known if name in key.split("_")][:1]
         if close:
-            header, choice, _ = next(table for table in group if close[0] in table[2])
-            where = f", which goes with {choice}" if group is here and choice else ""
-            where = f" of {header or 'the top'}" if group is tables else where
-            return f"did you mean {close[0]}{where}?"
+            (own, *_) = (table.name for table in group if close[0] in table.keys)
+            return f"did you mean {close[0]}{own and f' of {own}'}?"
     return "remove it or check its spelling."
 
 
@@ -264,23 +242,24 @@ def _tables(schema: Mapping[str, Any]) -> Iterator[_Table]:
     definitions = schema.get("$defs", {})
 
     def walk(
-        node: Mapping[str, Any], names: tuple[str, ...], several: bool, choice: str
+        node: Mapping[str, Any], place: tuple[str, ...], several: bool, chosen: str
     ) -> Iterator[_Table]:
         if "$ref" in node:
             node = definitions[node["$ref"].rsplit("/", 1)[1]]
         if "discriminator" in node:
             key = node["discriminator"]["propertyName"]
             for kind, target in node["discriminator"]["mapping"].items():
-                yield from walk({"$ref": target}, names, several, f'{key} = "{kind}"')
+                yield from walk({"$ref": target}, place, several, f' with {key} = "{kind}"')
             return
         for part in (*node.get("anyOf", ()), *node.get("allOf", ())):
-            yield from walk(part, names, several, choice)
+            yield from walk(part, place, several, chosen)
         if "items" in node:
-            yield from walk(node["items"], names, True, "")
+            yield from walk(node["items"], place, True, "")
         if "properties" in node:
-            header = f"[{'.'.join(names)}]" if names else ""
-            yield f"[{header}]" if several else header, choice, frozenset(node["properties"])
+            dotted = ".".join(place)
+            header = f"[[{dotted}]]" if several else f"[{dotted}]" if dotted else ""
+            yield _Table(dotted, header + chosen, bool(chosen), frozenset(node["properties"]))
             for name, part in node["properties"].items():
-                yield from walk(part, (*names, name), False, "")
+                yield from walk(part, (*place, name), False, "")
 
     return walk(schema, (), False, "")

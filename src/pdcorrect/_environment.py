@@ -85,16 +85,7 @@ HOME = "PDCORRECT_HOME"
 def home_folder(name: str, instead: str = "") -> Path:
     """The folder ``name`` of the checkout, or of the folder that the environment names.
 
-    Parameters
-    ----------
-    name : str
-    instead : str
-        What a user may give in its place, for the message.
-
-    Raises
-    ------
-    InputError
-        If the environment does not say, and the code is not in its checkout.
+    ``instead`` is what a user may give in its place, for the message.
     """
     home = os.environ.get(HOME)
     if home:
@@ -125,12 +116,7 @@ def total_memory(root: Path = Path("/")) -> float:
     """Bytes of the machine, or of a control group that this process is in, if less.
 
     Not what happens to be free: a run that is resumed has to make the same choices.
-    Infinite where the system does not tell.
-
-    Parameters
-    ----------
-    root : path
-        Where ``proc`` and ``sys`` are.
+    Infinite where the system does not tell.  ``proc`` and ``sys`` are in ``root``.
     """
     limits = [float("inf")]
     with suppress(OSError, ValueError, AttributeError):

@@ -44,13 +44,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, whoever else writes it at the time.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Write a file whole or not at all, whoever else writes it at the time."""
     try:
         with replacing(path, part_of_process(path)) as part:
             part.write_bytes(data)
@@ -59,13 +53,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """Create a folder for files, and those above it, if it is not there.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be created.
-    """
+    """Create a folder for files, and those above it, if it is not there."""
     folder = Path(folder)
     if folder.is_file():
         raise OutputError(f"{folder}: is a file: expected a folder, or a new name.")

@@ -73,14 +73,7 @@ EXTRAS = {
 
 
 def require_extra(module: str, extra: str) -> ModuleType:
-    """Import an optional dependency, or say how to install it.
-
-    Parameters
-    ----------
-    module : str
-        Dotted module name, such as ``"pyvista"``.
-    extra : str
-        The extra of this package that contains it, such as ``"view"``.
+    """Import an optional dependency, or say which extra of this package contains it.
 
     Raises
     ------

@@ -150,16 +150,9 @@ def relative_drift(values: ArrayLike) -> float:
 
 @dataclass(frozen=True, eq=False)
 class EnergyBalance:
-    """Energies of each frame and what went in and out since frame 0, (T+1,) each, J.
+    """Energies of each frame, and work and damping loss since frame 0, (T+1,) each, J.
 
-    Attributes
-    ----------
-    kinetic, elastic
-        At the frame.
-    external_work, clamp_work
-        Done on the body by the loads and by moving clamps.
-    damping_loss
-        Taken out by the scene's damping.
+    The work is that of the loads and of moving clamps on the body.
     """
 
     kinetic: Array

@@ -55,32 +55,24 @@ class State:
     memory: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name in ("positions", "velocities"):
-            object.__setattr__(self, name, _nodal(name, getattr(self, name)))
-        memory = {name: _nodal(f"memory {name!r}", a) for name, a in self.memory.items()}
+        positions = _nodal("positions", self.positions)
+        memory = {n: _nodal(f"memory {n!r}", a, positions) for n, a in self.memory.items()}
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "velocities", _nodal("velocities", self.velocities, positions))
         object.__setattr__(self, "memory", memory)
         if not math.isfinite(self.time):
             raise InputError(f"time = {self.time}: expected a finite number of seconds.")
-        if self.positions.shape != self.velocities.shape:
-            raise InputError(
-                f"positions {self.positions.shape} and velocities {self.velocities.shape}: "
-                "expected the same shape."
-            )
-        for name, array in memory.items():
-            if array.shape != self.positions.shape:
-                raise InputError(
-                    f"memory {name!r}: expected the shape of positions, {self.positions.shape}, "
-                    f"got {array.shape}."
-                )
 
     def __repr__(self) -> str:
         return f"State({len(self.positions)} nodes, t = {self.time:g} s)"
 
 
-def _nodal(name: str, values: Array) -> Array:
+def _nodal(name: str, values: Array, positions: Array | None = None) -> Array:
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{name}: expected shape (N, 3), got {array.shape}.")
+    if positions is not None and array.shape != positions.shape:
+        raise InputError(f"{name}: expected shape {positions.shape}, got {array.shape}.")
     return array
 
 

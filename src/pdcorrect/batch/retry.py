@@ -14,9 +14,9 @@ from pdcorrect.batch.cells import CellBatch
 from pdcorrect.batch.states import BatchResult, BatchState, state_of
 from pdcorrect.errors import PdcorrectError
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.adjoint import step_solution
 from pdcorrect.solvers.integrators import solution
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.solvers.step_solution import step_solution
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]

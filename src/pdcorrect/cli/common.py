@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -20,6 +21,30 @@ SceneFile = Annotated[Path, typer.Argument(help="Scene in TOML.", show_default=F
 
 Frames = Annotated[
     Optional[int], typer.Option(help="Frames to run; the scene's by default.", min=1)
+]
+ConfigFile = Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)]
+OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder for the results.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
+Gated = Annotated[
+    bool, typer.Option(help="Of correctors: let the default gate refuse corrections.")
+]
+Learned = Annotated[bool, typer.Option("--learned", help="With the learned element.")]
+EstimateError = Annotated[
+    bool, typer.Option("--estimate-error", help="Also estimate errors, by a far longer run.")
+]
+Device = Annotated[str, typer.Option(help="cpu, or cuda (extra 'learn').")]
+Batch = Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)]
+Seconds = Annotated[
+    Optional[float],
+    typer.Option(help="Stop after about so many seconds; the same command goes on.", min=0),
+]
+Figures = Annotated[bool, typer.Option(help="Draw figures (extra 'view').")]
+Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]
+SkipDamaged = Annotated[
+    bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
+]
+Incomplete = Annotated[
+    bool, typer.Option("--incomplete", help="Also if files of a split are missing.")
 ]
 
 
@@ -55,15 +80,7 @@ def tell_of_compiling() -> None:
 
 
 def check_models(models: Sequence[str], gate: bool) -> None:
-    """Refuse options of correctors that cannot be meant, before anything is computed.
-
-    Raises
-    ------
-    InputError
-        If a name is empty, or there is no corrector that could go without a gate.
-    MissingExtraError
-        If correctors cannot be run here.
-    """
+    """Refuse options of correctors that cannot be meant, before anything is computed."""
     if any(not model.strip() for model in models):
         raise InputError("--model '': expected the name of a model, or the path of its folder.")
     if models:
@@ -72,8 +89,37 @@ def check_models(models: Sequence[str], gate: bool) -> None:
         raise InputError("--no-gate without --model: expected --model NAME beside it.")
 
 
-def progress_bars(unit: str = "", *, hidden: bool = False, apart: bool = False) -> Any:
-    """A `rich.progress.Progress`, which counts in ``unit``; ``apart``: on standard error."""
+def console() -> Any:
+    """Standard output for tables, which are not broken where it is no terminal."""
+    from rich.console import Console
+
+    found = Console(markup=False)
+    return found if found.is_terminal else Console(width=400, markup=False)
+
+
+def print_table(
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], **style: Any
+) -> None:
+    """Names in the first column, which is folded where there is little room, then numbers."""
+    from rich.table import Table
+
+    table = Table(title=title, **style)
+    table.add_column(headings[0], min_width=12, overflow="fold")
+    for heading in headings[1:]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+@contextlib.contextmanager
+def progress_bars(
+    unit: str = "", *, apart: bool = False
+) -> Iterator[Callable[[str, int, int | None], None]]:
+    """Bars by name; gives what to call with a name, how much is done, and the total in ``unit``.
+
+    ``apart``: on standard error.
+    """
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -84,11 +130,19 @@ def progress_bars(unit: str = "", *, hidden: bool = False, apart: bool = False) 
         TimeRemainingColumn,
     )
 
-    return Progress(
+    tasks: dict[str, Any] = {}
+    with Progress(
         TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
         TextColumn(unit), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-        disable=hidden, console=Console(stderr=apart),
-    )  # fmt: skip
+        console=Console(stderr=apart),
+    ) as progress:  # fmt: skip
+
+        def show(name: str, done: int, total: int | None) -> None:
+            if name not in tasks:
+                tasks[name] = progress.add_task(name, total=total)
+            progress.update(tasks[name], completed=done, total=total)
+
+        yield show
 
 
 @contextlib.contextmanager
@@ -96,9 +150,15 @@ def progress_bar(
     title: str, total: int, done: int = 0, **options: Any
 ) -> Iterator[Callable[..., None]]:
     """One bar; gives what to call, with anything, at each step.  Options as of `progress_bars`."""
-    with progress_bars(**{"hidden": done >= total, **options}) as progress:
-        task = progress.add_task(title, total=total, completed=done)
-        yield lambda *_: progress.advance(task)
+    steps = count(done)
+    with progress_bars(**options) as show:
+
+        def advance(*_: object) -> None:
+            show(title, next(steps), total)
+
+        if done < total:
+            advance()
+        yield advance
 
 
 class FileLines:
@@ -124,8 +184,8 @@ class FileLines:
         self.done, self.total = done, total
         elapsed = time.monotonic() - self._started
         rest = elapsed / new * (total - done)
-        told = f"{elapsed:.0f} s: {name}, {done} of {total} simulations, about {rest:.0f} s left"
-        print(told, flush=True)
+        left = f"{done} of {total} simulations, about {rest:.0f} s left"
+        print(f"{elapsed:.0f} s: {name}, {left}", flush=True)
 
     def interrupted(self) -> str:
         """What to tell after an interruption."""

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Optional
@@ -12,7 +11,7 @@ from typing import Annotated, Optional
 import typer
 
 from pdcorrect._files import INTERRUPTED, Terminated, make_folder, write_text
-from pdcorrect.cli.common import FAILED, FileLines, progress_bar
+from pdcorrect.cli import common
 from pdcorrect.errors import InputError
 
 app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and convert data sets.")
@@ -20,32 +19,19 @@ app = typer.Typer(no_args_is_help=True, help="Generate, check, summarise and con
 Folder = Annotated[Path, typer.Argument(help="Folder of the data set.", show_default=False)]
 
 
-class Layout(StrEnum):
-    """Choices of --to."""
-
-    meshgraphnet = "meshgraphnet"
-    vtu = "vtu"
+Layout = StrEnum("Layout", ["meshgraphnet", "vtu"])
 
 
 @app.command()
 def generate(
-    config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the data set.")],
-    workers: Annotated[
-        int, typer.Option(help="Processes on this machine (extra 'cluster' if several).", min=1)
-    ] = 1,
-    scheduler: Annotated[
-        Optional[str], typer.Option(help="Address of a Dask scheduler, to use its workers.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="cpu, or cuda (extra 'learn').")] = "cpu",
-    batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
+    config: common.ConfigFile,
+    output: common.OutputFolder,
+    workers: common.Workers = 1,
+    scheduler: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler.")] = None,
+    device: common.Device = "cpu",
+    batch: common.Batch = 32,
     split: Annotated[Optional[list[str]], typer.Option(help="Only this split; repeatable.")] = None,
-    seconds: Annotated[
-        Optional[float],
-        typer.Option(
-            help="Begin nothing new after so many seconds; the mesh in hand is finished.", min=0
-        ),
-    ] = None,
+    seconds: common.Seconds = None,
 ) -> None:
     """Compute a data set, or what is missing or damaged of one that was begun.
 
@@ -56,23 +42,26 @@ def generate(
     from pdcorrect.data.generate import generate as run
     from pdcorrect.data.workers import Workers
 
-    with _simulations() as shown:
+    shown = common.FileLines()
+    try:
         found = run(
             DatasetConfig.load(config), output, Workers(workers, scheduler, device, batch),
             splits=split, seconds=seconds, on_begin=shown.begin, on_file=shown,
         )  # fmt: skip
+    except (KeyboardInterrupt, Terminated) as stop:
+        typer.echo(shown.interrupted(), err=True)
+        if isinstance(stop, Terminated):
+            raise
+        raise typer.Exit(INTERRUPTED) from None
     typer.echo(f"{output}: {found}")
     if not found:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(common.FAILED)
 
 
 @app.command()
 def check(
     folder: Folder,
-    repeat: Annotated[
-        int,
-        typer.Option(min=0, help="Steps of each simulation's coarse models to take again."),
-    ] = 1,
+    repeat: Annotated[int, typer.Option(min=0, help="Steps of coarse models to repeat.")] = 1,
 ) -> None:
     """Read every file, compare it with config.toml and the others, print what is wrong.
 
@@ -84,36 +73,30 @@ def check(
     from pdcorrect.data.folder import all_shards
 
     count = len(all_shards(folder))
-    with progress_bar("checking", count, unit="files", apart=True) as advance:
+    with common.progress_bar("checking", count, unit="files", apart=True) as advance:
         findings = check_dataset(folder, advance, repeat)
     for finding in findings:
         typer.echo(str(finding))
     errors = sum(finding.severity == "error" for finding in findings)
     typer.echo(f"{count} files, {errors} errors, {len(findings) - errors} warnings")
     if errors:
-        raise typer.Exit(FAILED)
+        raise typer.Exit(common.FAILED)
 
 
 @app.command()
 def info(
     folder: Folder,
-    json: Annotated[
-        Optional[Path], typer.Option(help="Also write all numbers to this file.")
-    ] = None,
-    skip_damaged: Annotated[
-        bool, typer.Option("--skip-damaged", help="Leave out and name files that are damaged.")
-    ] = False,
+    json: Annotated[Optional[Path], typer.Option(help="File for all numbers.")] = None,
+    skip_damaged: common.SkipDamaged = False,
 ) -> None:
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
-    from rich.console import Console
-
     from pdcorrect.data.folder import all_shards
     from pdcorrect.data.summary import dataset_info
 
-    with progress_bar("reading", len(all_shards(folder)), unit="files", apart=True) as advance:
+    count = len(all_shards(folder))
+    with common.progress_bar("reading", count, unit="files", apart=True) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
-    console = Console(width=None if sys.stdout.isatty() else 200, markup=False)
-    console.print(*found.tables())
+    common.console().print(*found.tables())
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:
@@ -127,25 +110,12 @@ def export(
     folder: Folder,
     target: Annotated[Path, typer.Argument(help="Folder to write to.", show_default=False)],
     to: Annotated[Layout, typer.Option(help="Layout.")] = Layout.meshgraphnet,
-    split: Annotated[
-        Optional[str],
-        typer.Option(help="The only split; meshgraphnet: all by default; vtu: evaluation."),
-    ] = None,
-    base: Annotated[
-        Optional[str],
-        typer.Option(help="meshgraphnet: run whose predictions are given as base_pos; plain."),
-    ] = None,
+    split: Annotated[Optional[str], typer.Option(help="All by default; vtu: evaluation.")] = None,
+    base: Annotated[Optional[str], typer.Option(help="meshgraphnet: run of base_pos.")] = None,
     mesh: Annotated[Optional[int], typer.Option(help="vtu: number of the mesh; 0.", min=0)] = None,
-    simulation: Annotated[
-        Optional[int], typer.Option(help="vtu: number of the simulation; 0.", min=0)
-    ] = None,
-    run: Annotated[
-        Optional[list[str]],
-        typer.Option(help="vtu: run beside the reference; repeatable; plain, if there is one."),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files of the same names.")
-    ] = False,
+    simulation: Annotated[Optional[int], typer.Option(help="vtu: its number; 0.", min=0)] = None,
+    run: Annotated[Optional[list[str]], typer.Option(help="vtu: runs shown with it.")] = None,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
     from pdcorrect.data import export as exports
@@ -154,7 +124,10 @@ def export(
     if to is Layout.meshgraphnet:
         _unused(to, {"--mesh": mesh, "--simulation": simulation, "--run": run})
         with contextlib.suppress(InputError):  # of config.toml, which no export needs
-            _warn_of_missing(missing_files(folder, split))
+            missing = missing_files(folder, split)
+            if missing:
+                told = f"{len(missing)} files that its config.toml asks for, as {missing[0]}"
+                typer.echo(f"warning: the data set lacks {told}.", err=True)
         written = exports.export_meshgraphnet(
             folder, target, base=base or "plain", split=split, overwrite=overwrite
         )
@@ -175,15 +148,6 @@ def _unused(to: Layout, options: Mapping[str, object]) -> None:
             raise InputError(f"{name} with --to {to}: it has no use there; leave it out.")
 
 
-def _warn_of_missing(paths: Sequence[Path]) -> None:
-    if paths:
-        typer.echo(
-            f"warning: the data set is incomplete: {len(paths)} of the files that its config.toml "
-            f"asks for are missing, as {paths[0]}.",
-            err=True,
-        )
-
-
 @app.command("import")
 def import_(
     sources: Annotated[
@@ -192,18 +156,11 @@ def import_(
             help="Reference trajectories on one body (HDF5), or one .npz.", show_default=False
         ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the data set.")],
-    coarse: Annotated[
-        Optional[list[Path]],
-        typer.Option(help="Coarse trajectory; one for each reference, in order."),
-    ] = None,
-    split: Annotated[
-        str, typer.Option(help="Split: training, validation, evaluation, or a name of your own.")
-    ] = "training",
+    output: common.OutputFolder,
+    coarse: Annotated[Optional[list[Path]], typer.Option(help="One for each reference.")] = None,
+    split: Annotated[str, typer.Option(help="training, validation, evaluation, any.")] = "training",
     number: Annotated[int, typer.Option(help="Number of the mesh in the split.", min=0)] = 0,
-    best: Annotated[
-        bool, typer.Option("--best", help="Also compute the best coarse model's run.")
-    ] = False,
+    best: Annotated[bool, typer.Option("--best", help="Also run the best coarse model.")] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
     from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
@@ -222,17 +179,3 @@ def import_(
             f"{VALIDATION!r}, evaluation {EVALUATION!r} unless told otherwise.",
             err=True,
         )
-
-
-@contextlib.contextmanager
-def _simulations() -> Iterator[FileLines]:
-    """A line for each file; an interruption ends the program, and says what is there."""
-    shown = FileLines()
-    try:
-        yield shown
-    except KeyboardInterrupt:
-        typer.echo(shown.interrupted(), err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    except Terminated:
-        typer.echo(shown.interrupted(), err=True)
-        raise

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli.common import tell_of_compiling
+from pdcorrect.cli import common
 from pdcorrect.errors import require_extra
 
 if TYPE_CHECKING:
@@ -26,29 +26,21 @@ def evaluate(
         ),
     ],
     split: Annotated[str, typer.Option(help="Split of the data set.")] = "evaluation",
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    batch: Annotated[int, typer.Option(help="Simulations at once on a GPU.", min=1)] = 32,
-    workers: Annotated[int, typer.Option(help="Processes that measure.", min=1)] = 1,
+    device: common.Device = "cpu",
+    batch: common.Batch = 32,
+    workers: common.Workers = 1,
     output: Annotated[
-        Optional[Path],
-        typer.Option("-o", "--output", help="Folder for JSON, CSV, Markdown and figures."),
+        Optional[Path], typer.Option("-o", "--output", help="Folder for tables and figures.")
     ] = None,
-    gate: Annotated[bool, typer.Option(help="Let a gate refuse doubtful corrections.")] = True,
+    gate: common.Gated = True,
     seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
-    incomplete: Annotated[
-        bool, typer.Option("--incomplete", help="Also if files of the split are missing.")
-    ] = False,
-    figures: Annotated[
-        bool, typer.Option(help="Also draw figures into the folder (extra 'view').")
-    ] = True,
+    incomplete: common.Incomplete = False,
+    figures: common.Figures = True,
 ) -> None:
     """Measure models, and the stored runs of a data set, against its reference.
 
     Every simulation of the split is stepped from rest.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     from pdcorrect.evaluation.evaluation import DEFAULT_GATE, saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate as run
     from pdcorrect.evaluation.tables import write_evaluation
@@ -58,13 +50,12 @@ def evaluate(
         require_extra("matplotlib", "view")
     refuses = DEFAULT_GATE if gate else None
     saved = saved_candidates(models, device, gate=refuses)
-    tell_of_compiling()
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("evaluating", total=None)
+    common.tell_of_compiling()
+    with common.progress_bars("simulations", apart=True) as show:
         found = run(
             saved, folder, split, device=device, batch=batch,
             workers=workers, incomplete=incomplete,
-            on_cases=lambda done, total: progress.update(task, completed=done, total=total),
+            on_cases=lambda done, total: show("evaluating", done, total),
         )  # fmt: skip
     notes = _notes(saved, found)
     _print(found, notes, seed)
@@ -101,20 +92,11 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
 
 def _print(found: Evaluation, notes: list[str], seed: int) -> None:
     from rich.box import MARKDOWN
-    from rich.console import Console
-    from rich.table import Table
 
     from pdcorrect.evaluation.tables import tables
 
-    # Without a terminal lines are not broken, so that the tables remain Markdown.
-    console = Console() if sys.stdout.isatty() else Console(width=400)
-    for title, headings, rows in tables(found, seed):
-        table = Table(title=title, title_justify="left", title_style="bold", box=MARKDOWN)
-        for number, heading in enumerate(headings):
-            table.add_column(heading, justify="right" if number else "left", no_wrap=True)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
+    for table in tables(found, seed):
+        common.print_table(*table, box=MARKDOWN, title_justify="left", title_style="bold")
     for note in notes:
         typer.echo(f"- {note}")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pdcorrect.cli.common import say
+from pdcorrect.cli.common import OutputFolder, say
 from pdcorrect.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ def export(
     run: Annotated[
         Path, typer.Argument(help="Trajectory file of pdcorrect simulate.", show_default=False)
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the files.")],
+    output: OutputFolder,
     every: Annotated[int, typer.Option(help="Write each such frame; frame 0 always.", min=1)] = 1,
     stress: Annotated[
         bool, typer.Option(help="With stresses and volume ratios, where the file allows them.")

@@ -28,24 +28,11 @@ from pdcorrect.errors import (
     PdcorrectWarning,
 )
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    help="Coarse-mesh projective dynamics of soft solids, validated against Newton FEM.",
-)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for command in (
-    simulate,
-    compare,
-    render,
-    export,
-    train,
-    train_element,
-    tune_element,
-    evaluate,
-    validate,
+    simulate, compare, render, export, train, train_element, tune_element, evaluate, validate,
     doctor,
-):
+):  # fmt: skip
     app.command()(command)
 app.add_typer(dataset, name="dataset")
 
@@ -75,9 +62,7 @@ def main() -> None:
     except Terminated:
         typer.echo("stopped by SIGTERM", err=True)
         sys.exit(TERMINATED)
-    except ConvergenceError as error:
-        _stop(str(error), FAILED)
-    except OutputError as error:
+    except (ConvergenceError, OutputError) as error:
         _stop(str(error), FAILED)
     except PdcorrectError as error:
         _stop(str(error), BAD_INPUT)

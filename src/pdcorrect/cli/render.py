@@ -11,13 +11,7 @@ import typer
 from pdcorrect.cli.common import say
 from pdcorrect.errors import InputError
 
-
-class Colour(StrEnum):
-    """Choices of --colour."""
-
-    displacement = "displacement"
-    error = "error"
-    none = "none"
+Colour = StrEnum("Colour", ["displacement", "error", "none"])
 
 
 def render(
@@ -27,10 +21,7 @@ def render(
     colour: Annotated[Colour, typer.Option(help="What to colour by.")] = Colour.displacement,
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a film.", min=0.1)] = 25.0,
-    overlay: Annotated[
-        bool,
-        typer.Option("--overlay", help="Draw runs over each other in a .png, each in a colour."),
-    ] = False,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Over each other (.png).")] = False,
 ) -> None:
     """Draw one run or several side by side; errors are against the last run given.
 

@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
-from pdcorrect.cli.common import (
-    Frames,
-    SceneFile,
-    check_models,
-    progress_bar,
-    say,
-    tell_of_compiling,
-)
+from pdcorrect.cli import common
 from pdcorrect.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,45 +18,25 @@ if TYPE_CHECKING:
     from pdcorrect.trajectory import Stepper, Trajectory
 
 
-class SolverName(StrEnum):
-    """Choices of --solver."""
-
-    pd = "pd"
-    newton = "newton"
+SolverName = StrEnum("SolverName", ["pd", "newton"])
 
 
 def simulate(
-    scene: SceneFile,
+    scene: common.SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
     refine: Annotated[int, typer.Option(help="Cut each coarse cell into REFINE^3.", min=1)] = 1,
     solver: Annotated[SolverName, typer.Option(help="Method.")] = SolverName.pd,
     model: Annotated[
-        Optional[str],
-        typer.Option(
-            help="Correct the steps by this model, a name (models/README.md lists "
-            "them) or a folder, on the coarse model that it is for (extra 'learn')."
-        ),
+        Optional[str], typer.Option(help="Corrector, by name or folder (extra 'learn').")
     ] = None,
-    gate: Annotated[
-        bool, typer.Option(help="Of the corrector: let the default gate refuse its corrections.")
-    ] = True,
-    learned: Annotated[
-        bool, typer.Option("--learned", help="With the learned element in place of the scene's.")
-    ] = False,
-    estimate_error: Annotated[
-        bool,
-        typer.Option(
-            "--estimate-error",
-            help="Also how far the run is from the converged motion, by a finer one that takes "
-            "10 to 20 times as long.",
-        ),
-    ] = False,
-    frames: Frames = None,
+    gate: common.Gated = True,
+    learned: common.Learned = False,
+    estimate_error: common.EstimateError = False,
+    frames: common.Frames = None,
     vtu: Annotated[
-        Optional[Path],
-        typer.Option(help="Also write VTU files, with stress, and a PVD into this folder."),
+        Optional[Path], typer.Option(help="Folder for the run, with stress, for ParaView.")
     ] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace an existing output file.")] = False,
+    overwrite: common.Overwrite = False,
     resume: Annotated[
         bool, typer.Option(help="Continue an existing output file after its last complete frame.")
     ] = False,
@@ -75,7 +48,7 @@ def simulate(
 
     if resume and overwrite:
         raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
-    check_models([] if model is None else [model], gate)
+    common.check_models([] if model is None else [model], gate)
     if model is not None and (learned or refine != 1 or solver is not SolverName.pd):
         raise InputError(
             f"--model {model} with --refine {refine} --solver {solver}{' --learned' * learned}: a "
@@ -85,28 +58,28 @@ def simulate(
     loaded = Scene.load(scene)
     if vtu:
         make_folder(vtu)
-    tell_of_compiling()
+    common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
     origin = getattr(stepper, "origin", None)
     if origin:
-        say("model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
-            .format(**origin))  # fmt: skip
+        told = "model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
+        common.say(told.format(**origin))
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     log = _run(stepper, count, output, earlier, overwrite)
     before = 0 if earlier is None else len(earlier)
     if before < count:
         _summary(log.arrays(), stepper, before)
-        say(f"wrote {output}")
+        common.say(f"wrote {output}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 
         series = write_vtu_series(
             load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
         )
-        say(f"wrote {series}")
+        common.say(f"wrote {series}")
     if estimate_error:
-        say(_estimated(load_trajectory(output)))
+        common.say(_estimated(load_trajectory(output)))
 
 
 def _make_stepper(
@@ -132,14 +105,14 @@ def _frames_so_far(output: Path, stepper: Stepper, count: int) -> Trajectory | N
     from pdcorrect.solvers.rollout import check_same_run
 
     if not output.exists():
-        say(f"{output} does not exist yet: starting from the beginning")
+        common.say(f"{output} does not exist yet: starting from the beginning")
         return None
     run = load_trajectory(output, salvage=True)
     check_same_run(stepper, run, str(output))
     if len(run) < count:
-        say(f"{output} holds {len(run)} of {count} frames: continuing")
+        common.say(f"{output} holds {len(run)} of {count} frames: continuing")
         return replace(run, scene_toml=stepper.problem.scene.to_toml())
-    say(f"{output} holds {len(run)} frames already, {count} wanted: nothing to do")
+    common.say(f"{output} holds {len(run)} frames already, {count} wanted: nothing to do")
     return run
 
 
@@ -160,7 +133,7 @@ def _run(
     else:
         state, done, log = continue_from(stepper, earlier), len(earlier), StepLog(earlier.stats)
         writer = TrajectoryWriter.resume(output, earlier)
-    with writer, progress_bar(problem.scene.name, count, done) as advance:
+    with writer, common.progress_bar(problem.scene.name, count, done) as advance:
         try:
             for result, elapsed in march(stepper, max(0, count - done), state=state):
                 writer.append(result, elapsed)
@@ -192,31 +165,31 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     element, correction = problem.element, problem.correction
     if correction is not None and not correction.learned.all():
         element += f", {int(correction.learned.sum())} of them learned"
-    say(
+    common.say(
         f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
         f"and {len(problem.cells)} cells ({element}, {problem.mass_rule} mass) in "
         f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
     )
-    say(
+    common.say(
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
         f"{stats['iterations'].max()}; frames: {ends}"
     )
     others = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
     work = {"external_work": "work of the loads"}
     work |= {name: text for name, text in others.items() if stats[name].any()}
-    say(
+    common.say(
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
         f"{stats['kinetic_energy'][-1]:.4g} J; over the run "
         + ", ".join(f"{text} {stats[name].sum():.4g} J" for name, text in work.items())
     )
-    say(inverted_frames(stats, problem.scene.time.step))
+    common.say(inverted_frames(stats, problem.scene.time.step))
     if problem.scene.time.integrator != "quasi-static":
-        say(gained_energy(stats))
+        common.say(gained_energy(stats))
     if "gate" in stats:
         if not stats["refused"].all():
             largest = 1e3 * stats["correction"].max()
-            say(f"corrections: at most {largest:.3g} mm of a node in a frame")
-        say(refused_corrections(stats["gate"]))
+            common.say(f"corrections: at most {largest:.3g} mm of a node in a frame")
+        common.say(refused_corrections(stats["gate"]))
 
 
 def _estimated(run: Trajectory) -> str:
@@ -226,7 +199,7 @@ def _estimated(run: Trajectory) -> str:
     from pdcorrect.evaluation.converged import error_estimate
     from pdcorrect.metrics import rms_error
 
-    with progress_bar("finer run", len(run)) as advance:
+    with common.progress_bar("finer run", len(run)) as advance:
         found = error_estimate(run, on_step=advance)
     rest = np.broadcast_to(run.points, run.positions.shape)
     error, size = 1e3 * np.sqrt((found[1:] ** 2).mean()), 1e3 * rms_error(run, rest)

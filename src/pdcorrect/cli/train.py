@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli.common import tell_of_compiling
+from pdcorrect.cli import common
 from pdcorrect.errors import OutputError
 
 if TYPE_CHECKING:
@@ -17,31 +17,18 @@ if TYPE_CHECKING:
 
 EVALUATION = "evaluation"
 """Folder, inside a training's, of what ``--evaluate`` finds."""
-_UNFINISHED = 1
-"""Exit status if time was up before the training was finished."""
 
 
 def train(
-    config: Annotated[Path, typer.Argument(help="Configuration, TOML.", show_default=False)],
+    config: common.ConfigFile,
     data: Annotated[Path, typer.Option(help="Folder of the data set.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
-    resume: Annotated[
-        bool, typer.Option(help="Go on from the folder's checkpoint, if there is one.")
-    ] = False,
-    seconds: Annotated[
-        Optional[float],
-        typer.Option(help="Stop after about so many seconds, start included; --resume goes on."),
-    ] = None,
-    incomplete: Annotated[
-        bool,
-        typer.Option("--incomplete", help="Also if files of the data set's splits are missing."),
-    ] = False,
+    output: common.OutputFolder,
+    device: common.Device = "cpu",
+    resume: Annotated[bool, typer.Option(help="Go on from the folder's checkpoint.")] = False,
+    seconds: common.Seconds = None,
+    incomplete: common.Incomplete = False,
     evaluate: Annotated[
-        Optional[str],
-        typer.Option(
-            help="Split on which the best model is judged at the end, as by pdcorrect evaluate."
-        ),
+        Optional[str], typer.Option(help="Split on which the best model is judged at the end.")
     ] = None,
 ) -> None:
     """Train a corrector; the best model is in OUTPUT/model (extra 'learn').
@@ -63,7 +50,7 @@ def train(
         shard_paths(data, evaluate)  # refused now, not when the training has ended
         if not incomplete:
             check_whole(data, [evaluate])
-    tell_of_compiling()
+    common.tell_of_compiling()
     with joined(device) as (world, own):
         training = Training(
             loaded, data, output, device=own, resume=resume, incomplete=incomplete, world=world,
@@ -76,7 +63,7 @@ def train(
         metrics = training.progress.metrics
     if not finished:
         typer.echo(f"{output}: not finished after {training.progress.total} iterations; --resume")
-        raise typer.Exit(_UNFINISHED)
+        raise typer.Exit(common.FAILED)
     told = ", ".join(f"{name.replace('_', ' ')} {value:.1f}" for name, value in metrics.items())
     typer.echo(f"{output / MODEL}: {told or 'no validation split'}")
     if evaluate is not None:
@@ -98,21 +85,15 @@ def _tell(at: Progress, row: Mapping[str, Any]) -> None:
 
 
 def train_element(
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the training.")],
-    bodies: Annotated[
-        Optional[int],
-        typer.Option(help="Random bodies to learn from; as released by default.", min=1),
-    ] = None,
+    output: common.OutputFolder,
+    bodies: Annotated[Optional[int], typer.Option(help="Random bodies.", min=1)] = None,
     iterations: Annotated[
-        Optional[int], typer.Option(help="Steps of the optimiser; as released by default.", min=1)
+        Optional[int], typer.Option(help="Steps of the optimiser.", min=1)
     ] = None,
     seed: Annotated[int, typer.Option(help="Of bodies, weights and order.", min=0)] = 45,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1, ...")] = "cpu",
-    workers: Annotated[int, typer.Option(help="Processes that compute answers.", min=1)] = 1,
-    seconds: Annotated[
-        Optional[float],
-        typer.Option(help="Stop after about so many seconds; the same command goes on."),
-    ] = None,
+    device: common.Device = "cpu",
+    workers: common.Workers = 1,
+    seconds: common.Seconds = None,
 ) -> None:
     """Train the network that writes the learned element's cells (extra 'learn').
 
@@ -124,20 +105,20 @@ def train_element(
 
     given = {"bodies": bodies, "iterations": iterations}
     recipe = ElementRecipe(seed=seed, **{k: v for k, v in given.items() if v is not None})
-    tell_of_compiling()
+    common.tell_of_compiling()
     if not train_network(
         recipe, output, device=device, workers=workers, seconds=seconds, report=typer.echo
     ):
         typer.echo(f"{output}: not finished; the same command goes on")
-        raise typer.Exit(_UNFINISHED)
+        raise typer.Exit(common.FAILED)
 
 
 def tune_element(
-    scene: Annotated[Path, typer.Argument(help="Scene, TOML.", show_default=False)],
+    scene: common.SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="File of weights, *.safetensors.")],
     iterations: Annotated[int, typer.Option(help="Steps of the optimiser.", min=1)] = 200,
     seed: Annotated[int, typer.Option(help="Of loads and order.", min=0)] = 0,
-    overwrite: Annotated[bool, typer.Option(help="Replace an existing file of weights.")] = False,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Tune the learned element to the body of one scene, in a minute (extra 'learn').
 
@@ -150,7 +131,7 @@ def tune_element(
     loaded = Scene.load(scene)
     if output.exists() and not overwrite:
         raise OutputError(f"{output}: there already: expected a new name, or --overwrite.")
-    tell_of_compiling()
+    common.tell_of_compiling()
     problem = discretise(learned_coarse(loaded))
     found = tune(problem, output, iterations=iterations, seed=seed, report=typer.echo)
     names = "displacements", "frequencies"

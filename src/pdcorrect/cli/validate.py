@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli.common import FAILED, tell_of_compiling
+from pdcorrect.cli.common import FAILED, OutputFolder, tell_of_compiling
 
 
 def validate(
@@ -18,15 +18,9 @@ def validate(
         Optional[list[str]],
         typer.Argument(metavar="[CASE]...", help="Names of cases; all by default."),
     ] = None,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for results and the report.")
-    ] = Path("report"),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Only the quick parts, a few minutes in all.")
-    ] = False,
-    again: Annotated[
-        bool, typer.Option("--again", help="Run also what is done and has not changed since.")
-    ] = False,
+    output: OutputFolder = Path("report"),
+    quick: Annotated[bool, typer.Option("--quick", help="Only the quick parts.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Also what has not changed.")] = False,
     known: Annotated[bool, typer.Option("--list", help="Only list the cases.")] = False,
 ) -> None:
     """Run the validation cases, judge them by figures written down before, and report.

@@ -7,6 +7,7 @@ share one camera (parallel projection), one colour scale and one length scale.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -146,22 +147,19 @@ def render(
     longest = max(map(max, times))
     sheet = Sheet(view, captions, columns, bar, _font(width, columns), longest=longest)
     palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
-    painter = Painter(bodies, view, palette, limit, rest)
+    with closing(Painter(bodies, view, palette, limit, rest)) as painter:
 
-    def pages() -> Iterator[Image]:
-        for start in range(0, len(panels), a_page):
-            shown = panels[start : start + a_page]
-            images = [painter.image(body, time) for body, time in shown]
-            yield sheet.page(images, [times[body][time] for body, time in shown])
+        def pages() -> Iterator[Image]:
+            for start in range(0, len(panels), a_page):
+                shown = panels[start : start + a_page]
+                images = [painter.image(body, time) for body, time in shown]
+                yield sheet.page(images, [times[body][time] for body, time in shown])
 
-    try:
         with picture_file(output) as part:
             if film:
                 write_film(part, pages(), fps)
             else:
                 write_png(part, next(pages()))
-    finally:
-        painter.close()
     return output
 
 
@@ -181,14 +179,8 @@ def render_overlay(
     ----------
     trajectories : sequence of Trajectory
         Two to six, on meshes that hold the nodes of the coarsest.
-    output : path
-        ``.png``.
-    labels : sequence of str
-        One for each run.
-    frame : int
-        Which of the common frames; negative ones count from the end.
-    window : int
-        Width of the picture, pixels.
+    output, labels, frame, window
+        See `render`; one frame, ``.png`` only.
 
     Returns
     -------
@@ -197,12 +189,8 @@ def render_overlay(
 
     Raises
     ------
-    InputError
-        If labels, frame, suffix, times or meshes do not fit.
-    OutputError
-        If the file cannot be written.
-    MissingExtraError
-        Without the extra "view".
+    InputError, OutputError, MissingExtraError
+        As by `render`, and if the meshes do not fit.
     """
     runs, output = list(trajectories), Path(output)
     if _check_arguments(runs, output, labels, None, None):
@@ -220,12 +208,9 @@ def render_overlay(
     time = float(runs[0].times[shared[0, place]])
     key = [(label, edges) for label, (_, edges) in zip(labels, colours, strict=True)]
     sheet = Sheet(view, [""], 1, None, _font(window, 2), longest=time, key=key)
-    painter = Painter(bodies, view, "viridis", 1.0, rest=False, colours=colours)
-    try:
-        with picture_file(output) as part:
-            write_png(part, sheet.page([painter.overlay(0)], [time]))
-    finally:
-        painter.close()
+    drawn = Painter(bodies, view, "viridis", 1.0, rest=False, colours=colours)
+    with closing(drawn) as painter, picture_file(output) as part:
+        write_png(part, sheet.page([painter.overlay(0)], [time]))
     return output
 
 
@@ -296,9 +281,10 @@ def _body(
     reference: Trajectory | None,
     reference_frames: NDArray[np.int64],
 ) -> Body:
-    if colour != "error" or reference is None:
-        moved = run.positions[frames] - run.points
-        return Body(run, frames, np.linalg.norm(moved, axis=2) if colour else None)
+    if colour is None:
+        return Body(run, frames, None)
+    if colour == "displacement" or reference is None:
+        return Body(run, frames, np.linalg.norm(run.positions[frames] - run.points, axis=2))
     run = _on_nodes_of(run, reference)
     nodes = coincident_nodes(reference.points, run.points, _tolerance(run))
     difference = run.positions[frames] - reference.positions[reference_frames][:, nodes]

@@ -27,7 +27,6 @@ _ENERGIES = {
     "kinetic_energy": "kinetic [J]",
     "external_work": "work of the loads [J]",
 }
-
 _OTHER_WORK = {"clamp_work": "work of the clamps [J]", "damping_loss": "lost to damping [J]"}
 """Drawn where a run has any."""
 
@@ -58,7 +57,7 @@ def _labelled(
     trajectories: Sequence[Trajectory] | Trajectory, labels: Sequence[str]
 ) -> list[tuple[Trajectory, str]]:
     runs = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
-    if not runs or len(labels) != len(runs):
+    if not 0 < len(runs) == len(labels):
         raise InputError(f"{len(labels)} labels for {len(runs)} runs: expected as many, and some.")
     return list(zip(runs, labels, strict=True))
 
@@ -66,8 +65,7 @@ def _labelled(
 def _legend(figure: Any, axes: Sequence[Any]) -> None:
     """Above the axes, so that it hides nothing, in as many columns as fit.
 
-    The figure grows by the rows beyond the first, and letters of a name that is wider than the
-    figure are smaller.
+    The figure grows by the rows beyond the first; a name that is wider than it is written smaller.
     """
     lines: dict[str, Any] = {}
     for axis in axes:
@@ -132,11 +130,6 @@ def plot_energy(
     """Elastic and kinetic energy and the work of the loads so far, over time, J.
 
     Likewise the work of moving clamps and the loss to damping, where there is any.
-
-    Raises
-    ------
-    InputError
-        If no run has any of them among its statistics.
     """
     runs = _labelled(trajectories, labels)
     names = {name: t for name, t in _ENERGIES.items() if any(name in r.stats for r, _ in runs)}
@@ -201,26 +194,13 @@ def plot_error_against_time(
 
 
 _BINS = 24
-_HALF = 50.0  # per cent
 
 
 def plot_omega(values: Mapping[str, Sequence[float]], output: str | Path) -> Path:
-    """Histograms over trajectories of Omega, per cent, one outline a model.
-
-    Raises
-    ------
-    InputError
-        If a model has no value, or there is no model.
-    """
+    """Histograms over trajectories of Omega, per cent, one outline a model."""
     if not values or not all(len(found) for found in values.values()):
         raise InputError("Omega by model: expected one model or more, each with values.")
-    every = np.concatenate([np.asarray(found, dtype=np.float64) for found in values.values()])
-    low, high = float(every.min()), float(every.max())
-    edges = (
-        np.linspace(low - 0.5, high + 0.5, _BINS + 1)
-        if high - low < 1.0
-        else np.linspace(low, high, _BINS + 1)
-    )
+    edges = np.histogram_bin_edges(np.concatenate([*map(np.asarray, values.values())]), _BINS)
     figure, (axis,) = _axes(1, 4.0)
     for index, (label, found) in enumerate(values.items()):
         axis.hist(found, edges, histtype="step", label=label, **_style(index))

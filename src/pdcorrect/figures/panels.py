@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from pdcorrect._files import replacing
 from pdcorrect.errors import InputError, OutputError, require_extra
@@ -35,16 +34,7 @@ _PLAIN, _INK = "#7f9fc4", "#202020"
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a panel shows.
-
-    Attributes
-    ----------
-    run : Trajectory
-    frames : (n,) int
-        Its frame at each time that is drawn.
-    values : (n, N) or None
-        What colours the nodes at those times.
-    """
+    """What a panel shows: a run at frames (n,), nodes coloured by values (n, N) or not."""
 
     run: Trajectory
     frames: NDArray[np.int64]
@@ -55,14 +45,8 @@ class Body:
 class Camera:
     """Camera fitted to points.
 
-    Attributes
-    ----------
-    axes : (3, 3)
-        Rows: to the right, upwards, towards the camera.
-    low, high : (3,)
-        Corners of what is seen in these directions, m.
-    size : tuple of int
-        Pixels.
+    Rows of ``axes`` (3, 3) point to the right, upwards and towards the camera; ``low`` and ``high``
+    (3,) are corners of what is seen in these directions, m; ``size`` is in pixels.
     """
 
     axes: Array
@@ -121,18 +105,8 @@ def shown_points(bodies: Sequence[Body], rest: bool) -> Array:
 class Painter:
     """Draws bodies one by one into images of equal size.
 
-    Parameters
-    ----------
-    bodies : sequence of Body
-    view : Camera
-    palette : str
-        Name of a colour map.
-    limit : float
-        Value of its upper end; the lower one is 0.
-    rest : bool
-        Whether to draw the edges of the shape at rest behind the body.
-    colours : sequence of (str, str), optional
-        Of bodies without values, and of their cells' edges, one pair each.
+    The colour map ``palette`` ends at the value ``limit``.  ``rest`` draws the edges of the shape
+    at rest behind the body.  ``colours`` are pairs, of bodies without values and their edges.
     """
 
     def __init__(
@@ -146,11 +120,8 @@ class Painter:
     ) -> None:
         self._pv = _pyvista()
         self._view = view
-        self._plotter = self._pv.Plotter(
-            off_screen=True,
-            window_size=tuple(_OVERSAMPLING * s for s in view.size),
-            lighting="none",
-        )
+        size = tuple(_OVERSAMPLING * s for s in view.size)
+        self._plotter = self._pv.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background("white")
         for place, strength in _LIGHTS:
             self._plotter.add_light(
@@ -201,21 +172,17 @@ class Painter:
         style: dict[str, Any] = {"color": colour}
         if body.values is not None:
             surface["value"] = np.zeros(len(nodes))
-            style = {
-                "scalars": "value",
-                "cmap": self._palette,
-                "clim": (0.0, self._limit),
-                "show_scalar_bar": False,
-            }
-        actors = [
-            self._plotter.add_mesh(surface, ambient=0.5, diffuse=0.55, specular=0.0, **style),
-        ]
-        actors[0].prop.edge_color = edges
+            limits = (0.0, self._limit)
+            style = {"scalars": "value", "cmap": self._palette, "clim": limits}
+            style["show_scalar_bar"] = False
+        drawn = self._plotter.add_mesh(surface, ambient=0.5, diffuse=0.55, specular=0.0, **style)
+        actors = [drawn]
+        drawn.prop.edge_color = edges
         cell = self._view.pixels_a_metre * _edge_length(body.run)
         if cell > 4:
-            actors[0].prop.show_edges = True
-            actors[0].prop.edge_opacity = float(np.clip(cell / 25, 0.15, 0.75))
-            actors[0].prop.line_width = 1.1 * _OVERSAMPLING
+            drawn.prop.show_edges = True
+            drawn.prop.edge_opacity = float(np.clip(cell / 25, 0.15, 0.75))
+            drawn.prop.line_width = 1.1 * _OVERSAMPLING
         if rest:
             outline = self._pv.PolyData.from_regular_faces(body.run.points[nodes], faces)
             outline = outline.extract_feature_edges(30)
@@ -297,28 +264,21 @@ def _write_gif(path: Path, pages: list[Image], fps: float) -> None:
     """All pages share one palette, so that nothing flickers."""
     pil = require_extra("PIL.Image", "view")
     palette = _palette(np.concatenate([pages[k] for k in {0, len(pages) // 2, len(pages) - 1}]))
-    levels = 4.0 * np.arange(64) + 2.0
-    cube = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1)
-    nearest = cKDTree(palette).query(cube)[1].astype(np.uint8)  # (64, 64, 64)
-    drawn = []
-    for page in pages:
-        image = pil.fromarray(nearest[tuple(np.moveaxis(page >> 2, -1, 0))])
-        image.putpalette(palette.astype(np.uint8).tobytes())
-        drawn.append(image)
+    drawn = [pil.fromarray(page).quantize(palette=palette, dither=0) for page in pages]
     duration = max(20, round(1000 / fps))  # ms; browsers slow down faster ones
     drawn[0].save(
         path, save_all=True, append_images=drawn[1:], duration=duration, loop=0, optimize=False
     )
 
 
-def _palette(sample: Image) -> NDArray[np.float64]:
-    """White and 255 other colours (256, 3) for a picture."""
+def _palette(sample: Image) -> Any:
+    """An image whose palette is white and 255 other colours."""
     pil = require_extra("PIL.Image", "view")
     # each colour once, to 8 levels, however often it is used: small things keep theirs
     colours = np.unique(sample.reshape(-1, 3) & 0xF8, axis=0) | 4
-    chosen = pil.fromarray(colours[None]).quantize(255, kmeans=3).getpalette()
-    palette = np.full((256, 3), 255.0)
-    palette[1 : 1 + len(chosen) // 3] = np.reshape(chosen, (-1, 3))[:255]
+    chosen = pil.fromarray(colours[None]).quantize(255, kmeans=3).getpalette()[: 3 * 255]
+    palette = pil.new("P", (1, 1))
+    palette.putpalette([255, 255, 255, *chosen])
     return palette
 
 
@@ -337,10 +297,7 @@ print(pv.__version__, type(window).__name__, found[0] if found else "")
 
 def check_offscreen(timeout: float = 120.0) -> str:
     """Draw a cube in another process, which may crash: "ok (...)" or what to install."""
-    remedy = (
-        "install EGL with `apt-get install libegl1 libgl1` (Debian, Ubuntu) or use a VTK built "
-        "with OSMesa"
-    )
+    remedy = "install EGL (apt-get install libegl1 libgl1) or use a VTK built with OSMesa"
     try:
         probe = subprocess.run(
             [sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=timeout

@@ -34,20 +34,9 @@ class ColourBar:
 class Sheet:
     """Rows and columns of panels, a caption above each, a legend below them all.
 
-    Parameters
-    ----------
-    view : Camera
-        The panels' camera and size.
-    labels : sequence of str
-        One for each panel, row by row; may have several lines.
-    columns : int
-    bar : ColourBar or None
-    font : float
-        Height of the text, pixels.
-    longest : float
-        The last time on any page, s: chooses the unit of times.
-    key : sequence of (str, str), optional
-        Names and their colours, in place of a bar.
+    ``labels``, row by row, may have several lines.  ``font`` is the height of the text, pixels;
+    ``longest`` the last time on any page, s, which chooses the unit of times; ``key`` names and
+    their colours, in place of a bar.
     """
 
     def __init__(

@@ -3,13 +3,24 @@
 Layout: ``positions`` and ``velocities`` (T+1, N, 3), ``times`` (T+1,),
 ``mesh/points``, ``mesh/cells``, ``stats/<name>`` (T,), and ``memory/<name>``
 (T+1, N, 3) if the states remember anything; the scene and the attributes of the
-run are attributes of the file.  The length of ``times`` counts the complete frames.
+run are attributes of the file.
+
+A frame is one chunk, with a checksum, of every growing dataset.  ``times`` counts the
+complete frames, because it is written after the others have reached the file.  While it
+grows the file is in HDF5's single-writer/multiple-reader mode, which keeps readable what
+was flushed: a killed writer and a full disk leave the frames before.
 """
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+import errno
+import io
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -18,24 +29,26 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import part_of, replacing
+from pdcorrect._files import part_of, replacing, write_bytes
 from pdcorrect._version import __version__
 from pdcorrect.errors import InputError, OutputError
-from pdcorrect.io.growing_file import Column, GrowingFile
 from pdcorrect.io.trajectory_reader import (
     FORMAT,
     RESERVED,
     VERSION,
+    file_end,
     load_trajectory,
-    read_storage,
     trajectory_fault,
+    written_by,
 )
 from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Trajectory
 
 __all__ = ["TrajectoryWriter", "load_trajectory", "save_trajectory"]
 
-_FLOAT = np.dtype(np.float64)
+_LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
+_STATUS = h5py.string_dtype("ascii", 32)
+_FILL = {"f": np.nan, "i": -1, "S": b""}
 
 
 class TrajectoryWriter:
@@ -59,8 +72,6 @@ class TrajectoryWriter:
         Solver, refinement and the like.
     overwrite : bool
         Replace an existing file, at once.
-    compress : bool
-        gzip with byte shuffling; smaller files, slower writing.
 
     Raises
     ------
@@ -85,7 +96,6 @@ class TrajectoryWriter:
         scene_toml: str = "",
         attributes: Mapping[str, str] | None = None,
         overwrite: bool = False,
-        compress: bool = False,
     ) -> None:
         first = Trajectory(
             positions=initial.positions[None],
@@ -99,25 +109,30 @@ class TrajectoryWriter:
             memory={name: array[None] for name, array in initial.memory.items()},
         )
         _refuse(first)
-        self._shape = first.points.shape
-        self._file = GrowingFile(
-            Path(path),
-            _frame_columns(self._shape) | _memory_columns(initial.memory, self._shape),
-            "times",
-            _entries(initial),
-            _file_attributes(first),
-            {"mesh/points": first.points, "mesh/cells": first.cells},
-            overwrite=overwrite,
-            compress=compress,
-        )
-        self._time = initial.time
+        self.path = Path(path)
+        _check_target(self.path, overwrite)
+        self._shape, self._time = first.points.shape, initial.time
+        self._frames = 0
+        self._growing: list[str] = []  # datasets but for times
+        self._broken, self._reserved = False, 0
+        with io.BytesIO() as memory:  # HDF5 may crash where a disk is full
+            with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
+                for name, value in _file_attributes(first).items():
+                    self._file.attrs[name] = _of_fixed_length(value)
+                for name, mesh in {"points": first.points, "cells": first.cells}.items():
+                    self._file.create_dataset(
+                        f"mesh/{name}", data=mesh, chunks=mesh.shape, fletcher32=True
+                    )
+                self._add(_entries(initial, {}))
+                self._write(_entries(initial, {}))
+            write_bytes(self.path, memory.getvalue())
 
     @classmethod
     def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
-        """Reopen a finished or interrupted file, to append after its last complete frame.
+        """Continue a finished or interrupted file after its last complete frame.
 
-        A file that was not closed, or has a damaged or half-written frame, is
-        first rewritten without it; until that is done the old one stays.
+        The file is first rewritten, without what is damaged or half written; until that is done
+        the old one stays.
 
         Parameters
         ----------
@@ -137,35 +152,42 @@ class TrajectoryWriter:
             If the file cannot be rewritten; it is unchanged.
         """
         path = Path(path)
-        stored = read_storage(path)
-        if stored.version != __version__:
+        version = written_by(path)
+        if version != __version__:
             raise InputError(
-                f"{path}: written by pdcorrect {stored.version}, this is {__version__}: continue "
+                f"{path}: written by pdcorrect {version}, this is {__version__}: continue "
                 "it with the version that began it, or start again."
             )
         run = load_trajectory(path, salvage=True) if run is None else run
+        part_of(part_of(path)).unlink(missing_ok=True)  # of a killed process
+        try:
+            with replacing(path) as part:
+                writer = cls._written(part, run, overwrite=True)
+        except OSError as error:
+            raise OutputError(
+                f"{path}: is unchanged, but the copy to continue with failed: {error}"
+            ) from error
+        writer.path = path
+        return writer
+
+    @classmethod
+    def _written(cls, path: Path, run: Trajectory, overwrite: bool) -> TrajectoryWriter:
+        """The writer of a whole trajectory, closed: it opens the file again for more."""
         _refuse(run)
-        file = _reopened(path, run)
-        if file is None:
-            _rewrite(path, run, stored.compressed)
-            file = _reopened(path, run)
-        if file is None:
-            raise OutputError(f"{path}: has changed meanwhile; is another process writing it?")
-        for stale in (part_of(path), part_of(part_of(path))):  # of a killed process
-            stale.unlink(missing_ok=True)
-        writer = cls.__new__(cls)
-        writer._file, writer._shape, writer._time = file, run.points.shape, float(run.times[-1])
+        with cls(
+            path, run.points, run.cells, run.state(0), scene_toml=run.scene_toml,
+            attributes=run.attributes, overwrite=overwrite,
+        ) as writer:  # fmt: skip
+            for k in range(len(run)):
+                values = {name: array[k] for name, array in run.stats.items()}
+                writer.append_values(run.state(k + 1), values)
         return writer
 
     @property
-    def path(self) -> Path:
-        """The file."""
-        return self._file.path
-
-    @property
     def steps(self) -> int:
-        """Steps in the file, the initial state not counted."""
-        return self._file.complete - 1
+        """Steps in the file, also where a signal came before the last was counted."""
+        open_now = self._file and not self._broken
+        return (len(self._file["times"]) if open_now else self._frames) - 1
 
     def __enter__(self) -> TrajectoryWriter:
         return self
@@ -199,19 +221,33 @@ class TrajectoryWriter:
         self.append_values(result.state, values)
 
     def append_values(self, state: State, values: Mapping[str, Any]) -> None:
-        """Write one frame with statistics by name: numbers, and ``status`` as text."""
-        columns = _stats_columns(values) | _memory_columns(state.memory, self._shape)
+        """Write one frame with statistics by name: numbers, and ``status`` as text.
+
+        Those that other frames have are NaN, -1 or empty where they are left out.
+        """
+        _check_names(values, state.memory)
         self._check(state)
-        entries = {f"stats/{name}": value for name, value in values.items()}
-        self._file.append(entries | _entries(state), columns)
+        if self._broken:
+            raise OutputError(f"{self.path}: nothing more can be written after a failure.")
+        entries = _entries(state, values)
+        new = {n: x for n, x in entries.items() if n not in (*self._growing, "times")}
+        if new or not self._file:
+            self._open(new)
+        with self._reporting():
+            self._reserve(entries)
+            self._write(entries)
         self._time = state.time
 
     def close(self) -> None:
         """Finish the file; harmless when repeated."""
-        self._file.close()
+        if self._file and not self._broken:
+            with self._reporting():
+                self._file.close()
+                if self._reserved:
+                    os.truncate(self.path, file_end(self.path))
 
     def _check(self, state: State) -> None:
-        where = f"{self.path}: frame {self._file.records}"
+        where = f"{self.path}: frame {self._frames}"
         if state.positions.shape != self._shape:
             raise InputError(f"{where}: {state.positions.shape} positions, expected {self._shape}.")
         arrays = (state.positions, state.velocities, *state.memory.values())
@@ -220,13 +256,82 @@ class TrajectoryWriter:
         if not state.time > self._time:
             raise InputError(f"{where}: time {state.time} s, expected more than {self._time} s.")
 
+    def _open(self, new: Mapping[str, Any]) -> None:
+        """Open the file, with more datasets; they are added to a copy that then replaces it."""
+        self.close()
+        with self._reporting():
+            if new:
+                with io.BytesIO(self.path.read_bytes()) as memory:
+                    with h5py.File(memory, "r+", libver=_LIBRARY) as self._file:
+                        self._add(new)
+                    write_bytes(self.path, memory.getvalue())
+            self._reserved = 0
+            self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
+            self._file.swmr_mode = True
 
-def save_trajectory(
-    path: str | Path, trajectory: Trajectory, overwrite: bool = False, compress: bool = False
-) -> None:
+    def _reserve(self, entries: Mapping[str, Any]) -> None:
+        """Make room for a frame and the blocks of its index: HDF5 may crash on a full disk."""
+        size = 2 * sum(np.asarray(entry).nbytes for entry in entries.values())
+        size += 256 * (16 + math.isqrt(self._frames)) * len(entries) + 32768
+        used = self._file.id.get_filesize()
+        if used + size <= self._reserved or not hasattr(os, "posix_fallocate"):
+            return
+        with self.path.open("r+b") as file:
+            try:
+                os.posix_fallocate(file.fileno(), used, size)
+            except OSError as error:
+                if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS):
+                    raise
+        self._reserved = used + size
+
+    def _add(self, entries: Mapping[str, Any]) -> None:
+        """Create growing datasets, with the fill value for the frames before."""
+        for name, value in entries.items():
+            dtype, shape, before = _stored_type(value), np.shape(value), self._place(name)
+            dataset = self._file.create_dataset(
+                name, (before, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape),
+                fillvalue=_FILL[dtype.kind], fletcher32=True,
+            )  # fmt: skip
+            if before:
+                dataset[...] = _FILL[dtype.kind]
+        self._growing += [name for name in entries if name != "times"]
+
+    def _write(self, entries: Mapping[str, Any]) -> None:
+        for name in self._growing:
+            self._extend(name, entries)
+        self._file.flush()
+        self._extend("times", entries)
+        self._file.flush()
+        self._frames += 1
+
+    def _extend(self, name: str, entries: Mapping[str, Any]) -> None:
+        dataset, place = self._file[name], self._place(name)
+        dataset.resize(place + 1, axis=0)
+        dataset[place] = entries.get(name, _FILL[dataset.dtype.kind])
+
+    def _place(self, name: str) -> int:
+        """Of the next frame in a dataset: statistics begin with the first step."""
+        return self._frames - name.startswith("stats/")
+
+    @contextlib.contextmanager
+    def _reporting(self) -> Iterator[None]:
+        """Turn what HDF5 raises into `OutputError`, and give the file up."""
+        try:
+            yield
+        except (OSError, RuntimeError, ValueError) as error:
+            self._broken = True
+            if self._file:
+                _abandon(self._file, self.path)
+            number = getattr(error, "errno", None)
+            reason = " ".join(str(error).split()) if number is None else os.strerror(number)
+            raise OutputError(
+                f"{self.path}: cannot be written ({reason}); its first {self._frames} "
+                "frames are intact. Free some space or choose another place."
+            ) from error
+
+
+def save_trajectory(path: str | Path, trajectory: Trajectory, overwrite: bool = False) -> None:
     """Write a whole trajectory; `load_trajectory` returns the same arrays, bit by bit.
-
-    Parameters are those of `TrajectoryWriter`.
 
     Raises
     ------
@@ -235,20 +340,7 @@ def save_trajectory(
     OutputError
         If the file cannot be written.
     """
-    _refuse(trajectory)
-    with TrajectoryWriter(
-        path,
-        trajectory.points,
-        trajectory.cells,
-        trajectory.state(0),
-        scene_toml=trajectory.scene_toml,
-        attributes=trajectory.attributes,
-        overwrite=overwrite,
-        compress=compress,
-    ) as writer:
-        for k in range(len(trajectory)):
-            values = {name: array[k] for name, array in trajectory.stats.items()}
-            writer.append_values(trajectory.state(k + 1), values)
+    TrajectoryWriter._written(Path(path), trajectory, overwrite)
 
 
 def _refuse(trajectory: Trajectory) -> None:
@@ -258,64 +350,42 @@ def _refuse(trajectory: Trajectory) -> None:
     taken = sorted(set(trajectory.attributes) & RESERVED)
     if taken:
         raise InputError(f"attribute {taken[0]!r} is the file's own: choose another name.")
-    _columns(trajectory)
+    _check_names(trajectory.stats, trajectory.memory)
 
 
-def _reopened(path: Path, run: Trajectory) -> GrowingFile | None:
-    return GrowingFile.reopen(path, _columns(run), "times", len(run.times), _file_attributes(run))
-
-
-def _rewrite(path: Path, run: Trajectory, compress: bool) -> None:
-    try:
-        with replacing(path) as part:
-            save_trajectory(part, run, overwrite=True, compress=compress)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: is unchanged, but the copy to continue with failed: {error}"
-        ) from error
-
-
-def _entries(state: State) -> dict[str, Any]:
-    memory = {f"memory/{name}": array for name, array in state.memory.items()}
-    return memory | {
-        "positions": state.positions, "velocities": state.velocities, "times": state.time
-    }  # fmt: skip
-
-
-def _columns(run: Trajectory) -> dict[str, Column]:
-    """All growing datasets of a run's file."""
-    values = {name: array[0] if len(array) else array for name, array in run.stats.items()}
-    stats, shape = _stats_columns(values), run.points.shape
-    fixed = _frame_columns(shape) | _memory_columns(run.memory, shape)
-    return fixed | stats if len(run) else fixed  # statistics come with the first step
-
-
-def _frame_columns(shape: tuple[int, ...]) -> dict[str, Column]:
-    nodal = Column(_FLOAT, shape)
-    return {"positions": nodal, "velocities": nodal, "times": Column(_FLOAT)}
-
-
-def _memory_columns(memory: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, Column]:
+def _check_names(stats: Mapping[str, Any], memory: Mapping[str, Any]) -> None:
     for name in memory:
         if name in ("", ".") or "/" in name:
             raise InputError(f"memory {name!r}: expected a name without '/'.")
-    return {f"memory/{name}": Column(_FLOAT, shape) for name in memory}
+    for name, value in stats.items():
+        kind = np.asarray(value).dtype.kind
+        expected = "U" if name == "status" else "iubf"
+        if name in ("", ".") or "/" in name or kind not in expected:
+            raise InputError(f"stats {name!r} of kind {kind!r}: expected numbers, status as text.")
 
 
-def _stats_columns(values: Mapping[str, Any]) -> dict[str, Column]:
-    return {f"stats/{name}": _column(name, value) for name, value in values.items()}
+def _check_target(path: Path, overwrite: bool) -> None:
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path}: is a folder, a device or a pipe; give the name of a file.")
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"{path}: exists already; choose another name, overwrite it with --overwrite "
+            "(overwrite=True), or continue it with --resume (TrajectoryWriter.resume)."
+        )
 
 
-def _column(name: str, value: Any) -> Column:
-    """How a statistic is stored: text, 64-bit integers or floats."""
+def _entries(state: State, values: Mapping[str, Any]) -> dict[str, Any]:
+    """A frame, by the names of the datasets."""
+    stats = {f"stats/{name}": value for name, value in values.items()}
+    memory = {f"memory/{name}": array for name, array in state.memory.items()}
+    nodal = {"positions": state.positions, "velocities": state.velocities}
+    return stats | memory | nodal | {"times": state.time}
+
+
+def _stored_type(value: Any) -> np.dtype[Any]:
+    """Text, 64-bit integers or floats."""
     kind = np.asarray(value).dtype.kind
-    if name in ("", ".") or "/" in name or (kind == "U") != (name == "status"):
-        raise InputError(f"stats {name!r} of kind {kind!r}: expected numbers, and status as text.")
-    if kind == "U":
-        return Column(np.dtype(h5py.string_dtype("ascii", 32)), first=1)
-    if kind not in "iubf":
-        raise InputError(f"stats {name!r} of kind {kind!r}: expected real numbers.")
-    return Column(_FLOAT if kind == "f" else np.dtype(np.int64), first=1)
+    return np.dtype(_STATUS if kind == "U" else np.float64 if kind == "f" else np.int64)
 
 
 def _file_attributes(trajectory: Trajectory) -> dict[str, str | int]:
@@ -326,3 +396,24 @@ def _file_attributes(trajectory: Trajectory) -> dict[str, str | int]:
         "scene_toml": trajectory.scene_toml,
         "pdcorrect_version": __version__,
     }
+
+
+def _of_fixed_length(value: str | int) -> Any:
+    """Text as it lies under the checksum of the file's index."""
+    if not isinstance(value, str):
+        return value
+    data = value.encode()
+    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+
+
+def _abandon(file: Any, path: Path) -> None:
+    """Close an h5py file that can no longer be written, without changing it on the disk.
+
+    HDF5, which would write its metadata, finishes on a scratch copy, if there is room for one.
+    """
+    with contextlib.suppress(Exception), tempfile.TemporaryFile() as scratch:
+        with path.open("rb") as original:
+            shutil.copyfileobj(original, scratch)
+        scratch.flush()
+        os.dup2(scratch.fileno(), file.id.get_vfd_handle())
+        file.close()

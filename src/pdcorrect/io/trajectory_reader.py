@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -11,7 +14,6 @@ import h5py
 import numpy as np
 
 from pdcorrect.errors import FileFormatError, InputError
-from pdcorrect.io.superblock import RepairedFile, Superblock, read_superblock
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
@@ -43,46 +45,111 @@ def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
         If the file cannot be read, is not a trajectory, or is damaged; says
         which, and how many frames could be salvaged.
     """
-    with _opened(Path(path)) as (file, block):
-        return _read(file, block, salvage)
+    with _opened(Path(path)) as (file, extent):
+        return _read(file, extent, salvage)
 
 
-class Storage(NamedTuple):
-    """How a file is stored: with gzip or not, and the pdcorrect that wrote it."""
-
-    compressed: bool
-    version: str
-
-
-def read_storage(path: Path) -> Storage:
-    """What rewriting a trajectory file has to keep; raises as `load_trajectory`."""
+def written_by(path: Path) -> str:
+    """The version of pdcorrect that wrote a trajectory file; raises as `load_trajectory`."""
     with _opened(path) as (file, _):
         _check_format(file)
-        known = "pdcorrect_version" in file.attrs
-        version = _attribute(file, "pdcorrect_version") if known else "of an unknown version"
-        return Storage(file["positions"].compression is not None, version)
+        name = "pdcorrect_version"
+        return _attribute(file, name) if name in file.attrs else "of an unknown version"
+
+
+class _Extent(NamedTuple):
+    """Bytes that a file has and should have, and whether its writer never closed it."""
+
+    size: int
+    end: int
+    in_writing: bool
+
+    @property
+    def truncated(self) -> bool:
+        return self.size < self.end
+
+    def lost(self) -> str:
+        return f"expected {self.end} bytes, got {self.size}"
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Superblock]]:
+def _opened(path: Path) -> Iterator[tuple[Any, _Extent]]:
     """A file, open; whatever its content makes HDF5 raise becomes `FileFormatError`."""
-    block = read_superblock(path)
+    extent = _extent(path)
     try:
-        whole = not (block.truncated or block.in_writing)
-        with h5py.File(path if whole else RepairedFile(path, block), "r", locking=False) as file:
-            yield file, block
+        unfinished = extent.truncated or extent.in_writing
+        source = io.BytesIO(_closed(path.read_bytes(), extent)) if unfinished else path
+        with h5py.File(source, "r", locking=False) as file:
+            yield file, extent
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}.") from None
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
-        lost = f"truncated ({_lost(block)})" if block.truncated else "damaged"
+        lost = f"truncated ({extent.lost()})" if extent.truncated else "damaged"
         reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
         raise FileFormatError(
             f"{path}: {lost}, with its index lost, so that no frame can be read ({reason})."
         ) from error
 
 
-def _lost(block: Superblock) -> str:
-    return f"expected {block.end} bytes, got {block.size}"
+_SUPERBLOCK = struct.Struct("<9sBxB16xQ8xI")
+"""HDF5's first bytes, version 3: signature, size of offsets, flags, end of file, checksum."""
+_WORD = 0xFFFFFFFF
+_SIGNATURE = b"\x89HDF\r\n\x1a\n\x03"
+
+
+def _extent(path: Path) -> _Extent:
+    try:
+        with path.open("rb") as file:
+            head, size = file.read(_SUPERBLOCK.size), os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from None
+    if len(head) < _SUPERBLOCK.size:
+        raise FileFormatError(f"{path}: truncated: no frame is left in {size} bytes.")
+    signature, offsets, flags, end, checksum = _SUPERBLOCK.unpack(head)
+    if signature != _SIGNATURE or offsets != 8:  # of another program: HDF5 checks it
+        return _Extent(size, 0, False)
+    if checksum != _lookup3(head[:-4]):
+        raise FileFormatError(f"{path}: damaged: the checksum of its first bytes is wrong.")
+    return _Extent(size, end, flags != 0)
+
+
+def file_end(path: Path) -> int:
+    """Bytes that HDF5 has used of a closed file of its own."""
+    return _extent(path).end
+
+
+def _closed(data: bytes, extent: _Extent) -> bytes:
+    """A file's content as if its writer had closed it, filled up to its whole length.
+
+    HDF5 refuses it as it is, and its reading mode for files in writing waits for ever where
+    something is damaged.  Every index and chunk of a trajectory has a checksum, so what is filled
+    in is noticed and never taken for data; zeros would be, whose checksum is zero.
+    """
+    end = max(extent.size, extent.end)
+    head = bytearray(data[: _SUPERBLOCK.size])
+    struct.pack_into("<B", head, 11, 0)
+    struct.pack_into("<Q", head, 28, end)
+    struct.pack_into("<I", head, 44, _lookup3(bytes(head[:44])))
+    return (bytes(head) + data[len(head) :]).ljust(end, b"\1")
+
+
+def _lookup3(data: bytes) -> int:
+    """Bob Jenkins's lookup3 hash of the superblock's 44 bytes, HDF5's checksum of metadata."""
+    a = b = c = (0xDEADBEEF + len(data)) & _WORD
+    *blocks, last = struct.iter_unpack("<3I", data.ljust(48, b"\0"))
+    for x, y, z in blocks:
+        a, b, c = (a + x) & _WORD, (b + y) & _WORD, (c + z) & _WORD
+        for shift in (4, 6, 8, 16, 19, 4):
+            a = ((a - c) & _WORD) ^ _rotated(c, shift)
+            a, b, c = b, (c + b) & _WORD, a
+    a, b, c = ((p + q) & _WORD for p, q in zip((a, b, c), last, strict=True))
+    for shift in (14, 11, 25, 16, 4, 14, 24):
+        a, b, c = b, ((c ^ b) - _rotated(b, shift)) & _WORD, a
+    return b
+
+
+def _rotated(x: int, k: int) -> int:
+    return ((x << k) | (x >> (32 - k))) & _WORD
 
 
 def trajectory_fault(trajectory: Trajectory) -> str | None:
@@ -139,7 +206,7 @@ def _stats_fault(trajectory: Trajectory, steps: int) -> str | None:
     return f"status {sorted(unknown)[0]!r} is unknown" if unknown else None
 
 
-def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
+def _read(file: Any, extent: _Extent, salvage: bool) -> Trajectory:
     _check_format(file)
     remembered = list(file["memory"]) if "memory" in file else []
     names = ("positions", "velocities", "times", *(f"memory/{name}" for name in remembered))
@@ -149,16 +216,17 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
     datasets = {name: file[name] for name in names}
     frames = datasets["times"].shape[0]
     stats = dict(file["stats"].items()) if "stats" in file else {}
-    if salvage or block.truncated or block.in_writing:
-        intact = _intact_frames([*datasets.values()], [*stats.values()], frames, block.size)
-        if not salvage and block.truncated and (intact < frames or not block.in_writing):
+    if salvage or extent.truncated or extent.in_writing:
+        intact = _intact_frames([*datasets.values()], [*stats.values()], frames)
+        if not salvage and extent.truncated and (intact < frames or not extent.in_writing):
             raise FileFormatError(
-                f"truncated: {_lost(block)}; {intact} of its {frames} frames are intact, which "
+                f"truncated: {extent.lost()}; {intact} of its {frames} frames are intact, which "
                 "load_trajectory(path, salvage=True) reads"
             )
         frames = intact
     try:
-        frames = _written(datasets["times"][:frames])
+        written = np.flatnonzero(~np.isnan(datasets["times"][:frames]))
+        frames = int(written.max(initial=-1)) + 1
         arrays = {name: dataset[:frames] for name, dataset in datasets.items()}
         values = {name: dataset[: max(0, frames - 1)] for name, dataset in stats.items()}
     except OSError as error:
@@ -171,7 +239,10 @@ def _read(file: Any, block: Superblock, salvage: bool) -> Trajectory:
         positions=arrays["positions"],
         velocities=arrays["velocities"],
         times=arrays["times"],
-        stats={name: _text(v) if v.dtype.kind == "S" else v for name, v in values.items()},
+        stats={
+            name: np.char.decode(array, "ascii") if array.dtype.kind == "S" else array
+            for name, array in values.items()
+        },
         points=file["mesh/points"][...],
         cells=file["mesh/cells"][...].astype(np.int64, copy=False),
         scene_toml=_attribute(file, "scene_toml"),
@@ -203,49 +274,21 @@ def _attribute(file: Any, name: str) -> str:
     return value.decode("utf-8") if isinstance(value, bytes) else str(value)
 
 
-def _written(times: Any) -> int:
-    """Number of frames that were complete: a time that was not written yet is NaN."""
-    written = np.flatnonzero(~np.isnan(times))
-    return int(written[-1]) + 1 if len(written) else 0
-
-
-def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int, size: int) -> int:
-    """Number of leading frames whose every chunk is complete and has the right checksum."""
-    stored = {dataset: _chunks(dataset, size) for dataset in (*frame_data, *step_data)}
+def _intact_frames(frame_data: list[Any], step_data: list[Any], frames: int) -> int:
+    """Number of leading frames whose every chunk is there and has the right checksum."""
     for k in range(frames):
         parts = [(dataset, k) for dataset in frame_data]
         parts += [(dataset, k - 1) for dataset in step_data if k]
-        if not all(_intact(dataset, index, stored[dataset]) for dataset, index in parts):
+        if not all(_is_intact(*part) for part in parts):
             return k
     return frames
 
 
-def _chunks(dataset: Any, size: int) -> set[int]:
-    """First index of each chunk that lies in the first ``size`` bytes of the file."""
-    found: set[int] = set()
-
-    def note(chunk: Any) -> None:
-        if chunk.byte_offset is not None and chunk.byte_offset + chunk.size <= size:
-            found.add(chunk.chunk_offset[0])
-
-    with contextlib.suppress(OSError, RuntimeError, ValueError):  # those before the damage count
-        if dataset.chunks:
-            dataset.id.chunk_iter(note)
-    return found
-
-
-def _intact(dataset: Any, index: int, stored: set[int]) -> bool:
-    if dataset.chunks and index - index % dataset.chunks[0] not in stored:
-        return False
+def _is_intact(dataset: Any, index: int) -> bool:
     try:
-        dataset[index]
+        return dataset[index] is not None
     except (OSError, RuntimeError, ValueError):
         return False
-    return True
-
-
-def _text(values: Any) -> Any:
-    return np.char.decode(values, "ascii")
 
 
 _ROUNDING = 1e-9
@@ -256,15 +299,8 @@ def problem_of(run: Trajectory) -> Problem:
     """The run's own problem, or one made anew from the scene that its file holds.
 
     Its density is the scene's, also where the run had another one, as of `with_total_mass`:
-    Cauchy stress at given positions does not depend on it.
-
-    Raises
-    ------
-    InputError
-        If the file does not say enough: it holds no scene, or only a part of the nodes, or its
-        moduli were changed after the scene had been read.
-    SceneError, MeshError
-        If the scene cannot be read or discretised, as where the file of its mesh is gone.
+    Cauchy stress at given positions does not depend on it.  `InputError` is raised if the file does
+    not say enough or its mesh is not the scene's, and what the scene raises.
     """
     if run.problem is not None:
         return run.problem

@@ -97,13 +97,7 @@ def write_vtu_series(
 
 
 def delete_vtu_series(folder: Path, name: str) -> None:
-    """Delete ``name.pvd`` and then its frames, and no other series' files.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be deleted.
-    """
+    """Delete ``name.pvd`` and then its frames, and no other series' files."""
     _delete(folder / f"{name}.pvd")
     _delete_frames(folder, name, but=())
 

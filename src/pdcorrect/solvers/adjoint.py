@@ -17,22 +17,28 @@ much.  On a kink of the energy (see `energies`) they are those of the branch tha
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import InputError
-from pdcorrect.solvers.adjoint_solve import (
-    AdjointSolver,
-    check_solver,
-)
+from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.internal_modes import Condensed
+from pdcorrect.solvers.adjoint_solve import AdjointSolver
 from pdcorrect.solvers.gradients import Gradients, TakenStep
 from pdcorrect.solvers.implicit import ImplicitStepper, positive, quiet_blas
-from pdcorrect.solvers.step import nodal_array
-from pdcorrect.solvers.step_solution import step_solution
+from pdcorrect.solvers.integrators import Integrator, equal_steps, solution
+from pdcorrect.solvers.step import StepObjective, nodal_array
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
+
+_MODE_STEPS, _SETTLED = 100, 1e-13
+"""Newton steps to find internal modes, and the last one's length, of the cell size."""
+_BALANCE = 10.0
+"""Of the residual that a step reports.  Its internal modes need not be in equilibrium."""
+_ROUNDING = 1e-11
+"""Of positions: what they are off by moves the residual by the stiffness times that."""
 
 
 def adjoint(
@@ -86,11 +92,24 @@ def adjoint(
     ConvergenceError
         If the linear system cannot be solved.
     """
-    check_solver(solver)
+    if solver not in get_args(AdjointSolver):
+        raise InputError(f"solver = {solver!r}: expected {', '.join(get_args(AdjointSolver))}.")
     positive("tolerance", tolerance)
-    _check_status(result.status)
+    if not result.status.ok:
+        raise InputError(f"the step {result.status.value}: expected one that has a result.")
+    if result.status is Status.SUBSTEPPED:
+        raise InputError(
+            "the step converged only in smaller parts, which are steps of their own: expected a "
+            "step in one. Take smaller time steps, and the adjoint of each."
+        )
     grad_memory = grad_memory or {}
-    _check_names(grad_memory, result.state)
+    known = result.state.memory
+    unknown = [name for name in grad_memory if name not in known]
+    if unknown:
+        raise InputError(
+            f"grad_memory has {', '.join(unknown)}: expected names in the memory of the state "
+            f"after the step ({', '.join(known) or 'it has none'})."
+        )
     after = {"positions": grad_positions, "velocities": grad_velocities, **grad_memory}
     checked = {
         name: np.zeros_like(state.positions)
@@ -107,20 +126,58 @@ def adjoint(
         return Gradients(step, checked, y)
 
 
-def _check_status(status: Status) -> None:
-    if not status.ok:
-        raise InputError(f"the step {status.value}: expected one that has a result.")
-    if status is Status.SUBSTEPPED:
+def step_solution(
+    objective: StepObjective, integrate: Integrator, time_step: float, result: StepResult
+) -> Array:
+    """Y (N + B, 3) of the step that ``objective`` belongs to.
+
+    `InputError` is raised if the result is not that step's: it is at another time, or out of
+    balance by more than it reports; `ConvergenceError` if internal modes are not found.
+    """
+    problem = objective.problem
+    taken = result.state.time - objective.state.time
+    if not equal_steps(taken, time_step):
         raise InputError(
-            "the step converged only in smaller parts, which are steps of their own: expected a "
-            "step in one. Take smaller time steps, and the adjoint of each."
+            f"the result is {taken:g} s after the state, but time_step = {time_step:g} s: expected "
+            "the state that the step started from and the time step that it was given."
+        )
+    scheme = integrate.scheme(objective.state, time_step)
+    y = solution(scheme, objective.state, result.state, problem)
+    objective.follow(y)
+    damping = problem.scene.damping
+    if (damping.stiffness or damping.viscosity) and problem.space.internal:
+        y = _damped_modes(objective, y)
+    _check_balance(objective, y, result)
+    return y
+
+
+def _check_balance(objective: StepObjective, y: Array, result: StepResult) -> None:
+    _, gradient = objective.value_and_gradient(y)
+    found, allowed = float(np.abs(gradient).max()), _BALANCE * result.residual
+    if found <= allowed:
+        return
+    stiffest = float(objective.problem.scalar_matrix(*objective.factors).diagonal().max())
+    if not found <= allowed + _ROUNDING * stiffest * float(np.abs(y).max()):
+        raise InputError(
+            f"the result is out of balance by {found:.2g} N as a step from this state with these "
+            f"forces, but reports {result.residual:.2g} N: expected the stepper, state and forces "
+            "that it was made with."
         )
 
 
-def _check_names(grad_memory: Mapping[str, Array], after: State) -> None:
-    unknown = [name for name in grad_memory if name not in after.memory]
-    if unknown:
-        raise InputError(
-            f"grad_memory has {', '.join(unknown)}: expected names in the memory of the state "
-            f"after the step ({', '.join(after.memory) or 'it has none'})."
-        )
+def _damped_modes(objective: StepObjective, y: Array) -> Array:
+    """Y with internal modes in equilibrium with their damping too, by Newton's method."""
+    problem, nodes = objective.problem, len(objective.problem.positions)
+    for _ in range(_MODE_STEPS):
+        _, gradient = objective.value_and_gradient(y)
+        gradient[:nodes] = 0.0
+        blocks = objective.cell_hessians(y, project=True)
+        following = Condensed(blocks, problem.space.local, problem.cells.shape[1])
+        change = following.recovered(np.zeros((nodes, 3)), gradient)
+        y = y - change
+        if np.abs(change).max() <= _SETTLED * problem.cell_size:
+            return y
+    raise ConvergenceError(
+        f"internal modes of the step are not in equilibrium after {_MODE_STEPS} Newton steps: "
+        "expected a state that a step converged to."
+    )

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,18 +34,14 @@ _FIXED_POINT_STEPS = 20000
 _DIRECT_STEPS = 4
 """The first solution and refinements: LU pivots little, GMRES looks at another norm."""
 _HOPELESS = 1e3
-"""Growth of the fixed point's change at which it is given up."""
+"""Growth of the residual at which iterations are given up."""
 
 
 @dataclass(frozen=True, eq=False)
 class AdjointOperator:
     """x -> (dr/dy)^T x for the residual r of a step's equation.
 
-    Attributes
-    ----------
-    hessian : HessianOperator
-    loads : callable or None
-        Nodal x (N, 3) -> derivatives of x . (loads that follow the body) by the positions.
+    ``loads`` gives, for nodal x (N, 3), derivatives of x . (loads that follow the body).
     """
 
     hessian: HessianOperator
@@ -66,25 +62,13 @@ class AdjointOperator:
 class AdjointSolution:
     """X (N + B, 3) with H x = g on the free components, zero where clamped.
 
-    Attributes
-    ----------
-    solver : str
-        What found it.
-    iterations : int
-    residual : float
-        |g - H x| / |g|.
+    ``solver`` is what found it, ``residual`` |g - H x| / |g|.
     """
 
     x: Array
     solver: str
     iterations: int
     residual: float
-
-
-def check_solver(name: str) -> None:
-    """Refuse a name that is no `AdjointSolver`."""
-    if name not in get_args(AdjointSolver):
-        raise InputError(f"solver = {name!r}: expected {', '.join(get_args(AdjointSolver))}.")
 
 
 def solve_adjoint(
@@ -95,30 +79,18 @@ def solve_adjoint(
     global_solver: Callable[[], Solve],
     tolerance: float,
 ) -> AdjointSolution:
-    """Solve H x = g.
+    """Solve H x = g for g (N + B, 3) that is zero where clamped.
 
-    Parameters
-    ----------
-    H : AdjointOperator
-    g : (N + B, 3)
-        Zero where clamped.
-    solver : str
-        "auto" is conjugate gradients, and a direct solution where they fail; with loads
-        that follow the body GMRES, as is "direct" with a factor of the symmetric part.
-    precondition, global_solver : callable
-        Make the preconditioner of conjugate gradients, and G^-1.
-    tolerance : float
-        Of the residual, relative.
-
-    Raises
-    ------
-    ConvergenceError
-        If the method asked for does not reach the tolerance, as where H is singular.
+    "auto" is conjugate gradients, and a direct solution where they fail; with loads that follow
+    the body GMRES, as is "direct" with a factor of the symmetric part.  ``precondition`` and
+    ``global_solver`` make the preconditioner of conjugate gradients and G^-1.  Where the method
+    asked for does not reach the relative tolerance, as where H is singular, `ConvergenceError` is
+    raised.
     """
     if not g.any():
         return AdjointSolution(np.zeros_like(g), "none needed", 0, 0.0)
     if solver == "fixed-point":
-        return _fixed_point(H, g, global_solver(), tolerance)
+        return _iterated(H, g, global_solver(), tolerance, solver, _FIXED_POINT_STEPS)
     if H.loads is not None:
         if solver == "cg":
             raise InputError(
@@ -138,7 +110,7 @@ def solve_adjoint(
                 f"adjoint by conjugate gradients: {why} in {found.steps} steps, expected a state "
                 "that a step converged to. Use solver='direct'."
             )
-    return _direct(H, g, tolerance)
+    return _iterated(H, g, _factor(H), tolerance, "direct", _DIRECT_STEPS)
 
 
 def _residual(H: AdjointOperator, g: Array, x: Array) -> tuple[Array, float]:
@@ -147,34 +119,28 @@ def _residual(H: AdjointOperator, g: Array, x: Array) -> tuple[Array, float]:
     return r, float(np.linalg.norm(r) / np.linalg.norm(g))
 
 
-def _fixed_point(H: AdjointOperator, g: Array, solve: Solve, tolerance: float) -> AdjointSolution:
+_ADVICE = {
+    "fixed-point": "Use solver='auto': the spectral radius of G^-1 (G - H) is not well under 1.",
+    "direct": "If it is large, the Hessian at this state is singular and the step has no slope "
+    "there; if it is small, use a larger tolerance.",
+}
+
+
+def _iterated(
+    H: AdjointOperator, g: Array, solve: Solve, tolerance: float, solver: str, most: int
+) -> AdjointSolution:
+    """By x <- x + solve(g - H x): the fixed point with G^-1, refinement with factors of H."""
     x, r = np.zeros_like(g), g
-    for step in range(1, _FIXED_POINT_STEPS + 1):
+    for step in range(1, most + 1):
         x = x + solve(r)
         r, left = _residual(H, g, x)
         if left <= tolerance:
-            return AdjointSolution(x, "fixed-point", step, left)
+            return AdjointSolution(x, solver, step, left)
         if not left < _HOPELESS:
             break
     raise ConvergenceError(
-        f"adjoint by the fixed point: relative residual {left:.1e} after {step} steps, expected "
-        "a spectral radius of G^-1 (G - H) well below 1. Use solver='auto'."
-    )
-
-
-def _direct(H: AdjointOperator, g: Array, tolerance: float) -> AdjointSolution:
-    """By a sparse LU factorisation of H, which may be indefinite, and refinements of its x."""
-    solve = _factor(H)
-    x, r = np.zeros_like(g), g
-    for step in range(1, _DIRECT_STEPS + 1):
-        x = x + solve(r)
-        r, left = _residual(H, g, x)
-        if left <= tolerance:
-            return AdjointSolution(x, "direct", step, left)
-    raise ConvergenceError(
-        f"adjoint by factors of the Hessian: relative residual {left:.1e} after {step} "
-        f"solutions, expected {tolerance:g} or less. If it is large, the Hessian at this state is "
-        "singular and the step has no derivative there; if it is small, use a larger tolerance."
+        f"adjoint, solver {solver!r}: relative residual {left:.1e} after {step} steps, expected "
+        f"{tolerance:g} or less. {_ADVICE[solver]}"
     )
 
 

@@ -6,6 +6,7 @@ configurations before y follow the nodes and the material there.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from functools import cached_property
 
 import numpy as np
@@ -18,11 +19,6 @@ from pdcorrect.solvers.damping import Rayleigh, Viscous
 
 Array = NDArray[np.float64]
 Weights = tuple[Array, Array]
-
-
-def mass_slope(problem: Problem, a: Array, b: Array) -> Array:
-    """Derivatives of a . M b by the cells' densities, (C,), for nodal a and b (N, 3)."""
-    return cell_products(problem.cells, problem.cell_masses, a, b)
 
 
 def cell_products(cells: NDArray[np.int64], masses: Array, a: Array, b: Array) -> Array:
@@ -49,50 +45,73 @@ def follower_slope(problem: Problem, x: Array, positions: Array, start: float, e
     return out
 
 
-class RayleighTerm:
-    """- x . d C (y - o), by what the step starts from."""
+class DampingTerm(ABC):
+    """- x . (force of the damping at y), by what the step starts from."""
 
-    def __init__(self, problem: Problem, damping: Rayleigh, y: Array, x: Array) -> None:
-        self._problem, self._damping, self._x = problem, damping, x
-        self._offset = y - damping.origin
-        self._by_origin = damping.times(x)
-
-    @cached_property
-    def origin(self) -> Array:
-        """By o, with its modes in equilibrium, (N, 3)."""
-        if not self._damping.stiffness:
-            return self._by_origin[: len(self._problem.positions)]
-        return self._at_origin.reduced(self._by_origin)
-
-    @cached_property
-    def place(self) -> Array:
-        """By where the stiffness is taken, with its modes in equilibrium, (N, 3)."""
-        if not self._damping.stiffness:
-            return np.zeros_like(self._problem.positions)
-        return self._at.reduced(self._by_place)
-
-    @cached_property
-    def weights(self) -> Weights:
-        """By mu and omega, each (C,)."""
-        stiffness = self._damping.stiffness
-        if not stiffness:
-            nothing = np.zeros(len(self._problem.cells))
-            return nothing, nothing
-        _, by_mu, by_omega = self._slopes
-        more = weight_slopes(self._problem, self._damping.at, -self._at.response(self._by_place))
-        modes = -self._at_origin.response(self._by_origin)
-        last = weight_slopes(self._problem, self._damping.origin, modes)
-        return (
-            more[0] + last[0] - stiffness * by_mu,
-            more[1] + last[1] - stiffness * by_omega,
-        )
+    def __init__(self, problem: Problem, before: list[Array]) -> None:
+        self._problem, self._before = problem, before
 
     @property
-    def density(self) -> Array:
-        """By the cells' densities, (C,)."""
-        count = len(self._problem.positions)
-        slope = mass_slope(self._problem, self._x[:count], self._offset[:count])
-        return -self._damping.mass * slope
+    @abstractmethod
+    def slopes(self) -> list[Array]:
+        """By each of the configurations before y, (N + B, 3)."""
+
+    @property
+    @abstractmethod
+    def by_weights(self) -> Weights:
+        """By mu and omega with internal modes held, each (C,)."""
+
+    @property
+    @abstractmethod
+    def matrices(self) -> Array | float:
+        """By a learned element's matrices, (C, 18, 18)."""
+
+    @cached_property
+    def _following(self) -> list[Following]:
+        return [Following(self._problem, place) for place in self._before]
+
+    @property
+    def places(self) -> list[Array]:
+        """By the nodes of each configuration before y, (N, 3)."""
+        pairs = zip(self._following, self.slopes, strict=True)
+        return [following.reduced(slope) for following, slope in pairs]
+
+    @property
+    def weights(self) -> Weights:
+        """By mu and omega, each (C,)."""
+        by_mu, by_omega = self.by_weights
+        for place, following, slope in zip(self._before, self._following, self.slopes, strict=True):
+            more = weight_slopes(self._problem, place, -following.response(slope))
+            by_mu, by_omega = by_mu + more[0], by_omega + more[1]
+        return by_mu, by_omega
+
+
+class RayleighTerm(DampingTerm):
+    """- x . d C (y - o): the configurations before y are o and where the stiffness is taken."""
+
+    def __init__(self, problem: Problem, damping: Rayleigh, y: Array, x: Array) -> None:
+        super().__init__(problem, [damping.origin, damping.at] if damping.stiffness else [])
+        self._damping, self._x = damping, x
+        self._offset = y - damping.origin
+
+    @property
+    def slopes(self) -> list[Array]:
+        return [self._damping.times(self._x), self._stiff[0]] if self._before else []
+
+    @property
+    def by_weights(self) -> Weights:
+        return self._stiff[1], self._stiff[2]
+
+    @property
+    def matrices(self) -> Array | float:
+        return self._stiff[3]
+
+    @property
+    def places(self) -> list[Array]:
+        """By o and, if there is any, by where the stiffness is taken, (N, 3)."""
+        if self._before:
+            return super().places
+        return [self._damping.times(self._x)[: len(self._problem.positions)]]
 
     @property
     def mass_offset(self) -> Array:
@@ -110,73 +129,46 @@ class RayleighTerm:
         return -float(np.vdot(self._x, self._damping.tangent.apply(self._offset)))
 
     @cached_property
-    def _at_origin(self) -> Following:
-        return Following(self._problem, self._damping.origin)
-
-    @cached_property
-    def _at(self) -> Following:
-        return Following(self._problem, self._damping.at)
-
-    @property
-    def matrices(self) -> Array | float:
-        """By a learned element's matrices, (C, 18, 18)."""
-        written = self._damping.stiffness and self._written
-        return -self._damping.stiffness * written[1] if written else 0.0
-
-    @cached_property
-    def _slopes(self) -> tuple[Array, Array, Array]:
-        return tangent_slopes(self._problem, self._damping.at, self._x, self._offset)
-
-    @cached_property
-    def _written(self) -> tuple[Array, Array] | None:
-        """What a learned element adds, see `CellCorrection.tangent_slopes`."""
-        problem, correction = self._problem, self._problem.correction
-        if correction is None:
-            return None
-        u = self._damping.at - problem.extended(problem.positions)
-        return correction.tangent_slopes(u, self._x, self._offset)
-
-    @cached_property
-    def _by_place(self) -> Array:
-        """By the configuration there."""
-        slopes = self._slopes[0] if self._written is None else self._slopes[0] + self._written[0]
-        return -self._damping.stiffness * slopes
+    def _stiff(self) -> tuple[Array, Array, Array, Array | float]:
+        """By where the stiffness is taken, mu, omega and matrices of a learned element."""
+        problem, damping = self._problem, self._damping
+        by_matrices: Array | float = 0.0
+        if not damping.stiffness:
+            return np.zeros(0), *np.zeros((2, len(problem.cells))), 0.0
+        by_place, by_mu, by_omega = tangent_slopes(problem, damping.at, self._x, self._offset)
+        if problem.correction is not None:
+            u = damping.at - problem.extended(problem.positions)
+            more, by_matrices = problem.correction.tangent_slopes(u, self._x, self._offset)
+            by_place = by_place + more
+        factor = -damping.stiffness
+        return factor * by_place, factor * by_mu, factor * by_omega, factor * by_matrices
 
 
-class ViscousTerm:
-    """- x . (force of viscosity at y), by what the step starts from."""
+class ViscousTerm(DampingTerm):
+    """The same of viscosity: the configurations before y are those that stretches are of."""
 
     def __init__(self, problem: Problem, damping: Viscous, y: Array, x: Array) -> None:
-        self._problem, self._damping = problem, damping
+        super().__init__(problem, damping.places)
+        self._damping, self._y, self._x = damping, y, x
         at_y = Stretches(problem, y)
         self._change, self._rates = damping.change(at_y), at_y.rates(x)
         self._along = damping.rate * small_strain_stress(problem, self._rates)
-        self._y, self._x = y, x
-        self._following = [Following(problem, place) for place in damping.places]
 
     @cached_property
-    def places(self) -> list[Array]:
-        """By each of the earlier positions that stretches are of, (N, 3)."""
-        pairs = zip(self._following, self._slopes, strict=True)
-        found = [following.reduced(slope) for following, slope in pairs]
+    def slopes(self) -> list[Array]:
+        found = [a * part.forces(self._along) for a, part in self._damping.parts]
         if self._damping.written is None:
             return found
-        return [a + b for a, b in zip(found, self._written[0], strict=True)]
+        written = zip(found, self._written[0], strict=True)
+        return [a + self._problem.extended(b) for a, b in written]
 
-    @cached_property
-    def weights(self) -> Weights:
-        """By mu and omega, each (C,)."""
+    @property
+    def by_weights(self) -> Weights:
         by_mu, by_omega = stress_slopes(self._problem, self._change, self._rates)
-        total = [-self._damping.rate * by_mu, -self._damping.rate * by_omega]
-        places = zip(self._damping.places, self._following, self._slopes, strict=True)
-        for place, following, slope in places:
-            more = weight_slopes(self._problem, place, -following.response(slope))
-            total = [a + b for a, b in zip(total, more, strict=True)]
-        return total[0], total[1]
+        return -self._damping.rate * by_mu, -self._damping.rate * by_omega
 
     @property
     def matrices(self) -> Array | float:
-        """By a learned element's matrices, (C, 18, 18)."""
         written = self._damping.written
         return 0.0 if written is None else -0.5 * self._damping.rate * self._written[1]
 
@@ -192,8 +184,3 @@ class ViscousTerm:
         out = -float(product(self._change, self._along).sum()) / self._damping.rate
         written = self._damping.written
         return out if written is None else out - written.along(self._y, self._x)
-
-    @cached_property
-    def _slopes(self) -> list[Array]:
-        """By the configurations there."""
-        return [a * part.forces(self._along) for a, part in self._damping.parts]

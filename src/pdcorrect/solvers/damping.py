@@ -19,16 +19,9 @@ Array = NDArray[np.float64]
 class Rayleigh:
     """d/2 (y - o)^T (alpha M + beta K) (y - o).
 
-    Attributes
-    ----------
-    mass, stiffness : float
-        d alpha and d beta.
-    origin : (N + B, 3)
-        o, with the internal modes in equilibrium there: their velocity at y, like the
-        nodes', is d times the change since.
-    at : (N + B, 3), tangent : Linearisation
-        Where y is foreseen, to second order, and K there, projected; only if
-        ``stiffness`` is not zero.
+    ``mass`` and ``stiffness`` are d alpha and d beta.  In o, ``origin`` (N + B, 3), internal modes
+    are in equilibrium: their velocity at y, like the nodes', is d times the change since.  K is
+    ``tangent``, projected, where y is foreseen to second order (``at``).
     """
 
     def __init__(self, problem: Problem, stage: StepEquation) -> None:
@@ -67,13 +60,7 @@ class Viscous:
     """r/2 (S(y) - S') : C : (S(y) - S'), summed over points, see `fem.viscosity`.
 
     And the same with the matrices and strains of a learned element, see `fem.turned_strains`.
-
-    Attributes
-    ----------
-    rate : float
-        r, the strain rate's factor times the viscosity.
-    parts : list of (float, Stretches)
-        What S' is a sum of.
+    r, ``rate``, is the strain rate's factor times the viscosity; S' is a sum of ``parts``.
     """
 
     def __init__(self, problem: Problem, stage: StepEquation) -> None:
@@ -128,12 +115,7 @@ class WrittenViscous:
 
     K has no part in volume, nor in cells whose strains fade where the step begins: their rates
     are not those of the stretch, and could outweigh what the element itself dissipates.  The rest
-    of K is less than the element's own.
-
-    Attributes
-    ----------
-    places : list of (float, (N, 3))
-        What z' is a sum of: factors and displacements.
+    of K is less than the element's own.  z' is a sum over ``places``, factors and displacements.
     """
 
     def __init__(

@@ -32,12 +32,7 @@ _MODE_STEPS = 2
 
 
 class Rotations:
-    """How the parts of a body have turned: rotations of cells and nodes.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
+    """How the parts of a body have turned: rotations of cells and nodes."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
@@ -80,51 +75,32 @@ class TurnedSolver:
     def __init__(self, solver: TangentSolver, rotations: Array) -> None:
         self._solver = solver
         self._rotations = np.ascontiguousarray(rotations)
+        self._back = np.ascontiguousarray(np.swapaxes(rotations, 1, 2))
 
     def __call__(self, r: Array) -> Array:
         back = np.empty_like(r)
-        _turn_back(self._rotations, r, back)
+        _turn(self._back, r, back)
         out = self._solver(back)
-        _turn(self._rotations, out)
+        _turn(self._rotations, out, out)
         return out
 
 
 @njit(**OPTIONS)
-def _turn(rotations, x):  # type: ignore[no-untyped-def]
-    """Multiply each row of x (n, 3) by its rotation, in place."""
+def _turn(rotations, x, out):  # type: ignore[no-untyped-def]
+    """Each row of x (n, 3) times its rotation; ``out`` may be x."""
     for n in range(len(x)):
         a, b, c = x[n, 0], x[n, 1], x[n, 2]
         for i in range(3):
-            x[n, i] = rotations[n, i, 0] * a + rotations[n, i, 1] * b + rotations[n, i, 2] * c
-
-
-@njit(**OPTIONS)
-def _turn_back(rotations, x, out):  # type: ignore[no-untyped-def]
-    """Multiply each row of x (n, 3) by its rotation's transpose."""
-    for n in range(len(x)):
-        a, b, c = x[n, 0], x[n, 1], x[n, 2]
-        for i in range(3):
-            out[n, i] = rotations[n, 0, i] * a + rotations[n, 1, i] * b + rotations[n, 2, i] * c
+            out[n, i] = rotations[n, i, 0] * a + rotations[n, i, 1] * b + rotations[n, i, 2] * c
 
 
 class TrueHessian:
     """A factor of the Hessian at some shape, turned to each step's first iterate.
 
-    Parameters
-    ----------
-    tangents : TangentFactory
-    lagged : bool
-        Whether to take a new factor when that pays; otherwise the rest shape's is
-        kept, and steps do not depend on those before.
+    ``lagged``: a new factor is taken when that pays; otherwise the rest shape's is kept, and steps
+    do not depend on those before.  ``age`` counts the steps since the factor was made, `INSIDE` if
+    that was not at the start of a step.
 
-    Attributes
-    ----------
-    age : int
-        Steps since the factor in use was made, 0 in the step that made it; `INSIDE`
-        if that was not at the start of a step.
-
-    Notes
-    -----
     A factor's first step needs the fewest iterations; what later steps need more is
     its loss.  When the losses since the last factorisation add up to the cost of one,
     it is time for the next: this keeps the total within twice the best possible.  The
@@ -176,8 +152,7 @@ class TrueHessian:
     def restore(self, age: int, counts: list[int], objective: StepObjective, time: float) -> None:
         """Take up a factor made ``age`` steps before the last one, in the step of ``objective``.
 
-        ``counts`` are the iterations of that step and of those since; ``time`` (s) is
-        where the run goes on.
+        ``counts`` are the iterations since, ``time`` (s) is where the run goes on.
         """
         if self.lagged and age != INSIDE:
             self._renew(objective, self._at_start(objective), age)

@@ -8,7 +8,6 @@ where the plain one diverges because the loads are stiffer than the body.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,33 +45,21 @@ class Anderson:
 def settle(objective: StepObjective, minimise: Callable[[Array], Minimum]) -> Minimum:
     """Minimise with loads that follow the body, as they are at the minimum.
 
-    Parameters
-    ----------
-    objective : StepObjective
-        Its loads are sampled at the first iterate.
-    minimise : callable
-        From a configuration on; it takes no iteration where the remaining distance is
-        within the tolerance.
-
-    Returns
-    -------
-    Minimum
-        Of which `Status.ITERATION_LIMIT` says that loads and positions did not settle.
+    ``minimise``, from a configuration on, takes no iteration where the remaining distance is
+    within the tolerance.
     """
     accelerate = Anderson()
     y = objective.start
     found = minimise(y)
-    iterations, evaluations = found.iterations, found.evaluations
     for _ in range(MOST):
         if not found.status.ok:
             break
         y = accelerate(y.ravel(), found.positions.ravel()).reshape(y.shape)
         objective.follow(y)
-        found = minimise(y)
-        iterations += found.iterations
-        evaluations += found.evaluations
-        if found.iterations == 0:
+        again = minimise(y)
+        found = again.after(found)
+        if again.iterations == 0:
             break
     else:
         found.status = Status.ITERATION_LIMIT
-    return replace(found, iterations=iterations, evaluations=evaluations)
+    return found

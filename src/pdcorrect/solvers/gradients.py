@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -22,11 +22,12 @@ from pdcorrect.solvers.adjoint_solve import (
     spectral_radius,
 )
 from pdcorrect.solvers.adjoint_terms import (
+    DampingTerm,
     RayleighTerm,
     ViscousTerm,
+    cell_products,
     follower_slope,
     gravity_slope,
-    mass_slope,
 )
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.integrators import Integrator
@@ -36,7 +37,7 @@ from pdcorrect.state import State
 
 Array = NDArray[np.float64]
 
-Term = TypeVar("Term", RayleighTerm, ViscousTerm)
+Term = TypeVar("Term", bound=DampingTerm)
 
 _STEP = 1e-3
 """Of the time step, for differences of fourth order at fixed y."""
@@ -72,13 +73,9 @@ class TakenStep:
         """X with H x = g for the operator H at y."""
         objective = H.hessian.objective
         return solve_adjoint(
-            H,
-            g,
-            solver,
-            lambda: self.stepper.preconditioner(objective, y),
-            lambda: self.global_solver(objective),
-            tolerance,
-        )
+            H, g, solver, lambda: self.stepper.preconditioner(objective, y),
+            lambda: self.global_solver(objective), tolerance,
+        )  # fmt: skip
 
 
 class Gradients:
@@ -90,11 +87,8 @@ class Gradients:
     ----------
     x : (N + B, 3)
         The adjoint state: the loss's derivative by a force on each node (and mode).
-    solver : str
-        What solved for it.
-    iterations : int
-    residual : float
-        Of its linear system, relative.
+    solver, iterations, residual
+        Of its linear system, see `AdjointSolution`.
     """
 
     def __init__(self, step: TakenStep, after: Mapping[str, Array], y: Array) -> None:
@@ -116,18 +110,20 @@ class Gradients:
         if kept.any():
             by_y = by_y + self._scheme.inertia * self._problem.mass_times(kept)
             by_y -= self._by_sampled("y", y, kept)
-        self._H = AdjointOperator(self._objective.hessian_operator(y), self._load_slopes(y))
+        loads = (lambda x: self._by_sampled("y", y, x)) if self._problem.has_followers else None
+        self._H = AdjointOperator(self._objective.hessian_operator(y), loads)
         g = self._problem.extended(by_y) * self._objective.free
         found = step.solve(self._H, y, g, step.solver, step.tolerance)
         self.x, self.solver, self.iterations = found.x, found.solver, found.iterations
         self.residual = found.residual
         self._nodal = self.x[: len(by_y)] - kept
-        objective, problem = self._objective, self._problem
+        rayleigh, viscous = self._objective.rayleigh, self._objective.viscous
         self._rayleigh = self._viscous = None
-        if objective.rayleigh is not None:
-            self._rayleigh = RayleighTerm(problem, objective.rayleigh, y, self.x)
-        if objective.viscous is not None:
-            self._viscous = ViscousTerm(problem, objective.viscous, y, self.x)
+        if rayleigh is not None:
+            self._rayleigh = RayleighTerm(self._problem, rayleigh, y, self.x)
+        if viscous is not None:
+            self._viscous = ViscousTerm(self._problem, viscous, y, self.x)
+        self._damping: list[DampingTerm] = [t for t in (self._rayleigh, self._viscous) if t]
         self._pull_stage(by_y)
 
     def __repr__(self) -> str:
@@ -210,48 +206,41 @@ class Gradients:
     @cached_property
     def density(self) -> Array:
         """By each cell's density, (C,), m3/kg; gravity included."""
-        stage, problem, x = self._objective.stage, self._problem, self._nodal
-        offset = self._y[: len(x)] - stage.target
-        out = gravity_slope(problem, stage.load_factor * x, *stage.loads_over)
-        out -= stage.inertia * mass_slope(problem, x, offset)
-        return out if self._rayleigh is None else out + self._rayleigh.density
+        stage, problem = self._objective.stage, self._problem
+        out = gravity_slope(problem, stage.load_factor * self._nodal, *stage.loads_over)
+        for x, offset in self._inertial:
+            out -= cell_products(problem.cells, problem.cell_masses, x, offset)
+        return out
 
     @cached_property
     def matrices(self) -> Array:
         """By the matrices K of a learned element, (C, 18, 18), m/N.
 
         The derivatives by the moduli include what it writes from them.
-
-        Raises
-        ------
-        InputError
-            If the problem has none.
         """
         correction, problem = self._learned, self._problem
         u = self._y - problem.extended(problem.positions)
         out = correction.matrix_slopes(u, -self.x)
-        for term in (self._rayleigh, self._viscous):
-            if term is not None:
-                out = out + term.matrices
+        for term in self._damping:
+            out = out + term.matrices
         return out
 
     @cached_property
     def masses(self) -> Array:
-        """By its masses at density 1, (C, 8, 8), 1/m3.
+        """By its masses at density 1, (C, 8, 8), 1/m3."""
+        cells, out = self._problem.cells, np.zeros_like(self._learned.masses)
+        for x, offset in self._inertial:
+            out -= np.einsum("cki,cli->ckl", x[cells], offset[cells])
+        return self._problem.materials.density[:, None, None] * out
 
-        Raises
-        ------
-        InputError
-            If the problem has none.
-        """
-        stage, problem, x = self._objective.stage, self._problem, self._nodal
-        out = np.zeros_like(self._learned.masses)
+    @property
+    def _inertial(self) -> list[tuple[Array, Array]]:
+        """Pairs of nodal a and b (N, 3) of which the Lagrangian has - a . M b."""
+        stage, x = self._objective.stage, self._nodal
         pairs = [(x, stage.inertia * (self._y[: len(x)] - stage.target))]
-        if self._rayleigh is not None:
+        if self._rayleigh:
             pairs.append((self.x[: len(x)], self._rayleigh.mass_offset))
-        for a, b in pairs:
-            out -= np.einsum("cki,cli->ckl", a[problem.cells], b[problem.cells])
-        return problem.materials.density[:, None, None] * out
+        return pairs
 
     @property
     def _learned(self) -> CellCorrection:
@@ -265,13 +254,7 @@ class Gradients:
 
     @property
     def viscosity(self) -> float:
-        """By ``damping.viscosity``, 1/s.
-
-        Raises
-        ------
-        InputError
-            If the scene has none, as of the next two.
-        """
+        """By ``damping.viscosity``, 1/s; refused, as the next two, where the scene has none."""
         term = self._damped(self._viscous, "viscosity")
         return self._objective.stage.strain_rate * term.by_rate
 
@@ -319,12 +302,6 @@ class Gradients:
 
     # --- internals --------------------------------------------------------------------------
 
-    def _load_slopes(self, y: Array) -> Callable[[Array], Array] | None:
-        """What loads that follow the body add to the operator at y."""
-        if not self._problem.has_followers:
-            return None
-        return lambda x: self._by_sampled("y", y, x)
-
     def _by_sampled(self, name: str, y: Array, x: Array) -> Array:
         """Derivatives of x . (loads in the equation) by y or positions that they are sampled at."""
         stage, share = self._objective.stage, self._scheme.sampled.coefficients.get(name, 0.0)
@@ -350,13 +327,14 @@ class Gradients:
             self._pull(scheme.target, scheme.clamped_target, by_target)
         scheme.past_forces.transpose(x, self._sums)
         Linear(positions=1.0).transpose(self._by_sampled("positions", self._y, x), self._sums)
-        if self._rayleigh is not None:
-            self._pull(scheme.origin, scheme.clamped_origin, self._rayleigh.origin)
-            self._pull(scheme.foreseen or scheme.start, scheme.clamped, self._rayleigh.place)
-        if self._viscous is not None:
-            pairs = zip(scheme.strains, self._viscous.places, strict=True)
-            for (_, place), slope in pairs:
-                place.transpose(slope, self._sums)
+        if self._rayleigh:
+            origin = scheme.origin, scheme.clamped_origin
+            at = scheme.foreseen or scheme.start, scheme.clamped
+            for place, slope in zip((origin, at), self._rayleigh.places, strict=False):
+                self._pull(*place, slope)
+        if self._viscous:
+            for (_, strained), slope in zip(scheme.strains, self._viscous.places, strict=True):
+                self._pull(strained, None, slope)
         held = ~problem.free
         if held.any():
             back = (by_y - self._H.product(self.x)[: len(x)]) * held
@@ -371,7 +349,7 @@ class Gradients:
         """By each cell's mu and omega, 0 for a term that the energy does not have."""
         problem = self._problem
         parts = [weight_slopes(problem, self._y, -self.x)]
-        parts += [term.weights for term in (self._rayleigh, self._viscous) if term is not None]
+        parts += [term.weights for term in self._damping]
         correction, materials = problem.correction, problem.materials
         if correction is not None and correction.writer is not None:
             weights = materials.mu, materials.volume_weight

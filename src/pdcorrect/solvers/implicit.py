@@ -301,11 +301,7 @@ class ImplicitStepper:
         again = newton_cg(objective, found.positions, solver, options)
         if again.status is Status.CONVERGED:
             again.status = Status.RECOVERED
-        return replace(
-            again,
-            iterations=found.iterations + again.iterations,
-            evaluations=found.evaluations + again.evaluations,
-        )
+        return again.after(found)
 
     def _substeps(
         self, state: State, forces: Array | None, h: float, effort: _Effort

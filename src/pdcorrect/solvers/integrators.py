@@ -29,27 +29,15 @@ _EQUAL_STEPS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class StepEquation:
-    """The equation of one step, over nodal arrays (N, 3), and what it was made of.
+    """The equation of one step: a `Scheme` with nodal arrays (N, 3) in place of combinations.
+
+    ``start`` and ``foreseen`` are prescribed where clamped, ``loads_over`` is a time interval, s,
+    and ``strains`` are none in scenes without viscosity.
 
     Attributes
     ----------
-    inertia, rate, gain : float
-        See `Scheme`.
-    target, origin : (N, 3)
-        q and o, m.
-    start, foreseen : (N, 3)
-        See `Scheme`, m; prescribed values where clamped.
-    loads_over : tuple of float
-        Loads are averaged over this time interval (s), or taken at its ends if
-        these are equal.
-    load_factor : float
-    past_forces : (N, 3)
-        See `Scheme`, N.
     sampled : callable
         y -> where loads that follow the body are sampled, (N, 3).
-    strain_rate : float
-    strains : tuple of (float, (N, 3))
-        See `Scheme`; none in scenes without viscosity.
     finish : callable
         y and all forces (N, 3) of the equation, of moving clamps too -> the state after.
     """
@@ -92,8 +80,7 @@ class Integrator:
     def usable(memory: Mapping[str, Any], is_a_step: Callable[[Any], bool]) -> frozenset[str]:
         """The entries of a state's memory that a step may use.
 
-        ``is_a_step`` says of the times of the state before, if these are there, whether they
-        are one step earlier.
+        ``is_a_step`` says of the times of the state before whether they are one step earlier.
         """
         names = frozenset(memory)
         if "previous_times" in names and not is_a_step(memory["previous_times"]):
@@ -195,12 +182,7 @@ backward_euler = Integrator(schemes.backward_euler)
 
 
 def integrator(name: str, spectral_radius: float = 0.8, viscous: bool = False) -> Integrator:
-    """An integrator by its name in a scene; ``viscous`` where the scene has a viscosity.
-
-    Raises
-    ------
-    InputError
-    """
+    """An integrator by its name in a scene; ``viscous`` where the scene has a viscosity."""
     if name == "generalised-alpha":
         return Integrator(schemes.GeneralisedAlpha(spectral_radius, viscous))
     if name == "midpoint" and viscous:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -30,15 +30,13 @@ Solve = Callable[[Array], Array]
 ARMIJO = 1e-4
 _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
-
 BACKTRACKS = 30
-_ESTIMATE_STEPS = 1000
+_ESTIMATE_STEPS, _INNER_STEPS = 1000, 400
 NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 
 Otherwise stiff bodies would not move at all where the motion is below the tolerance.
 """
-
 FIRST_CHECK = 0.15
 """Length of the loop's own step, of the tolerance, at which the estimate is first made.
 
@@ -65,15 +63,9 @@ class Objective(Protocol):
 class MinimiserOptions:
     """Policy of the loop.
 
-    Attributes
-    ----------
-    tolerance : float
-        Largest accepted estimate of the remaining displacement of a node, m.
-    history : int
-        Pairs that L-BFGS keeps; 0 is plain local/global.
-    max_iterations : int
-    unmoved : float
-        The share of the tolerance within which a start is accepted as it is.
+    ``tolerance`` is the largest accepted estimate of the remaining displacement of a node, m, and
+    ``unmoved`` its share within which a start is accepted as it is; ``history`` are the pairs that
+    L-BFGS keeps, of which plain local/global has 0.
     """
 
     tolerance: float
@@ -86,8 +78,8 @@ class MinimiserOptions:
 class Minimum:
     """Where the loop ended.
 
-    ``estimate`` is the estimated largest distance of a node from the minimum,
-    m; infinite if the Hessian there is not positive definite.
+    ``estimate`` is that of the largest distance of a node from the minimum, m; infinite if the
+    Hessian there is not positive definite.
     """
 
     positions: Array
@@ -97,6 +89,14 @@ class Minimum:
     iterations: int
     evaluations: int
     estimate: float
+
+    def after(self, earlier: Minimum) -> Minimum:
+        """The same with the work of a loop that led to its start."""
+        return replace(
+            self,
+            iterations=earlier.iterations + self.iterations,
+            evaluations=earlier.evaluations + self.evaluations,
+        )
 
 
 class History:
@@ -249,13 +249,9 @@ class LineSearchResult:
 
 
 def line_search(
-    objective: Objective,
-    p: Array,
-    value: float,
-    gradient: Array,
-    direction: Array,
+    objective: Objective, p: Array, value: float, gradient: Array, direction: Array,
     search: bool = True,
-) -> LineSearchResult:
+) -> LineSearchResult:  # fmt: skip
     """Backtracking until gamma falls (Armijo).
 
     Where the fall is lost in round-off, the slope decides (approximate Wolfe
@@ -295,20 +291,12 @@ def newton_step(
     not happen or a direction of negative curvature is met.
     """
     found = conjugate_gradients(
-        objective.hessian_operator(p),
-        -gradient,
-        solve,
-        tolerance=0.1,
-        max_steps=_ESTIMATE_STEPS,
-        start=guess,
-        residual_share=0.03,
+        objective.hessian_operator(p), -gradient, solve, tolerance=0.1, start=guess,
+        max_steps=_ESTIMATE_STEPS, residual_share=0.03,
         settled=lambda x, change: largest_displacement(change) <= 0.1 * largest_displacement(x),
-    )
+    )  # fmt: skip
     exact = found.converged and found.convex
     return found.x, largest_displacement(found.x) if exact else math.inf
-
-
-_INNER_STEPS = 400
 
 
 Direction = Callable[[Array, Array], tuple[Array, bool]]
@@ -354,14 +342,11 @@ def newton_cg(
     Where these meet negative curvature, the direction found so far is used, or
     minus the preconditioned gradient at the first step.
     """
-    return newton_loop(
-        objective, start, lambda p, gradient: _direction(objective, p, gradient, solve), options
-    )
 
+    def direction(p: Array, gradient: Array) -> tuple[Array, bool]:
+        found = conjugate_gradients(
+            objective.hessian_operator(p), -gradient, solve, tolerance=1e-3, max_steps=_INNER_STEPS
+        )
+        return found.x, found.converged and found.convex
 
-def _direction(objective: Objective, p: Array, gradient: Array, solve: Solve) -> tuple[Array, bool]:
-    """The (truncated) Newton direction, and whether it is one of the exact, positive Hessian."""
-    found = conjugate_gradients(
-        objective.hessian_operator(p), -gradient, solve, tolerance=1e-3, max_steps=_INNER_STEPS
-    )
-    return found.x, found.converged and found.convex
+    return newton_loop(objective, start, direction, options)

@@ -89,7 +89,7 @@ class Newton(ImplicitStepper):
 
     def _prepare(self, objective: StepObjective) -> None:
         _, gradient = objective.value_and_gradient(objective.start)
-        self._solver(objective, self._options)(objective.start, gradient)
+        self._steps(objective, self._options)(objective.start, gradient)
 
     def preconditioner(self, objective: StepObjective, y: Array) -> Solve:
         """A factor of the Hessian at y, or a multigrid cycle where steps go without one."""
@@ -103,21 +103,21 @@ class Newton(ImplicitStepper):
     def _minimise(
         self, objective: StepObjective, start: Array, options: MinimiserOptions
     ) -> Minimum:
-        return newton_loop(objective, start, self._solver(objective, options), options)
+        return newton_loop(objective, start, self._steps(objective, options), options)
 
-    def _solver(self, objective: StepObjective, options: MinimiserOptions) -> Direction:
+    def _steps(self, objective: StepObjective, options: MinimiserOptions) -> Direction:
         """What gives the Newton steps of one time step."""
         if self.linear_solver == "cg":
             return _IterativeSteps(objective, self._tangents, options.tolerance)
-        return lambda p, g: self._direction(objective, p, g)
 
-    def _direction(self, objective: StepObjective, p: Array, g: Array) -> tuple[Array, bool]:
-        """The Newton step, and whether the exact tangent gave it."""
-        try:
-            solver, exact = self._tangents.factorise(objective, p)
-            return -solver(g), exact
-        except NotPositiveDefinite:  # multigrid may notice only when it solves
-            return np.zeros_like(p), False  # no descent: the line search says so
+        def direct(p: Array, gradient: Array) -> tuple[Array, bool]:
+            try:
+                solver, exact = self._tangents.factorise(objective, p)
+                return -solver(gradient), exact
+            except NotPositiveDefinite:  # multigrid may notice only when it solves
+                return np.zeros_like(p), False  # no descent: the line search says so
+
+        return direct
 
 
 class _IterativeSteps:
@@ -130,9 +130,7 @@ class _IterativeSteps:
     def __init__(
         self, objective: StepObjective, tangents: TangentFactory, tolerance: float
     ) -> None:
-        self._objective = objective
-        self._tangents = tangents
-        self._tolerance = tolerance
+        self._objective, self._tangents, self._tolerance = objective, tangents, tolerance
         self._cycle: TangentSolver | None = None
         self._first = self._last = 0
 
@@ -160,16 +158,14 @@ class _IterativeSteps:
 
     def _solve(self, p: Array, b: Array, project: bool = False) -> Solution:
         objective = self._objective
+
+        def settled(x: Array, change: Array) -> bool:
+            return largest_displacement(change) <= _CG_LENGTH * largest_displacement(x)
+
         found = conjugate_gradients(
-            objective.hessian_operator(p, project),
-            b,
-            self._precondition,
-            tolerance=_CG_TOLERANCE,
-            max_steps=_CG_STEPS,
-            settled=lambda x, change: (
-                largest_displacement(change) <= _CG_LENGTH * largest_displacement(x)
-            ),
-        )
+            objective.hessian_operator(p, project), b, self._cycle or (lambda r: r),
+            tolerance=_CG_TOLERANCE, max_steps=_CG_STEPS, settled=settled,
+        )  # fmt: skip
         self._last = found.steps
         self._first = self._first or found.steps
         return found
@@ -178,6 +174,3 @@ class _IterativeSteps:
         """Whether no negative curvature is met with a right-hand side that has all modes in it."""
         b = np.random.default_rng(0).normal(size=p.shape) * self._objective.free
         return self._solve(p, b).convex
-
-    def _precondition(self, r: Array) -> Array:
-        return r if self._cycle is None else self._cycle(r)

@@ -179,7 +179,7 @@ class ProjectiveDynamics(ImplicitStepper):
             solver = hessian.renew(objective, found.positions)
             limit = min(_PATIENCE, most - found.iterations)
             again = replace(options, max_iterations=limit)
-            found = _after(found, minimise(objective, found.positions, solver, again))
+            found = minimise(objective, found.positions, solver, again).after(found)
         return found
 
 
@@ -204,11 +204,3 @@ _NAMES = {
     "rest": "true Hessian of the rest shape, turned with the body",
     "lagged": "true Hessian of an earlier frame, turned with the body",
 }
-
-
-def _after(earlier: Minimum, later: Minimum) -> Minimum:
-    return replace(
-        later,
-        iterations=earlier.iterations + later.iterations,
-        evaluations=earlier.evaluations + later.evaluations,
-    )

@@ -60,7 +60,14 @@ def march(
             if not result.status.ok and on_failure != "continue":
                 if on_failure == "stop":
                     return
-                raise ConvergenceError(_failure(frame, result), result=result)
+                raise ConvergenceError(
+                    f"frame {frame} (t = {result.state.time:g} s) {result.status.value} after "
+                    f"{result.iterations} iterations (largest out-of-balance force "
+                    f"{result.residual:.3g} N, estimated distance from the solution "
+                    f"{result.error_estimate:.3g} m). Use a smaller time step, weaker loads or a "
+                    "finer mesh.",
+                    result=result,
+                )
             current = result.state
             results.append(result)
         yield _of_frame(results), time.perf_counter() - started
@@ -139,17 +146,10 @@ def rollout(
     return _trajectory(stepper, states, log)
 
 
-def _failure(frame: int, result: StepResult) -> str:
-    return (
-        f"frame {frame} (t = {result.state.time:g} s) {result.status.value} after "
-        f"{result.iterations} iterations (largest out-of-balance force {result.residual:.3g} N, "
-        f"estimated distance from the solution {result.error_estimate:.3g} m). Use a smaller "
-        "time step, weaker loads or a finer mesh."
-    )
-
-
 def _trajectory(stepper: Stepper, states: list[State], log: StepLog) -> Trajectory:
-    problem = stepper.problem
+    """With NaN for what states do not remember."""
+    problem, none = stepper.problem, np.full_like(states[0].positions, np.nan)
+    remembered = dict.fromkeys(name for state in states for name in state.memory)
     return Trajectory(
         positions=np.stack([s.positions for s in states]),
         velocities=np.stack([s.velocities for s in states]),
@@ -160,25 +160,12 @@ def _trajectory(stepper: Stepper, states: list[State], log: StepLog) -> Trajecto
         scene_toml=problem.scene.to_toml(),
         attributes=run_attributes(stepper),
         problem=problem,
-        memory=_memory(states),
+        memory={name: np.stack([s.memory.get(name, none) for s in states]) for name in remembered},
     )
 
 
-def _memory(states: list[State]) -> dict[str, Array]:
-    """What the states remember, (T+1, N, 3) by name; NaN where one has none."""
-    none = np.full_like(states[0].positions, np.nan)
-    names = dict.fromkeys(name for state in states for name in state.memory)
-    return {name: np.stack([s.memory.get(name, none) for s in states]) for name in names}
-
-
 class StepLog:
-    """Statistics of a run, one row a step, without its states.
-
-    Parameters
-    ----------
-    earlier : mapping of str to (T,) arrays
-        Those of the steps before, of a run that is continued.
-    """
+    """Statistics of a run, one row a step; ``earlier`` are those of a run that is continued."""
 
     def __init__(self, earlier: Mapping[str, NDArray[Any]] | None = None) -> None:
         columns = earlier or {}
@@ -213,48 +200,26 @@ _NO_STEPS = ("status", "iterations", "residual", "error_estimate", "seconds")
 
 def run_attributes(stepper: Stepper) -> dict[str, str]:
     """What a run's file says about its origin."""
-    problem = stepper.problem
-    return {
+    problem, correction = stepper.problem, stepper.problem.correction
+    material = DENSITY_CHANGED if problem.density_changed else OWN_MATERIAL
+    found = {
         "refine": str(problem.refine),
         "element": problem.element,
         "mass": problem.mass_rule,
-        "material": _material(problem),
-        **_learned(problem),
-        **stepper.describe(),
+        "material": "changed after the scene" if problem.material_changed else material,
     }
-
-
-def _learned(problem: Problem) -> dict[str, str]:
-    """Which weights wrote the cells, and how many."""
-    correction = problem.correction
-    if correction is None:
-        return {}
-    digest = "" if correction.writer is None else correction.writer.digest
-    return {
-        "element_weights": digest,
-        "learned_cells": f"{int(correction.learned.sum())} of {len(correction.learned)}",
-    }
-
-
-def _material(problem: Problem) -> str:
-    """Whether it is the scene's; a density that was changed alone is told, for stress has none."""
-    if problem.material_changed:
-        return "changed after the scene"
-    return DENSITY_CHANGED if problem.density_changed else OWN_MATERIAL
+    if correction is not None:
+        found["element_weights"] = "" if correction.writer is None else correction.writer.digest
+        learned = correction.learned
+        found["learned_cells"] = f"{int(learned.sum())} of {len(learned)}"
+    return found | stepper.describe()
 
 
 def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
     """A run on the nodes that it shares with a coarser mesh (T_D of the thesis).
 
-    Without its memory, which is of its own mesh.
-
-    Parameters
-    ----------
-    run : Trajectory
-        On the finer mesh.
-    to : Problem or Trajectory
-        On the coarser one; each of its nodes must coincide, at rest, with one
-        of the run's.
+    Each node of ``to`` must coincide, at rest, with one of the run's.  The memory, which is of
+    the run's own mesh, is left out.
 
     Raises
     ------
@@ -264,42 +229,34 @@ def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
     points, cells = (to.points if isinstance(to, Trajectory) else to.positions), to.cells
     tolerance = 1e-6 * float(np.ptp(points[cells[0]], axis=0).max())
     nodes = coincident_nodes(run.points, points, tolerance)
-    return Trajectory(
+    return replace(
+        run,
         positions=run.positions[:, nodes],
         velocities=run.velocities[:, nodes],
-        times=run.times,
-        stats=run.stats,
         points=points,
         cells=cells,
-        scene_toml=run.scene_toml,
         attributes={**run.attributes, "restricted": "to the nodes of a coarser mesh"},
         problem=None,
+        memory={},
     )
 
 
 _SHOWN = 4
-_NONE = "nothing"
 
 
 def continue_from(stepper: Stepper, run: Trajectory) -> State:
     """The state to go on from, after telling the stepper about the frames so far.
 
-    Parameters
-    ----------
-    stepper : Stepper
-        If it has a method ``restore``, that is called with ``run``.
-    run : Trajectory
-        The frames so far.
+    If it has a method ``restore``, that is called with ``run``.
 
     Raises
     ------
     InputError
-        If another scene, mesh or solver made them.
+        If another scene, mesh or solver made the frames.
     """
     check_same_run(stepper, run)
-    restore = getattr(stepper, "restore", None)
-    if restore is not None:
-        restore(run)
+    if hasattr(stepper, "restore"):
+        stepper.restore(run)
     return run.state(-1)
 
 
@@ -322,17 +279,16 @@ def differences(stepper: Stepper, run: Trajectory) -> list[str]:
     old |= run.attributes
     new |= run_attributes(stepper)
     found = [
-        f"{name} was {old.get(name, _NONE)}, now {new.get(name, _NONE)}"
+        f"{name} was {old.get(name, 'nothing')}, now {new.get(name, 'nothing')}"
         for name in dict.fromkeys((*old, *new))
         if old.get(name) != new.get(name)
     ]
-    for name, was, now in (
-        ("nodes", run.points, problem.positions),
-        ("cells", run.cells, problem.cells),
-    ):
-        if not np.array_equal(was, now):
-            found.append(f"the mesh's {name} are different ones ({len(was)}, now {len(now)})")
-    return found
+    meshes = ("nodes", run.points, problem.positions), ("cells", run.cells, problem.cells)
+    return found + [
+        f"the mesh's {name} are different ones ({len(was)}, now {len(now)})"
+        for name, was, now in meshes
+        if not np.array_equal(was, now)
+    ]
 
 
 def _settings(scene_toml: str) -> dict[str, str]:
@@ -346,9 +302,7 @@ def _settings(scene_toml: str) -> dict[str, str]:
         scene = parse_toml(scene_toml)
     except ValueError:
         return {"scene": "unreadable"}
-    settings = dict(_flat("", scene))
-    settings.pop("time.frames", None)
-    return settings
+    return {key: value for key, value in _flat("", scene) if key != "time.frames"}
 
 
 def _flat(prefix: str, table: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

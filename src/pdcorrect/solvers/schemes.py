@@ -45,13 +45,7 @@ class Linear:
         return f"Linear({terms})"
 
     def __call__(self, arrays: Mapping[str, Any]) -> Any:
-        """The sum; 0.0 where there are no terms.
-
-        Raises
-        ------
-        KeyError
-            If an array is missing.
-        """
+        """The sum; 0.0 where there are no terms."""
         total: Any = None
         for name, c in self.coefficients.items():
             term = arrays[name] if c == 1.0 else c * arrays[name]
@@ -281,19 +275,8 @@ class GeneralisedAlpha:
     internal forces f, damping included, of both ends.  So no force is that of a point on the
     chord of a turning node's path, where strains are other ones.  Divided by 1 - alpha_f it
     is an equation at the end of the step.  The first step has constant acceleration,
-    which does not lower the order.
-
-    Attributes
-    ----------
-    spectral_radius : float
-        At infinite frequency, 0 to 1.
-    viscous : bool
-        Whether the steps need the rate of stretch.
-
-    Raises
-    ------
-    InputError
-        If the spectral radius is outside.
+    which does not lower the order.  The spectral radius, 0 to 1, is that at infinite
+    frequency; ``viscous`` steps need the rate of stretch.
     """
 
     spectral_radius: float

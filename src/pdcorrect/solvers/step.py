@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
@@ -39,17 +38,9 @@ _MODE_STEPS = 1
 
 
 class StepObjective:
-    """gamma for one step, over configurations y (N + B, 3).
+    """gamma for one step from ``state``, over configurations y (N + B, 3).
 
-    Parameters
-    ----------
-    problem : Problem
-    state : State
-        At the start of the step.
-    stage : StepEquation
-        The integrator's equation.
-    extra : (N, 3), optional
-        Forces besides the scene's loads, N.
+    ``stage`` is the integrator's equation, ``extra`` (N, 3) forces besides the scene's loads, N.
 
     Attributes
     ----------
@@ -64,8 +55,6 @@ class StepObjective:
         gamma is relative to this.
     factors : tuple of float
         On mass and on stiffness in the Hessian: 1/s2 and 1.
-    rayleigh : Rayleigh or None
-    viscous : Viscous or None
     """
 
     def __init__(
@@ -228,15 +217,8 @@ def global_backend(problem: Problem) -> Backend:
 class GlobalSolver:
     """G^-1 on the free components: one factor for each distinct column of ``free``.
 
-    Parameters
-    ----------
-    problem : Problem
-    factors : tuple of float
-        On mass (1/s2) and stiffness, see `hessian_factors`.
-    backend : str
-        See `factorise`; "auto" is `global_backend`.
-    volume_scale : float
-        Factor on the volume weight inside G (the energy is not changed).
+    ``factors`` are those of `hessian_factors`; ``volume_scale`` multiplies the volume weight
+    inside G, without a change of the energy.
     """
 
     def __init__(
@@ -251,23 +233,19 @@ class GlobalSolver:
         free = problem.free_unknowns
         columns, group = np.unique(free, axis=1, return_inverse=True)
         self._parts: list[tuple[Factor, NDArray[np.int64], NDArray[np.int64]]] = []
-        for i in range(columns.shape[1]):
-            nodes = np.flatnonzero(columns[:, i])
-            if len(nodes):
-                factor = self._factorise(matrix[nodes][:, nodes], backend)
-                self._parts.append((factor, nodes, np.flatnonzero(group.ravel() == i)))
+        for i, nodes in enumerate(map(np.flatnonzero, columns.T)):
+            if not len(nodes):
+                continue
+            try:
+                factor = factorise(matrix[nodes][:, nodes], backend, approximate=True)
+            except NotPositiveDefinite as error:
+                raise ConvergenceError(
+                    f"the global matrix of the step is singular to working precision ({error}): "
+                    "expected clamps, or inertia that matters beside the stiffness. Use clamps (a "
+                    "quasi-static problem needs them), a smaller time step or more density."
+                ) from None
+            self._parts.append((factor, nodes, np.flatnonzero(group.ravel() == i)))
         self._all_free = bool(free.all())
-
-    @staticmethod
-    def _factorise(matrix: sp.csr_matrix, backend: Backend) -> Factor:
-        try:
-            return factorise(matrix, backend, approximate=True)
-        except NotPositiveDefinite as error:
-            raise ConvergenceError(
-                f"the global matrix of the step is singular to working precision ({error}): "
-                "expected clamps, or inertia that matters beside the stiffness. Use clamps (a "
-                "quasi-static problem needs them), a smaller time step or more density."
-            ) from None
 
     @property
     def backend(self) -> str:
@@ -288,13 +266,7 @@ class GlobalSolver:
 
 
 def check_input(problem: Problem, state: State, forces: Array | None) -> None:
-    """Refuse states and forces of the wrong shape or with NaN.
-
-    Raises
-    ------
-    InputError
-        That names the node.
-    """
+    """Refuse states and forces of the wrong shape or with NaN, see `nodal_array`."""
     nodal_array(problem, "positions", state.positions)
     nodal_array(problem, "velocities", state.velocities)
     if forces is not None:
@@ -302,13 +274,7 @@ def check_input(problem: Problem, state: State, forces: Array | None) -> None:
 
 
 def nodal_array(problem: Problem, name: str, values: Array) -> Array:
-    """``values`` as an array; refused if it is not (N, 3) and finite.
-
-    Raises
-    ------
-    InputError
-        That names the node.
-    """
+    """``values`` as an array; `InputError` names the node if it is not (N, 3) and finite."""
     if isinstance(values, str) or not isinstance(values, (np.ndarray, Sequence)):
         raise InputError(
             f"{name} is a {type(values).__name__}: expected an array of shape "

@@ -53,17 +53,8 @@ _SHIFTS = (1e-10, 1e-6, 1e-2)
 class TangentFactory:
     """Factorises the Hessians of one problem's steps.
 
-    Parameters
-    ----------
-    problem : Problem
-    backend : str
-        See `factorise`; "auto" is a band where that pays and fits into memory, else
-        multigrid.
-
-    Attributes
-    ----------
-    backend : str
-        The one in use.
+    ``backend``, see `factorise`, is one of a kind for all; "auto" is a band where that pays and
+    fits into memory, else multigrid.
     """
 
     def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
@@ -116,12 +107,7 @@ class TangentFactory:
 
         Where the exact Hessian is not positive definite, negative eigenvalues are
         raised to zero at each quadrature point (Teran et al. 2005), with a growing
-        shift where that is singular.
-
-        Raises
-        ------
-        NotPositiveDefinite
-            If all of that fails.
+        shift where that is singular.  `NotPositiveDefinite` is raised if all of that fails.
         """
         try:
             return self._solver(objective, y, self.backend), True
@@ -134,10 +120,6 @@ class TangentFactory:
         """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid.
 
         ``at_rest``: damping too is taken at y, not at the step's start.
-
-        Raises
-        ------
-        NotPositiveDefinite
         """
         approximate = self.backend == "amg"
         if not approximate:
@@ -146,13 +128,7 @@ class TangentFactory:
         return self._projected(objective, y, self.backend, approximate, at_rest)
 
     def approximate(self, objective: StepObjective, y: Array) -> TangentSolver:
-        """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap.
-
-        Raises
-        ------
-        NotPositiveDefinite
-            If no shift made it so.
-        """
+        """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap."""
         return self._projected(objective, y, "amg", approximate=True)
 
     def _projected(
@@ -186,7 +162,7 @@ class TangentFactory:
         if backend == "band":
             band = self.order.assemble(blocks, problem.mass_matrix, mass_factor)
             band[:, 0] += shift * band[:, 0].max()
-            return TangentSolver(problem, self.order.factorise(band), None, modes)
+            return TangentSolver(self.order.factorise(band), None, modes)
         matrix = self._nodes.matrix(blocks)
         if mass_factor:
             matrix = matrix + mass_factor * sp.kron(problem.mass_matrix, sp.eye_array(3))
@@ -195,24 +171,16 @@ class TangentFactory:
         matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
         motions = rigid_motions(y[: len(problem.positions)])[self._free]
         factor = factorise(matrix, backend, 3, motions, approximate)
-        return TangentSolver(problem, factor, self._free, modes)
+        return TangentSolver(factor, self._free, modes)
 
 
 class TangentSolver:
     """r -> H^-1 r on configurations (N + B, 3), zero where clamped."""
 
     def __init__(
-        self,
-        problem: Problem,
-        factor: Factor,
-        free: NDArray[np.int64] | None,
-        modes: Condensed | None,
+        self, factor: Factor, free: NDArray[np.int64] | None, modes: Condensed | None
     ) -> None:
-        self.backend = factor.backend
-        self._count = len(problem.positions)
-        self._factor = factor
-        self._free = free
-        self._modes = modes
+        self._factor, self._free, self._modes = factor, free, modes
 
     def __call__(self, r: Array) -> Array:
         if self._modes is None:
