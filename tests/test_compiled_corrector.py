@@ -392,11 +392,10 @@ def test_edges_receive_in_groups_of_their_own():
 # --- in steps --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("placement", ["state", "force", "guess"])
 @pytest.mark.parametrize("gate", [None, Gate(), Gate(outside=0.0), Gate(outside=None, energy=0.0)])
-def test_steps_and_decisions_are_those_of_torch(placement, gate, monkeypatch):
+def test_steps_and_decisions_are_those_of_torch(gate, monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    made = fitted([problem], placement=placement, node_features=REMEMBERING)
+    made = fitted([problem], node_features=REMEMBERING)
     made.network.float()
     compiled = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), made, gate=gate)
     monkeypatch.setattr("pdcorrect.corrector.hybrid.compilable", lambda *_: False)

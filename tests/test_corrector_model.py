@@ -101,7 +101,7 @@ def test_a_loaded_model_corrects_as_the_saved_one(tmp_path, name):
 
 
 def test_settings_beside_those_of_a_preset_survive(tmp_path):
-    config = preset("thesis", layers=2, width=8, norm="all", shared=True, placement="force")
+    config = preset("thesis", layers=2, width=8, norm="all", shared=True)
     original = samples.fit(Corrector(config), samples.FeatureView(*sample()))
     save_model(original, tmp_path / "model", record=RECORD)
     assert_same_corrector(load_model(tmp_path / "model").corrector, original)
@@ -355,6 +355,7 @@ def put_json(*place, value):
         (put_json("weights_sha256", value=3), "weights_sha256"),
         (lambda content: content.pop("architecture"), "architecture: "),
         (put_json("format", value="something"), "format"),
+        (put_json("architecture", "placement", value="force"), "architecture.placement"),
         (put_json("normalisation", "output_scale", value=3.0), "normalisation"),
     ],
 )

@@ -35,9 +35,7 @@ class CorrectorConfig(Strict):
         linear momentum stays exactly, angular momentum to first order in delta.  Nodes with a
         held component keep what they have.
     placement
-        What is corrected: "state", the coarse solver's answer; "force", its loads;
-        "guess", only where its iteration begins, which may lead to another one of several
-        minima.
+        What is corrected: the coarse solver's answer.  Model files name it.
     """
 
     node_features: tuple[str, ...]
@@ -50,7 +48,7 @@ class CorrectorConfig(Strict):
     output: Literal["world", "frame"] = "frame"
     clip: Positive | None = 10.0
     momentum_neutral: bool = False
-    placement: Placement = "state"
+    placement: Literal["state"] = "state"
 
     @field_validator("node_features")
     @classmethod

@@ -16,6 +16,7 @@ from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureVi
 from pdcorrect.corrector.frames import turned, turned_back
 from pdcorrect.corrector.network import MeshGraphNetwork
 from pdcorrect.corrector.normaliser import Normaliser
+from pdcorrect.errors import InputError
 
 
 class Answers(Protocol):
@@ -119,6 +120,30 @@ class Corrector(nn.Module):
         if self.config.output == "world":
             return correction
         return turned_back(view.frames, correction) / (view.size * view.scale)
+
+
+def check_corrector(corrector: object, device: torch.device) -> Corrector:
+    """A corrector that can be asked on a device; others are refused.
+
+    Raises
+    ------
+    InputError
+        If it is of another kind, its normaliser was not fitted or it is elsewhere.
+    """
+    if not isinstance(corrector, Corrector):
+        raise InputError(f"corrector is a {type(corrector).__name__}: expected a Corrector.")
+    if not corrector.normaliser.fitted:
+        raise InputError(
+            "corrector: its normaliser has seen no data, so its inputs and output have no "
+            "scale. Expected one that was trained or loaded."
+        )
+    found = corrector.normaliser.output_scale.device
+    if found != device:
+        raise InputError(
+            f"corrector: on {found}, expected {device} as the coarse solver: move it there "
+            f"with corrector.to({str(device)!r})."
+        )
+    return corrector
 
 
 def without_momentum(view: FeatureView, correction: Tensor) -> Tensor:

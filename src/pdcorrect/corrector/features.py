@@ -42,8 +42,7 @@ class Snapshot:
     positions, velocities : (n, 3)
         Before the step, m and m/s.
     proposed : (n, 3)
-        After it: what the coarse solver found, or, before it was asked, the positions that
-        inertia and loads alone would lead to, m.
+        After it, as the coarse solver found them, m.
     forces : (n, 3)
         Loads during the step, N.
     correction : (n, 3) or None

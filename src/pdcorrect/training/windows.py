@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +16,6 @@ from torch import Tensor
 from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
 from pdcorrect.corrector.features import Snapshot
-from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.folder import Folders
 from pdcorrect.data.reader import TrajectoryDataset
@@ -43,8 +41,7 @@ class StepBatch:
     bodies : BodyGraph
     snapshot : Snapshot
     target : (n, 3)
-        The correction that leads to the reference, m; for placement "guess" to the base
-        model's answer.
+        The correction that leads to the reference, m.
     scale : (B,)
         Mean squared one-step error of the base model on each trajectory, m2.
     """
@@ -183,12 +180,6 @@ class StepWindows:
         bodies = joined([self._bodies[file] for file in files.tolist()])
         state = Snapshot(positions, velocities, coarse, forces, previous)
         target = self._taken("positions", ahead) - coarse
-        if self.config.placement != "state":
-            h: Any = bodies.by_node(bodies.time_step)[:, None]
-            # the clamps of the stored coarse step are where they are prescribed
-            start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
-            state = replace(state, proposed=start)
-            target = coarse - start if self.config.placement == "guess" else target
         which = torch.from_numpy(self._numbers[files, simulations]).to(self.device)
         return StepBatch(bodies, state, target, self._errors.of(which).after(1))
 
