@@ -12,13 +12,11 @@ from conftest import rotation
 from hybrid_samples import TORSION, Prescribed, fitted, soft_beam
 from network_samples import body, corrector, moving, turned_and_moved
 from pdcorrect.corrector.architecture import preset
-from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.compiled_features import CompiledFeatures
-from pdcorrect.corrector.compiled_network import Groups
+from pdcorrect.corrector.compiled import CompiledCorrector, CompiledFeatures, compilable
+from pdcorrect.corrector.compiled_network import Groups, product, strips
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.matrix_products import product, strips
 
 CROSS = {
     "shape": "cross", "cells": [6, 2, 2], "cell_size": 0.05, "arms": 4, "arm_start": 2,

@@ -15,12 +15,15 @@ from pdcorrect import discretise  # noqa: E402
 from pdcorrect.corrector import features  # noqa: E402
 from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
-from pdcorrect.corrector.envelope import Envelope  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
     NODE_FEATURES,
     FeatureView,
 )
-from pdcorrect.corrector.normaliser import Normaliser, RunningMoments  # noqa: E402
+from pdcorrect.corrector.normaliser import (  # noqa: E402
+    Envelope,
+    Normaliser,
+    RunningMoments,
+)
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from reader_samples import shard, write  # noqa: E402

@@ -11,12 +11,11 @@ from conftest import beam, box_mesh, held, problem_on, rotation
 from hybrid_samples import TORSION, Watched, fitted, problems, soft_beam
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
-from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.bodies import SHAPE_MEASURES, BodyGraph
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.normaliser import RunningMoments
-from pdcorrect.corrector.shapes import SHAPE_MEASURES
 from pdcorrect.fem.mesh import voxel_mesh
 
 ONLY_BODIES = Gate(crushing=None, energy=None)

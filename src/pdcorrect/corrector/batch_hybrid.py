@@ -181,21 +181,13 @@ class _TimesMass(torch.autograd.Function):
 
 
 class BatchCoarseStep:
-    """A `CoarseStep` of B scenes.
+    """A `CoarseStep` of B scenes; ``previous`` (n, 3) is the correction of the step before, m.
 
-    Where y of the integrator is the end of the step (all but midpoint),
-    the internal modes of a corrected answer stay those of the coarse one: relaxed again, which a
-    single scene's `HybridStepper` does, they would only lower its energy, so the gate is
-    never more lenient here.  Else y's modes belong to another time, and the gate relaxes those
-    at the end of the step, scene by scene on the CPU.
-
-    Parameters
-    ----------
-    parts : BatchParts
-    state : BatchState
-        Before the step.
-    previous : (n, 3) or None
-        Correction of the step before, m.
+    Where y of the integrator is the end of the step (all but midpoint), the internal modes of a
+    corrected answer stay those of the coarse one: relaxed again, which a single scene's
+    `HybridStepper` does, they would only lower its energy, so the gate is never more lenient here.
+    Else y's modes belong to another time, and the gate relaxes those at the end of the step, scene
+    by scene on the CPU.
     """
 
     def __init__(self, parts: BatchParts, state: BatchState, previous: Tensor | None) -> None:

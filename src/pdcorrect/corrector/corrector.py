@@ -9,13 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import CorrectorConfig
+from pdcorrect.corrector.architecture import CorrectorConfig, MeshGraphNetwork
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.envelope import Envelope
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.frames import turned, turned_back
-from pdcorrect.corrector.network import MeshGraphNetwork
-from pdcorrect.corrector.normaliser import Normaliser
+from pdcorrect.corrector.normaliser import Envelope, Normaliser
 from pdcorrect.errors import InputError
 
 
@@ -30,7 +28,7 @@ class Answers(Protocol):
         """Corrections (n, 3), m."""
 
     def rest_score(self, bodies: BodyGraph) -> Tensor:
-        """See `pdcorrect.corrector.envelope.Envelope.rest_score`, (B,)."""
+        """See `pdcorrect.corrector.normaliser.Envelope.rest_score`, (B,)."""
 
     def score(self, view: FeatureView) -> Tensor:
         """Out-of-distribution score of a step of each body, (B,)."""

@@ -89,11 +89,6 @@ class FeatureView:
         """Nodes that edges come from, (E,) int64."""
         return self.bodies.edge_index[1]
 
-    @property
-    def rest_frames(self) -> Tensor:
-        """Rotations (n, 3, 3)."""
-        return self.bodies.rest_frames
-
     @cached_property
     def gradients(self) -> Tensor:
         """Deformation gradients F (n, 3, 3), after the step."""
@@ -110,7 +105,7 @@ class FeatureView:
     @cached_property
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
-        return product(self.turns, self.rest_frames)
+        return product(self.turns, self.bodies.rest_frames)
 
     @cached_property
     def receiver_frames(self) -> Tensor:
@@ -122,7 +117,9 @@ class FeatureView:
         """U - 1 in the node's frame, (n, 3, 3)."""
         identity = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
         stretch = product(self.turns.transpose(1, 2), self.gradients) - identity
-        return product(product(self.rest_frames.transpose(1, 2), stretch), self.rest_frames)
+        return product(
+            product(self.bodies.rest_frames.transpose(1, 2), stretch), self.bodies.rest_frames
+        )
 
     @cached_property
     def deformation(self) -> Tensor:

@@ -59,13 +59,7 @@ class Refusal:
 
 
 def refusals(reasons: Iterable[float]) -> tuple[Refusal, ...]:
-    """What was refused in the steps of a run, most frequent first.
-
-    Parameters
-    ----------
-    reasons : iterable of numbers of `Reason`
-        Of each step, such as ``run.stats["gate"]``.
-    """
+    """What was refused in a run, most frequent first, for numbers ``run.stats["gate"]``."""
     counts = Counter(Reason(int(number)) for number in reasons if number > 0)
     return tuple(Refusal(reason, steps) for reason, steps in counts.most_common())
 
@@ -74,14 +68,8 @@ def refusals(reasons: Iterable[float]) -> tuple[Refusal, ...]:
 class GateMeasures:
     """What a gate looks at in the states of B scenes after a step.
 
-    Attributes
-    ----------
-    ratios : (B, C)
-        Smallest det F of each cell, of the nodes' displacements; infinite in padding.
-    stored : (B,)
-        Kinetic and elastic energy, J.
-    work : (B,)
-        Of the scene's loads since the step began, J.
+    Smallest det F (B, C) of each cell, of the nodes' displacements, infinite in padding; kinetic
+    and elastic energy (B,), J; work (B,) of the scene's loads since the step began, J.
     """
 
     ratios: Tensor
@@ -100,7 +88,7 @@ class Gate(Checked):
     ----------
     outside
         Refused if the out-of-distribution score of body, time step and inputs is more than this,
-        see `pdcorrect.corrector.envelope.Envelope`.
+        see `pdcorrect.corrector.normaliser.Envelope`.
     crushing
         Refused if in any cell the smallest det F at the quadrature points, of the nodes'
         displacements, is not positive, or below this multiple of the coarse answer's, where that
@@ -187,15 +175,9 @@ class CoarseStep(Protocol[Answer]):
 class CorrectedStep(Generic[Answer]):
     """A step of B scenes with n nodes in all, those corrections in it that count.
 
-    Attributes
-    ----------
-    answer, coarse : Answer
-        Corrected, and the coarse solver's: the same bit for bit in scenes whose correction is
-        zero or refused.
-    correction : (n, 3)
-        As applied, m; zero where it was refused.
-    reasons : (B,) int64
-        Numbers of `Reason`.
+    ``coarse`` is the coarse solver's answer: ``answer`` bit for bit in scenes whose correction is
+    zero or refused.  The correction (n, 3), m, is as applied, zero where refused; ``reasons`` (B,)
+    are numbers of `Reason`, int64.
     """
 
     answer: Answer
@@ -283,17 +265,8 @@ def moved(
     corrected positions been its solution; by backward Euler v = (p - p_before)/h.  They are
     linear in the solution, so each takes its own multiple of the correction.
 
-    Parameters
-    ----------
-    scheme : Scheme
-        Of the step that led to ``state``.
-    state
-        With positions and velocities (..., 3) and a memory.
-    correction : (..., 3)
-        m; zero where clamped.
-    velocity : {"recomputed", "kept"}
-    mass_times : callable
-        The mass matrix times a correction, zero where clamped.
+    Arrays or tensors: ``state`` has positions and velocities (..., 3) and a memory; the correction
+    (..., 3), m, is zero where clamped, as ``mass_times``, the mass matrix times one, makes it.
     """
     positions = state.positions + correction
     if velocity == "kept":

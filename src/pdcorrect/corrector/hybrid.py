@@ -197,26 +197,10 @@ class HybridStepper:
 
 
 class SingleCoarseStep:
-    """A `CoarseStep` of one scene, on the CPU.
+    """A `CoarseStep` of one scene, on the CPU, from ``state`` under ``forces`` of the caller too.
 
-    Parameters
-    ----------
-    coarse : ImplicitStepper
-    bodies : BodyGraph
-        Its scene, float64.
-    velocity : {"recomputed", "kept"}
-        Of corrected answers.
-    state : State
-        Before the step.
-    forces : (N, 3) or None
-        Besides the scene's loads, N.
-    previous : (N, 3) or None
-        Correction of the step before, m.
-
-    Attributes
-    ----------
-    seconds : float
-        Wall clock in the coarse solver.
+    ``bodies`` is the scene, in float64; ``previous`` (N, 3) the correction of the step before, m;
+    ``seconds`` the wall clock in the coarse solver.
     """
 
     def __init__(
@@ -361,17 +345,13 @@ def hybrid_of(
         loaded.corrector,
         velocity=loaded.velocity,
         gate=chosen,
-        origin=None if isinstance(model, LoadedModel) else about_model(model),
+        origin=None if isinstance(model, LoadedModel) else about_model(model, loaded),
     )
 
 
-def about_model(model: str | Path) -> dict[str, str]:
-    """Which model that is.
-
-    Keys are ``model``, its name, ``base``, ``dataset``, ``trained_integrator`` and
-    ``weights_sha256``.  Time steps are known by a body's cells: `HybridStepper.trained_step`.
-    """
-    loaded, folder = load_model(model), model_folder(model)
+def about_model(model: str | Path, loaded: LoadedModel | None = None) -> dict[str, str]:
+    """Which model that is, for `HybridStepper.describe`; ``loaded`` where it is already."""
+    loaded, folder = loaded or load_model(model), model_folder(model)
     return {
         "model": folder.name, "base": loaded.base, "dataset": loaded.record.dataset,
         "trained_integrator": loaded.integrator, "weights_sha256": weights_digest(folder),

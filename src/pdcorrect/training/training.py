@@ -18,8 +18,7 @@ from torch import Tensor
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_description import ModelRecord
-from pdcorrect.corrector.model_io import LoadedModel, save_model, weights_digest
+from pdcorrect.corrector.model_io import LoadedModel, ModelRecord, save_model, weights_digest
 from pdcorrect.data.configuration import TRAINING, VALIDATION
 from pdcorrect.data.folder import Folders, check_whole, folders_of, splits_of
 from pdcorrect.data.importing import INTEGRATOR
