@@ -168,7 +168,7 @@ def test_bodies_of_the_training_split_are_like_it_whatever_part_is_fitted_to(fol
     np.testing.assert_allclose(
         envelope.average_high.numpy(), averages.amax(dim=0).numpy(), atol=1e-12
     )
-    assert 1.0 < float(envelope.strangeness(averages).max()) <= 3.5 + 1e-9
+    assert 1.0 < float(envelope.average_excess(averages).max()) <= 3.5 + 1e-9
     assert not (corrector.score(view) > 1.0).any()
 
     settings = samples.config(samples.one_step())

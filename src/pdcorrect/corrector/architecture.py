@@ -17,9 +17,6 @@ from pdcorrect._config import Positive, PositiveCount, Strict, explained
 from pdcorrect.corrector import features
 from pdcorrect.errors import InputError
 
-Placement = Literal["state", "force", "guess"]
-
-
 Normalisation = Literal["hidden", "all", "none"]
 
 
@@ -169,15 +166,12 @@ class MessageLayer(nn.Module):
 
 
 class MeshGraphNetwork(nn.Module):
-    """Features of nodes and edges to one vector a node.
+    """Features of nodes and edges, so many components each, to one vector a node.
 
     Parameters
     ----------
-    node_features, edge_features : int
-        Components.
-    outputs : int
     layers : int
-        Rounds of message passing.
+        Rounds of message passing, afterwards ``count``.
     width : int
         Of all hidden layers.
     mlp_layers : int
@@ -186,11 +180,6 @@ class MeshGraphNetwork(nn.Module):
         LayerNorm on the output of each network but the decoder, also of the decoder, or of none.
     shared : bool
         Whether all rounds have the same weights.
-
-    Attributes
-    ----------
-    count : int
-        Rounds of message passing.
     """
 
     def __init__(

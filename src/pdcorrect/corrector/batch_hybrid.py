@@ -249,16 +249,10 @@ def _converged(statuses: Sequence[Status], device: torch.device) -> Tensor:
 class BatchHybridResult:
     """Outcome of a corrected step of B scenes with n nodes in all.
 
-    Attributes
-    ----------
-    state : BatchState
-    correction : (n, 3) tensor
-        As applied, m; zero where it was refused.
-    coarse : BatchResult
-        Of the coarse solver, its statuses too.  Steps that converged to inverted cells are
-        corrected like others.
-    reasons : (B,) int64 tensor
-        Numbers of `Reason`: why the plain coarse answer was kept; 0 where it was not.
+    The correction (n, 3), m, is as applied, zero where it was refused.  ``coarse`` is the coarse
+    solver's answer, its statuses too; steps that converged to inverted cells are corrected like
+    others.  ``reasons`` (B,) are numbers of `Reason`, why the plain coarse answer was kept, 0 where
+    it was not.
     """
 
     state: BatchState

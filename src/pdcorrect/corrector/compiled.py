@@ -127,7 +127,7 @@ class CompiledCorrector:
 
     def rest_score(self, bodies: BodyGraph) -> Tensor:
         """See `Corrector.rest_score`."""
-        return self._corrector.rest_score(bodies)
+        return self._corrector.envelope.rest_score(bodies)
 
     def score(self, view: FeatureView) -> Tensor:
         """See `Corrector.score`."""

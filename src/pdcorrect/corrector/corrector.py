@@ -38,18 +38,8 @@ class Corrector(nn.Module):
     """Displacements (n, 3), m, that are to be added to a coarse step.
 
     Clamped components get none.  With output "frame" it is exactly zero where the body is
-    not deformed, however it has moved.
-
-    Parameters
-    ----------
-    config : CorrectorConfig
-
-    Attributes
-    ----------
-    normaliser : Normaliser
-    envelope : Envelope
-        Both to be fitted before the first call; see `pdcorrect.training.fitting`.
-    network : MeshGraphNetwork
+    not deformed, however it has moved.  ``normaliser`` and ``envelope`` are to be fitted before the
+    first call; see `pdcorrect.training.fitting`.
     """
 
     def __init__(self, config: CorrectorConfig) -> None:

@@ -36,8 +36,8 @@ from pdcorrect.corrector.gate import (
 )
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.errors import InputError, PdcorrectWarning
-from pdcorrect.fem.problem import BASES, Problem, coarse_model
-from pdcorrect.scene import Scene, check_scene, trained_coarse
+from pdcorrect.fem.problem import BASES, coarse_model
+from pdcorrect.scene import Scene, check_scene
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State, Status, StepResult
@@ -306,7 +306,6 @@ def hybrid_of(
     model: str | Path | LoadedModel,
     *,
     gate: bool | Gate | None = True,
-    problem: Problem | None = None,
 ) -> HybridStepper:
     """Projective dynamics on the coarse model that a corrector was trained for, corrected.
 
@@ -319,15 +318,13 @@ def hybrid_of(
         Name or folder, see `load_model`, or one that is loaded.
     gate : bool, Gate or None
         True: the default `Gate`; None and False: none.
-    problem : Problem, optional
-        That coarse model of the scene if it is there already, or with another total mass.
 
     Raises
     ------
     FileFormatError, InputError
-        If there is no such model, it is damaged, it corrects an unknown coarse model or another
-        one than ``problem``, it does not fit the scene, the scene is quasi-static and the model's
-        training was not, or ``gate`` is something else.
+        If there is no such model, it is damaged, it corrects an unknown coarse model, it does not
+        fit the scene, the scene is quasi-static and the model's training was not, or ``gate`` is
+        something else.
     """
     check_scene(scene)
     loaded = model if isinstance(model, LoadedModel) else load_model(model)
@@ -336,12 +333,8 @@ def hybrid_of(
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
     _check_integrator(scene.time.integrator, loaded.integrator, name)
     chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
-    if problem is None:
-        problem = coarse_model(scene, loaded.base)
-    else:
-        _check_problem(problem, scene, loaded.base, name)
     return HybridStepper(
-        ProjectiveDynamics(problem),
+        ProjectiveDynamics(coarse_model(scene, loaded.base)),
         loaded.corrector,
         velocity=loaded.velocity,
         gate=chosen,
@@ -369,16 +362,3 @@ def _check_integrator(found: str, trained: str, name: str) -> None:
         )
     change = f'set integrator = "{trained}" in [time], or leave the model out'
     warnings.warn(f"{told}: it may be of no use; {change}", PdcorrectWarning, stacklevel=3)
-
-
-def _check_problem(problem: Problem, scene: Scene, base: str, name: str) -> None:
-    """Refuse another mesh, element or mass rule than the coarse model has."""
-    solver = (trained_coarse(scene) if base == "best" else scene).solver
-    found = problem.refine, problem.element, problem.mass_rule
-    expected = 1, solver.element, solver.mass
-    if found != expected:
-        raise InputError(
-            f"{name}: problem is refined {found[0]} times with element {found[1]} and mass "
-            f"{found[2]}: expected {expected[0]}, {expected[1]} and {expected[2]}, the scene's "
-            f"coarse model {base!r}."
-        )

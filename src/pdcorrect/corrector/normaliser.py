@@ -74,19 +74,8 @@ class RunningMoments:
 class Normaliser(nn.Module):
     """Affine maps by feature name, and the scale of the output; buffers, not trained.
 
-    Parameters
-    ----------
-    nodes, edges : mapping of str to int
-        Components of each feature.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of the features.
-    output_scale : () tensor
-        Root mean square of the training targets, a component.
-    fitted : bool
-        Whether it has seen data.
+    Nodes' and edges' features are given with their components.  ``output_scale`` is the root mean
+    square of the training targets, a component.
     """
 
     output_scale: Tensor
@@ -101,6 +90,7 @@ class Normaliser(nn.Module):
 
     @property
     def fitted(self) -> bool:
+        """Whether it has seen data."""
         return bool(self.output_scale > 0)
 
     def fit(self, features: Mapping[str, RunningMoments], target: RunningMoments) -> None:
@@ -199,15 +189,10 @@ class Envelope(nn.Module):
     has a high score all the same.  For inputs that are large in few steps, as in kicks, the last
     is a test of their range.  What is not a number is infinitely far.
 
-    Parameters
-    ----------
-    nodes, edges : mapping of str to int
-        Components of each feature.
+    Nodes' and edges' features are given with their components.
 
     Attributes
     ----------
-    names : tuple of str
-        Of the features.
     average_low, average_high, average_mean, average_deviation : (a,) tensors
         Of the means over a body's nodes of what the network sees of them, as all that follows
         not numbers before `fit`.
@@ -238,11 +223,8 @@ class Envelope(nn.Module):
     def fit(self, seen: Mapping[str, RunningMoments]) -> None:
         """Take over ranges of features by name, and those called average, shape and time_step.
 
-        Parameters
-        ----------
-        seen : mapping of str to RunningMoments
-            Of bodies' mean inputs (m, a), measures at rest (m, 10) and logarithms of time steps
-            over cell sizes (m, 1); what is not there stays as it is.
+        The last three are of bodies' mean inputs (m, a), measures at rest (m, 10) and logarithms of
+        time steps over cell sizes (m, 1).  What is not there stays as it is.
         """
         for name, moments in seen.items():
             for part in ("low", "high"):
@@ -268,16 +250,10 @@ class Envelope(nn.Module):
     def score(self, bodies: BodyGraph, excess: Tensor, averages: Tensor) -> Tensor:
         """The out-of-distribution score of a step of each body, (B,).
 
-        Parameters
-        ----------
-        bodies : BodyGraph
-            B.
-        excess : (n,)
-            The largest of a node's inputs and those of its edges.
-        averages : (B, a)
-            Bodies' mean inputs.
+        ``excess`` (n,) is the largest of a node's inputs and those of its edges, ``averages``
+        (B, a) are bodies' mean inputs.
         """
-        average = self.strangeness(averages).amax(dim=1) / AVERAGE
+        average = self.average_excess(averages).amax(dim=1) / AVERAGE
         inputs = torch.maximum(_exceeded(bodies, excess), average)
         return torch.maximum(self.rest_score(bodies), inputs)
 
@@ -307,7 +283,7 @@ class Envelope(nn.Module):
         )
         return low, high, below, above
 
-    def strangeness(self, averages: Tensor) -> Tensor:
+    def average_excess(self, averages: Tensor) -> Tensor:
         """How far bodies' mean inputs (B, a) are from their mean in training.
 
         In deviations of such means, of which the farthest on the same side counts as 3.5 at most.
