@@ -105,7 +105,7 @@ def test_a_loaded_model_corrects_as_the_saved_one(tmp_path, name):
 
 
 def test_settings_beside_those_of_a_preset_survive(tmp_path):
-    config = preset("thesis", layers=2, width=8, norm="all", shared=True)
+    config = preset("thesis", layers=2, width=8, momentum_neutral=True)
     original = samples.fit(Corrector(config), samples.FeatureView(*sample()))
     save_model(original, tmp_path / "model", record=RECORD)
     assert_same_corrector(load_model(tmp_path / "model").corrector, original)
@@ -360,6 +360,8 @@ def put_json(*place, value):
         (lambda content: content.pop("architecture"), "architecture: "),
         (put_json("format", value="something"), "format"),
         (put_json("architecture", "placement", value="force"), "architecture.placement"),
+        (put_json("architecture", "norm", value="all"), "architecture.norm"),
+        (put_json("architecture", "shared", value=True), "architecture.shared"),
         (put_json("normalisation", "output_scale", value=3.0), "normalisation"),
     ],
 )
@@ -372,8 +374,8 @@ def test_descriptions_that_do_not_fit_are_refused_by_name(model, change, named):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"width": 9}, {"layers": 2}, {"layers": 10**9}, {"mlp_layers": 3}, {"norm": "none"},
-        {"norm": "all"}, {"node_features": ["strain"]}, {"edge_features": ["stretch", "turn"]},
+        {"width": 9}, {"layers": 2}, {"layers": 10**9}, {"mlp_layers": 3},
+        {"node_features": ["strain"]}, {"edge_features": ["stretch", "turn"]},
         {"edge_features": ["rest-position", "stretch", "motion", "turn"]},
     ],
     ids=str,

@@ -17,8 +17,6 @@ from pdcorrect._config import Positive, PositiveCount, Strict, explained
 from pdcorrect.corrector import features
 from pdcorrect.errors import InputError
 
-Normalisation = Literal["hidden", "all", "none"]
-
 
 class CorrectorConfig(Strict):
     """A corrector's architecture.
@@ -27,7 +25,7 @@ class CorrectorConfig(Strict):
     ----------
     node_features, edge_features
         Names from `pdcorrect.corrector.features`.
-    layers, width, mlp_layers, norm, shared
+    layers, width, mlp_layers
         See `MeshGraphNetwork`.
     output
         "world": a vector in the scene's axes, in units of the training targets' deviation.
@@ -40,8 +38,9 @@ class CorrectorConfig(Strict):
         wholly free nodes of a body, at the proposed positions, is taken out of theirs: then
         linear momentum stays exactly, angular momentum to first order in delta.  Nodes with a
         held component keep what they have.
-    placement
-        What is corrected: the coarse solver's answer.  Model files name it.
+    norm, shared, placement
+        LayerNorm on the output of each network but the decoder; whether all rounds have the same
+        weights; what is corrected, the coarse solver's answer.  Model files name them.
     """
 
     node_features: tuple[str, ...]
@@ -49,8 +48,8 @@ class CorrectorConfig(Strict):
     layers: PositiveCount
     width: PositiveCount
     mlp_layers: Annotated[int, Field(strict=True, ge=2)]
-    norm: Normalisation = "hidden"
-    shared: bool = False
+    norm: Literal["hidden"] = "hidden"
+    shared: Literal[False] = False
     output: Literal["world", "frame"] = "frame"
     clip: Positive | None = 10.0
     momentum_neutral: bool = False
@@ -142,13 +141,13 @@ class MessageLayer(nn.Module):
     there are more edges than nodes.
     """
 
-    def __init__(self, width: int, layers: int, norm: bool) -> None:
+    def __init__(self, width: int, layers: int) -> None:
         super().__init__()
         self.of_edge = nn.Linear(width, width)
         self.of_receiver = nn.Linear(width, width, bias=False)
         self.of_sender = nn.Linear(width, width, bias=False)
-        self.edge_rest = nn.Sequential(nn.ReLU(), *MLP(width, width, width, layers - 1, norm))
-        self.node = MLP(2 * width, width, width, layers, norm)
+        self.edge_rest = nn.Sequential(nn.ReLU(), *MLP(width, width, width, layers - 1, True))
+        self.node = MLP(2 * width, width, width, layers, True)
         bound = (3 * width) ** -0.5  # as one map from all three
         for part in (self.of_edge, self.of_receiver, self.of_sender):
             nn.init.uniform_(part.weight, -bound, bound)
@@ -171,15 +170,11 @@ class MeshGraphNetwork(nn.Module):
     Parameters
     ----------
     layers : int
-        Rounds of message passing, afterwards ``count``.
+        Rounds of message passing.
     width : int
         Of all hidden layers.
     mlp_layers : int
         Linear layers of each network.
-    norm : {"hidden", "all", "none"}
-        LayerNorm on the output of each network but the decoder, also of the decoder, or of none.
-    shared : bool
-        Whether all rounds have the same weights.
     """
 
     def __init__(
@@ -191,17 +186,12 @@ class MeshGraphNetwork(nn.Module):
         layers: int,
         width: int,
         mlp_layers: int,
-        norm: Normalisation = "hidden",
-        shared: bool = False,
     ) -> None:
         super().__init__()
-        hidden = norm != "none"
-        self.node_encoder = MLP(node_features, width, width, mlp_layers, hidden)
-        self.edge_encoder = MLP(edge_features, width, width, mlp_layers, hidden)
-        count = 1 if shared else layers
-        self.rounds = nn.ModuleList(MessageLayer(width, mlp_layers, hidden) for _ in range(count))
-        self.decoder = MLP(width, width, outputs, mlp_layers, norm == "all")
-        self.count = layers
+        self.node_encoder = MLP(node_features, width, width, mlp_layers, True)
+        self.edge_encoder = MLP(edge_features, width, width, mlp_layers, True)
+        self.rounds = nn.ModuleList(MessageLayer(width, mlp_layers) for _ in range(layers))
+        self.decoder = MLP(width, width, outputs, mlp_layers, False)
 
     def forward(self, x: Tensor, e: Tensor, edge_index: Tensor) -> Tensor:
         """Outputs (n, k) for features (n, a) of nodes and (E, b) of edges.
@@ -209,7 +199,7 @@ class MeshGraphNetwork(nn.Module):
         The first row of ``edge_index`` (2, E) is the receiver.
         """
         x, e = self.node_encoder(x), self.edge_encoder(e)
-        for i in range(self.count):
-            x, e = self.rounds[i % len(self.rounds)](x, e, edge_index)
+        for each in self.rounds:
+            x, e = each(x, e, edge_index)
         out: Tensor = self.decoder(x)
         return out

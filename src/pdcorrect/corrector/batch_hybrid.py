@@ -44,10 +44,9 @@ from pdcorrect.state import Status
 
 
 def external_forces(stepper: BatchStepper, state: BatchState) -> Tensor:
-    """All loads of the scenes (B, N, 3), N, in the step from a state.
+    """All loads of the scenes (B, N, 3), N, in the step from a state; differentiable by it.
 
     Those that follow the body are sampled on the CPU, others do not leave the device.
-    Differentiable by the state, on which only the former depend.
     """
     stage = stepper.staging(state)
     found: Tensor = _Loads.apply(stepper, stage.spans, state.positions)  # type: ignore[no-untyped-call]
@@ -116,13 +115,7 @@ class BatchBodies:
         return out.reshape(scenes, nodes, *x.shape[1:]).to(self.stepper.dtype)
 
     def view(self, state: BatchState, coarse: Tensor, previous: Tensor | None) -> FeatureView:
-        """What the network sees of a step from ``state`` with the coarse answer (B, N, 3).
-
-        Raises
-        ------
-        InputError
-            If ``previous``, the correction of the step before, m, is one of other bodies.
-        """
+        """What the network sees of a step from ``state`` with the coarse answer (B, N, 3)."""
         self.check_previous(previous)
         loads = external_forces(self.stepper, state)
         parts = (state.positions, state.velocities, coarse, loads)

@@ -218,7 +218,6 @@ class CompiledNetwork:
         self._decoder = _maps(network.decoder, self._width)
         self._outputs = _linears(network.decoder)[-1].out_features
         rounds: list[Any] = list(network.rounds)
-        self._order = [i % len(rounds) for i in range(network.count)]
         self._updates = [
             (*_maps([r.of_edge, *r.edge_rest], self._width), *_maps(r.node, self._width))
             for r in rounds
@@ -227,16 +226,16 @@ class CompiledNetwork:
 
     def __call__(self) -> Array:
         """Outputs (nodes, 3 or more) for `x` and `e`; the next call overwrites them."""
-        groups, order = self._groups, self._order
+        groups = self._groups
         _encode(
-            self.x, self.e, *self._encoders, *self._ends[order[0]], self._width, groups.first,
+            self.x, self.e, *self._encoders, *self._ends[0], self._width, groups.first,
             self._values, self._edges, self._to, self._start[0],
         )  # fmt: skip
-        for i, number in enumerate(order):
-            last = i + 1 == len(order)
-            after = self._decoder if last else self._ends[order[i + 1]]
+        for i, updates in enumerate(self._updates):
+            last = i + 1 == len(self._updates)
+            after = self._decoder if last else self._ends[i + 1]
             _round(
-                *self._updates[number], *after, last, self._width, self._outputs, groups.first,
+                *updates, *after, last, self._width, self._outputs, groups.first,
                 groups.last, groups.sender, self._values, self._edges, self._to,
                 self._start[i % 2], self._start[(i + 1) % 2], self._out,
             )  # fmt: skip

@@ -50,7 +50,7 @@ class Corrector(nn.Module):
         self.normaliser, self.envelope = Normaliser(nodes, edges), Envelope(nodes, edges)
         self.network = MeshGraphNetwork(
             sum(nodes.values()), sum(edges.values()), layers=config.layers, width=config.width,
-            mlp_layers=config.mlp_layers, norm=config.norm, shared=config.shared,
+            mlp_layers=config.mlp_layers,
         )  # fmt: skip
 
     def forward(self, bodies: BodyGraph, snapshot: Snapshot) -> Tensor:
@@ -111,13 +111,7 @@ class Corrector(nn.Module):
 
 
 def check_corrector(corrector: object, device: torch.device) -> Corrector:
-    """A corrector that can be asked on a device; others are refused.
-
-    Raises
-    ------
-    InputError
-        If it is of another kind, its normaliser was not fitted or it is elsewhere.
-    """
+    """A corrector that can be asked on a device; others are refused with an `InputError`."""
     if not isinstance(corrector, Corrector):
         raise InputError(f"corrector is a {type(corrector).__name__}: expected a Corrector.")
     if not corrector.normaliser.fitted:

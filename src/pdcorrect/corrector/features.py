@@ -260,13 +260,7 @@ UNSCALED = frozenset({"node-type"})
 
 
 def width(features: dict[str, Feature], names: Sequence[str]) -> int:
-    """Components of some features together.
-
-    Raises
-    ------
-    InputError
-        If one is unknown, or named twice.
-    """
+    """Components of some features together; an `InputError` if one is unknown or named twice."""
     for name in names:
         if name not in features:
             raise InputError(f"feature {name!r}: expected one of {', '.join(features)}.")

@@ -133,12 +133,7 @@ class Gate(Checked):
 
 
 def check_gate(gate: object) -> None:
-    """Refuse what is no gate.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse what is no gate with an `InputError`."""
     if gate is not None and not isinstance(gate, Gate):
         raise InputError(f"gate is a {type(gate).__name__}: expected a Gate(...) or None.")
 
@@ -236,12 +231,7 @@ solver's own."""
 
 
 def check_velocity(velocity: str, integrator: str) -> None:
-    """Refuse velocities that have no meaning with an integrator.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse velocities that have no meaning with an integrator with an `InputError`."""
     if velocity not in get_args(Velocity):
         raise InputError(f"velocity = {velocity!r}: expected 'recomputed' or 'kept'.")
     if velocity == "kept" and integrator in ("bdf2", "generalised-alpha"):

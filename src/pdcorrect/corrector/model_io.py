@@ -83,13 +83,7 @@ class Description(Strict):
     weights_sha256: str
 
     def to_json(self) -> str:
-        """The file's text.
-
-        Raises
-        ------
-        ValueError
-            If a number is not finite.
-        """
+        """The file's text; a ValueError if a number is not finite."""
         content = self.model_dump(mode="json")
         whole = {**content, _CHECKSUM: content_digest(content)}
         return json.dumps(whole, indent=1, allow_nan=False) + "\n"
@@ -102,15 +96,7 @@ def content_digest(content: dict[str, Any]) -> str:
 
 
 def read_description(folder: Path) -> Description:
-    """What ``model.json`` in a folder says, if it is whole.
-
-    Raises
-    ------
-    FileFormatError
-        If it is damaged.
-    FileVersionError
-        If it was written in another version of the format.
-    """
+    """What ``model.json`` in a folder says; for errors see `load_model`."""
     path = folder / DESCRIPTION
     try:
         content = json.loads(_read(path).decode("utf-8"))
@@ -175,23 +161,14 @@ def model_folder(path_or_name: str | Path) -> Path:
 
 
 def models_folder() -> Path:
-    """Where models are looked up by name.
-
-    Raises
-    ------
-    InputError
-        If the environment does not say, and the code is not in its checkout.
-    """
+    """Where models are looked up by name."""
     return home_folder("models", ", or the path of a model")
 
 
 def unlike_ends(folders: Sequence[Path]) -> list[str]:
     """The shortest ends of paths that are all unlike, such as "seed-1/model".
 
-    Raises
-    ------
-    InputError
-        If a folder comes twice.
+    A folder that comes twice is an `InputError`.
     """
     for folder in folders:
         if folders.count(folder) > 1:
@@ -250,11 +227,7 @@ class LoadedModel:
 
     @property
     def fitted_to(self) -> list[str]:
-        """Names of the data sets that its training fitted or widened its ranges to.
-
-        Those are what a gate knows of bodies at rest and of time steps, among others.  All that it
-        was trained on if not recorded.
-        """
+        """Names of the data sets that its ranges were fitted to; all of them if not recorded."""
         training: dict[str, Any] = self.record.training
         if "fitted_to" in training:
             return list(training["fitted_to"])
@@ -377,7 +350,7 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise FileFormatError(f"{path}: not a file of tensors ({error}).") from None
     config = found.architecture
-    if (1 if config.shared else config.layers) + config.mlp_layers > len(state):
+    if config.layers + config.mlp_layers > len(state):
         raise FileFormatError(
             f"{path}: {len(state)} tensors: expected more for the architecture in {DESCRIPTION}."
         )
