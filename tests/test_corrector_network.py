@@ -349,12 +349,7 @@ def test_the_thesis_has_the_parameters_of_its_description():
     assert sum(p.numel() for p in model.parameters()) == by_hand == 2_878_467
 
 
-CONFIGS = {
-    **PRESETS,
-    "shared": preset("compact", shared=True, mlp_layers=2),
-    "norms": preset("equivariant", norm="all"),
-    "bare": preset("thesis", norm="none", layers=3, width=20),
-}
+CONFIGS = {**PRESETS, "small": preset("thesis", layers=3, width=20)}
 
 
 @pytest.mark.parametrize("name", list(CONFIGS))
