@@ -99,7 +99,7 @@ class StepWindows:
         device: str | torch.device = "cpu",
         without: Collection[str] = (),
     ) -> None:
-        self.config, self.device = config, torch.device(device)
+        self.device = torch.device(device)
         self._history = "previous-correction" in config.node_features
         self.dataset = TrajectoryDataset(
             folder, TRAINING, window=2 if self._history else 1, base=base, without=without
