@@ -8,13 +8,12 @@ import torch
 import pdcorrect as pc
 from conftest import beam, box_mesh, disturbed, problem_on
 from pdcorrect.corrector.architecture import preset
-from pdcorrect.corrector.batch_bodies import BatchBodies
+from pdcorrect.corrector.batch_hybrid import BatchBodies
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
+from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES
 from pdcorrect.corrector.model_io import ModelRecord, save_model
 from pdcorrect.corrector.normaliser import RunningMoments
 
-PLACEMENTS = ("state", "force", "guess")
 TORSION = {"kind": "torsion", "strength": 3e3, "stretch": 0.01}
 EULER = {"integrator": "backward-euler"}
 """By which correctors learn, and forces and energies of a correction are known in advance."""
@@ -78,8 +77,7 @@ def fitted(scenes, size=0.05, kind=Corrector, steps=6, seed=0, **changes):
     moments = {name: RunningMoments() for name in corrector.normaliser.names}
     views = []
     for state, after in itertools.pairwise(states):
-        coarse = after.positions if config.placement == "state" else None
-        views.append(FeatureView(nodes.graph, nodes.snapshot(state, coarse, None)))
+        views.append(nodes.view(state, after.positions, None))
         for table, names in (
             (NODE_FEATURES, config.node_features),
             (EDGE_FEATURES, config.edge_features),

@@ -8,7 +8,6 @@ import pdcorrect as pc
 from conftest import disturbed
 from hybrid_samples import (
     CELL,
-    PLACEMENTS,
     PRESSURE,
     TORSION,
     fitted,
@@ -18,19 +17,21 @@ from hybrid_samples import (
     soft_beam,
 )
 from pdcorrect.corrector.architecture import preset
-from pdcorrect.corrector.batch_bodies import BatchBodies, external_forces
-from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+from pdcorrect.corrector.batch_hybrid import (
+    BatchBodies,
+    BatchHybrid,
+    HybridLayer,
+    external_forces,
+)
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.single_step import SingleCoarseStep
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
+def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit():
     scenes = problems((3, 1, 1), (2, 2, 1))
     stepper = pc.BatchStepper(scenes)
-    hybrid = BatchHybrid(stepper, silent(fitted(scenes, placement=placement)), gate=Gate())
+    hybrid = BatchHybrid(stepper, silent(fitted(scenes)), gate=Gate())
     state = plain = stepper.rest_state()
     for _ in range(3):
         state, plain = hybrid(state).state, stepper(plain).state
@@ -39,11 +40,10 @@ def test_a_network_that_gives_nothing_leaves_a_batch_bit_for_bit(placement):
 
 
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_scenes_of_a_batch_are_corrected_as_single_ones_are(placement, element):
+def test_scenes_of_a_batch_are_corrected_as_single_ones_are(element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
     names = (*preset("compact").node_features, "previous-correction")
-    corrector = fitted(scenes, placement=placement, node_features=names)
+    corrector = fitted(scenes, node_features=names)
     gate = Gate(outside=None)
     stepper = pc.BatchStepper(scenes, 1e-12)
     many = BatchHybrid(stepper, corrector, gate=gate)
@@ -82,42 +82,6 @@ def test_the_network_is_told_all_loads_of_the_step(load):
     assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
 
 
-def proposed(problem, state):
-    """What the network is shown before the coarse solver was asked, one by one and in a batch."""
-    bodies = BodyGraph.of([problem], dtype=torch.float64)
-    one = SingleCoarseStep(pc.ProjectiveDynamics(problem), bodies, "recomputed", state)
-    stepper = pc.BatchStepper([problem])
-    many = BatchBodies(stepper).snapshot(stepper.state([state]), None, None)
-    return one.view(None).snapshot.proposed.numpy(), many.proposed.numpy()
-
-
-def test_moving_clamps_are_proposed_where_they_will_be():
-    turn = {"times": [0.0, 0.1], "rotation": [0.0, 40.0], "centre": [0, 0.01, 0.01], "axis": "x"}
-    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": turn}]
-    problem = pc.discretise(soft_beam(clamps=clamps, loads=[TORSION]))
-    coarse, state = pc.ProjectiveDynamics(problem), problem.rest_state()
-    for _ in range(2):
-        after = coarse(state).state
-        for found in proposed(problem, state):
-            held_at = ~problem.free
-            assert np.array_equal(found[held_at], after.positions[held_at])
-            assert np.abs(found - state.positions)[held_at].max() > 1e-2 * CELL
-        state = after
-
-
-def test_clamps_that_do_not_move_and_free_nodes_are_proposed_by_inertia_and_loads():
-    problem = pc.discretise(soft_beam(loads=[TORSION], clamps=[{
-        "region": {"plane": "x", "at": 0.0}, "components": ["x", "z"],
-    }]))  # fmt: skip
-    h, state = problem.time_step, pc.rollout(pc.ProjectiveDynamics(problem), 3).state()
-    loads = problem.external_forces(state.time, state.time + h)
-    expected = state.positions + h * state.velocities
-    expected += h**2 * loads * problem.free / problem.mass[:, None]
-    one, many = proposed(problem, state)
-    assert np.array_equal(one, expected)
-    assert np.allclose(many, expected, rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize("mass", ["lumped", "averaged", "per-node"])
 def test_the_network_knows_the_material_that_the_stepper_has_now(mass):
     scenes = [pc.discretise(p.scene, mass=mass) for p in problems((3, 1, 1), (2, 2, 1))]
@@ -137,7 +101,7 @@ def test_the_network_knows_the_material_that_the_stepper_has_now(mass):
     ]
     expected = BodyGraph.of(changed, dtype=torch.float64)
     late = BatchBodies(stepper)
-    for found in (nodes.graph, layer.bodies, late.graph):
+    for found in (nodes.graph, layer.nodes.graph, late.graph):
         for name in ("mass", "young", "poisson", "density"):
             torch.testing.assert_close(getattr(found, name), getattr(expected, name))
             assert not torch.allclose(getattr(found, name), getattr(own, name))
@@ -145,15 +109,14 @@ def test_the_network_knows_the_material_that_the_stepper_has_now(mass):
     assert nodes.graph is nodes.graph
     assert nodes.graph.rest_frames is known
     stepper.set_material()
-    for found in (nodes.graph, layer.bodies, late.graph):
+    for found in (nodes.graph, layer.nodes.graph, late.graph):
         for name in ("mass", "young", "poisson", "density"):
             assert torch.equal(getattr(found, name), getattr(own, name))
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_batch_of_another_material_is_corrected_as_scenes_of_that_material(placement):
+def test_a_batch_of_another_material_is_corrected_as_scenes_of_that_material():
     scenes = problems((3, 1, 1), (2, 2, 1))
-    corrector = fitted(scenes, placement=placement)
+    corrector = fitted(scenes)
     stepper = pc.BatchStepper(scenes, 1e-11)
     hybrid = BatchHybrid(stepper, corrector)
     before = hybrid(stepper.rest_state())

@@ -12,13 +12,11 @@ from conftest import rotation
 from hybrid_samples import TORSION, Prescribed, fitted, soft_beam
 from network_samples import body, corrector, moving, turned_and_moved
 from pdcorrect.corrector.architecture import preset
-from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.compiled_features import CompiledFeatures
-from pdcorrect.corrector.compiled_network import Groups
+from pdcorrect.corrector.compiled import CompiledCorrector, CompiledFeatures, compilable
+from pdcorrect.corrector.compiled_network import Groups, product, strips
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.matrix_products import product, strips
 
 CROSS = {
     "shape": "cross", "cells": [6, 2, 2], "cell_size": 0.05, "arms": 4, "arm_start": 2,
@@ -160,13 +158,10 @@ def test_inputs_that_are_not_numbers_are_outside_the_training_data():
     [
         {},
         {"mlp_layers": 3},
-        {"mlp_layers": 4, "norm": "all"},
-        {"norm": "none"},
-        {"norm": "all"},
-        {"shared": True, "layers": 3},
+        {"mlp_layers": 4},
         {"layers": 1},
         {"width": 20},
-        {"width": 1, "norm": "none"},
+        {"width": 2},
         {"clip": None},
         {"momentum_neutral": True},
         {"node_features": REMEMBERING},
@@ -392,11 +387,10 @@ def test_edges_receive_in_groups_of_their_own():
 # --- in steps --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("placement", ["state", "force", "guess"])
 @pytest.mark.parametrize("gate", [None, Gate(), Gate(outside=0.0), Gate(outside=None, energy=0.0)])
-def test_steps_and_decisions_are_those_of_torch(placement, gate, monkeypatch):
+def test_steps_and_decisions_are_those_of_torch(gate, monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    made = fitted([problem], placement=placement, node_features=REMEMBERING)
+    made = fitted([problem], node_features=REMEMBERING)
     made.network.float()
     compiled = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), made, gate=gate)
     monkeypatch.setattr("pdcorrect.corrector.hybrid.compilable", lambda *_: False)

@@ -10,8 +10,6 @@ import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on, rotation
 from hybrid_samples import (
     CELL,
-    EULER,
-    PLACEMENTS,
     TINY,
     TORSION,
     bumped,
@@ -19,7 +17,6 @@ from hybrid_samples import (
     flying,
     folded,
     prescribed,
-    problems,
     same,
     shaken,
     silent,
@@ -29,9 +26,8 @@ from pdcorrect.corrector import features
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer, _TimesMass
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.gate import Gate
+from pdcorrect.corrector.gate import Gate, moved
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
-from pdcorrect.corrector.placements import moved
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.solvers.rollout import check_same_run
@@ -39,19 +35,11 @@ from pdcorrect.solvers.rollout import check_same_run
 # --- no correction, no change ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("placement", "element", "kind"),
-    [  # each pair of two of them once
-        ("state", "hex8", pc.ProjectiveDynamics), ("state", "hex8-bubble", pc.Newton),
-        ("force", "hex8", pc.Newton), ("force", "hex8-bubble", pc.ProjectiveDynamics),
-        ("guess", "hex8", pc.ProjectiveDynamics), ("guess", "hex8-bubble", pc.Newton),
-    ],
-)  # fmt: skip
-def test_a_network_that_gives_nothing_leaves_the_coarse_rollout_bit_for_bit(
-    placement, element, kind
-):
+@pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
+@pytest.mark.parametrize("kind", [pc.ProjectiveDynamics, pc.Newton])
+def test_a_network_that_gives_nothing_leaves_the_coarse_rollout_bit_for_bit(element, kind):
     problem = pc.discretise(soft_beam(solver={"element": element}, loads=[TORSION]))
-    corrector = silent(fitted([problem], placement=placement))
+    corrector = silent(fitted([problem]))
     run = pc.rollout(HybridStepper(kind(problem), corrector, gate=Gate()), 4)
     plain = pc.rollout(kind(problem), 4)
     assert same(run, plain)
@@ -124,7 +112,7 @@ def test_corrected_answers_are_measured_once(monkeypatch):
     assert len(ratios) == 2  # coarse step, corrected one
 
 
-# --- placements ------------------------------------------------------------------------------
+# --- velocities and momentum -----------------------------------------------------------------
 
 
 def test_recomputed_velocities_are_the_way_over_the_step_and_kept_ones_the_coarse_solver_s():
@@ -195,75 +183,11 @@ def test_a_corrected_state_is_gone_on_from_as_from_the_solution_itself(integrato
             np.testing.assert_allclose(a[free], b[free], rtol=0, atol=1e-6 * np.abs(b).max())
 
 
-@pytest.mark.parametrize("mass", ["consistent", "lumped"])
-def test_a_force_moves_a_free_body_by_the_correction(mass):
-    """In a step of backward Euler, by which the force is defined."""
-    problem = problem_on(
-        box_mesh((2, 1, 1), (0.04, 0.02, 0.02), 0.2), solver={"mass": mass},
-        time=EULER,
-    )  # fmt: skip
-    shift = np.broadcast_to([1e-3, 2e-3, -3e-3], problem.positions.shape)
-    corrector = prescribed(problem, shift, placement="force")
-    before = shaken(problem)
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), corrector)
-    way = stepper(before).state.positions - stepper.coarse(before).state.positions
-    assert np.allclose(way, shift, rtol=0, atol=1e-10)
-
-
-def test_forces_of_the_caller_act_beside_those_of_the_correction():
-    problem = pc.discretise(soft_beam())
-    push = np.full(problem.positions.shape, 1e-3)
-    corrector = prescribed(problem, bumped(problem), placement="force")
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-11), corrector)
-    added = problem.mass[:, None] * corrector.answer / problem.time_step**2
-    expected = stepper.coarse(problem.rest_state(), push + added).state
-    assert np.allclose(stepper(problem.rest_state(), push).state.positions, expected.positions)
-
-
-def test_a_corrected_guess_leads_to_the_coarse_answer():
-    problem = pc.discretise(soft_beam(loads=[TORSION]))
-    corrector = prescribed(problem, bumped(problem), placement="guess")
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-9), corrector)
-    state = plain = problem.rest_state()
-    for _ in range(3):
-        result, expected = stepper(state), stepper.coarse(plain)
-        state, plain = result.state, expected.state
-        assert np.abs(state.positions - plain.positions).max() < 1e-7 * CELL
-        assert result.iterations != expected.iterations
-
-
-def test_a_guess_may_lead_to_another_minimum():
-    """A beam that is pressed together at its ends bows to the side of the guess."""
-    push = {"times": [0.0, 0.01], "displacement": [[0, 0, 0], [-CELL, 0, 0]]}
-    clamps = [
-        {"region": {"plane": "x", "at": "min"}},
-        {"region": {"plane": "x", "at": "max"}, "motion": push},
-    ]
-    time = {"integrator": "quasi-static"}
-    problem = pc.discretise(soft_beam((8, 1, 1), clamps=clamps, loads=[], time=time))
-    bow = np.zeros_like(problem.positions)
-    bow[:, 2] = CELL * np.sin(np.pi * problem.positions[:, 0] / (8 * CELL)) ** 2
-    coarse, ways = pc.ProjectiveDynamics(problem, 1e-7), []
-    plain = coarse(problem.rest_state())
-    for side in (1.0, -1.0):
-        corrector = prescribed(problem, side * bow, placement="guess")
-        result = HybridStepper(coarse, corrector)(problem.rest_state())
-        assert result.status is pc.Status.CONVERGED
-        assert result.stats["elastic_energy"] < 0.99 * plain.stats["elastic_energy"]
-        ways.append((result.state.positions - problem.positions)[:, 2])
-    assert ways[0].max() > 0.5 * CELL
-    assert ways[0].min() > -1e-3 * CELL
-    assert ways[1].min() < -0.5 * CELL
-    assert ways[1].max() < 1e-3 * CELL
-
-
-@pytest.mark.parametrize("placement", ["state", "force"])
-def test_neutral_corrections_leave_a_free_body_the_momentum_of_its_coarse_step(placement):
+def test_neutral_corrections_leave_a_free_body_the_momentum_of_its_coarse_step():
     problem, before = flying()
     momenta = {}
     for neutral in (True, False):
-        corrector = fitted([pc.discretise(soft_beam())], size=0.5, placement=placement,
-                           momentum_neutral=neutral)  # fmt: skip
+        corrector = fitted([pc.discretise(soft_beam())], size=0.5, momentum_neutral=neutral)
         stepper = HybridStepper(pc.ProjectiveDynamics(problem, 1e-12), corrector)
         bent = pc.State(problem.positions + bumped(problem), before.velocities)
         found, coarse = stepper(bent), stepper.coarse(bent)
@@ -272,58 +196,6 @@ def test_neutral_corrections_leave_a_free_body_the_momentum_of_its_coarse_step(p
         momenta[neutral] = np.abs(change.sum(axis=0)).max() / np.abs(change).sum()
     assert momenta[True] < 1e-6
     assert momenta[False] > 1e-3
-
-
-@pytest.mark.parametrize("integrator", ["backward-euler", "midpoint", "bdf2"])
-@pytest.mark.parametrize("kind", [pc.ProjectiveDynamics, pc.Newton])
-def test_a_step_that_begins_at_its_answer_ends_at_once(kind, integrator):
-    problem = pc.discretise(soft_beam(loads=[TORSION], time={"integrator": integrator}))
-    stepper = kind(problem, 1e-7)
-    answer = stepper(shaken(problem))
-    again = stepper(shaken(problem), guess=answer.state.positions)
-    assert again.iterations <= 1 < answer.iterations
-    assert np.abs(again.state.positions - answer.state.positions).max() < 1e-6 * CELL
-
-
-def test_a_batch_that_begins_at_its_answer_ends_at_once():
-    scenes = problems((3, 1, 1), (2, 2, 1))
-    stepper = pc.BatchStepper(scenes, 1e-7)
-    answer = stepper(stepper.rest_state())
-    again = stepper(stepper.rest_state(), guess=answer.state.positions)
-    assert (again.iterations <= 1).all()
-    assert (answer.iterations > 1).all()
-    guess = answer.state.positions.clone()
-    guess[1, 3] = torch.nan
-    other = stepper(stepper.rest_state(), guess=guess)
-    assert other.iterations.tolist() == [again.iterations[0], answer.iterations[1]]
-    assert torch.equal(other.state.positions[1], answer.state.positions[1])
-
-
-def test_a_step_recovers_from_an_absurd_guess():
-    problem = pc.discretise(soft_beam(loads=[TORSION]))
-    stepper = pc.ProjectiveDynamics(problem, 1e-8, max_iterations=15)
-    answer = stepper(problem.rest_state())
-    again = stepper(problem.rest_state(), guess=1e12 * (problem.positions[::-1] - 0.01))
-    assert again.status.ok
-    assert np.abs(again.state.positions - answer.state.positions).max() < 1e-6 * CELL
-
-
-@pytest.mark.parametrize(
-    ("guess", "message"),
-    [
-        (np.zeros((3, 3)), "guess has shape"),
-        ("there", "guess is a str"),
-        (np.full((16, 3), np.nan), "guess of node 0"),
-    ],
-)
-def test_a_guess_that_is_none_is_refused(guess, message):
-    problem = pc.discretise(soft_beam())
-    with pytest.raises(InputError, match=message):
-        pc.ProjectiveDynamics(problem)(problem.rest_state(), guess=guess)
-
-    stepper = pc.BatchStepper([problem])
-    with pytest.raises(InputError, match="guess"):
-        stepper(stepper.rest_state(), guess=torch.zeros(1, 2, 3, dtype=torch.float64))
 
 
 # --- memory ----------------------------------------------------------------------------------
@@ -422,13 +294,12 @@ def block(turn):
     return held(problem, np.flatnonzero(mesh.positions[:, 0] < 1e-9), problem.positions)
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_turned_scene_has_the_turned_rollout(placement):
+def test_a_turned_scene_has_the_turned_rollout():
     turn = rotation()
     straight, turned = block(np.eye(3)), block(turn)
     torch.manual_seed(5)
-    config = preset("equivariant", placement=placement)
-    fit = fitted([straight], size=0.2, placement=placement, layers=3, width=32)
+    config = preset("equivariant")
+    fit = fitted([straight], size=0.2, layers=3, width=32)
     corrector = Corrector(config.model_copy(update={"layers": 3, "width": 32, "mlp_layers": 2}))
     corrector.normaliser.load_state_dict(fit.normaliser.state_dict())
     runs = [
@@ -436,8 +307,7 @@ def test_a_turned_scene_has_the_turned_rollout(placement):
         for p in (straight, turned)
     ]
     plain = pc.rollout(pc.ProjectiveDynamics(straight, 1e-9), 5)
-    if placement != "guess":
-        assert np.abs(runs[0].positions - plain.positions).max() > 1e-3 * CELL
+    assert np.abs(runs[0].positions - plain.positions).max() > 1e-3 * CELL
     assert runs[0].stats["correction"].min() > 1e-4 * CELL
     assert np.abs(runs[0].positions @ turn.T - runs[1].positions).max() < 1e-5 * CELL
 
@@ -482,10 +352,9 @@ def test_parts_that_do_not_fit_are_refused():
             hybrid(part, corrector, velocity="kept")
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_correction_before_of_other_bodies_is_refused(placement):
+def test_a_correction_before_of_other_bodies_is_refused():
     stepper = pc.BatchStepper([pc.discretise(soft_beam())])
-    corrector = fitted(stepper.problems, placement=placement)
+    corrector = fitted(stepper.problems)
     state, other = stepper.rest_state(), torch.zeros(3, 3, dtype=torch.float64)
     with pytest.raises(InputError, match="previous"):
         BatchHybrid(stepper, corrector)(state, other)

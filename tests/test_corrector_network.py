@@ -16,13 +16,12 @@ import network_samples as samples  # noqa: E402
 from block_meshes import o_grid  # noqa: E402
 from conftest import rotation  # noqa: E402
 from network_samples import SIZE, STEP, tensor  # noqa: E402
-from pdcorrect.corrector.architecture import PRESETS, preset  # noqa: E402
+from pdcorrect.corrector.architecture import MLP, PRESETS, MeshGraphNetwork, MessageLayer, preset  # noqa: E402
 from pdcorrect.corrector.corrector import Corrector, without_momentum  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
     FeatureView,
     Snapshot,
 )
-from pdcorrect.corrector.network import MLP, MeshGraphNetwork, MessageLayer  # noqa: E402
 
 
 def largest(x):
@@ -249,8 +248,6 @@ def apply(linears, norm, x):
         x = x @ weight.T + bias
         if i < len(linears) - 1:
             x = x.clamp_min(0.0)
-    if norm is None:
-        return x
     mean = x.mean(dim=1, keepdim=True)
     variance = (x - mean).square().mean(dim=1, keepdim=True)
     return (x - mean) / (variance + 1e-5).sqrt() * norm[0] + norm[1]
@@ -259,14 +256,13 @@ def apply(linears, norm, x):
 def parts(module):
     linears = [(m.weight, m.bias) for m in module if isinstance(m, torch.nn.Linear)]
     norms = [(m.weight, m.bias) for m in module if isinstance(m, torch.nn.LayerNorm)]
-    return linears, norms[0] if norms else None
+    return linears, norms[0]
 
 
-@pytest.mark.parametrize("norm", [True, False])
 @pytest.mark.parametrize("layers", [2, 4])
-def test_a_round_is_the_textbook_formula(layers, norm):
+def test_a_round_is_the_textbook_formula(layers):
     torch.manual_seed(0)
-    layer, width = MessageLayer(6, layers, norm).double(), 6
+    layer, width = MessageLayer(6, layers).double(), 6
     for p in layer.parameters():
         torch.nn.init.normal_(p, std=0.5)
     bodies = samples.body()
@@ -293,37 +289,21 @@ def test_an_mlp_has_relu_between_its_layers_and_a_norm_at_the_end(layers):
     middle = [torch.nn.Linear, torch.nn.ReLU] * (layers - 1)
     assert kinds == [*middle, torch.nn.Linear, torch.nn.LayerNorm]
     assert [type(m) for m in MLP(3, 8, 5, layers, False)] == kinds[:-1]
-    layer, width = MessageLayer(64, layers, True), 64  # its first map is one from all three
+    layer, width = MessageLayer(64, layers), 64  # its first map is one from all three
     bound = (3 * width) ** -0.5
     for part in (layer.of_edge.weight, layer.of_receiver.weight, layer.of_sender.weight,
                  layer.of_edge.bias):  # fmt: skip
         assert 0.9 * bound < largest(part) <= bound
 
 
-@pytest.mark.parametrize(
-    ("norm", "hidden", "decoder"), [("hidden", 1, 0), ("all", 1, 1), ("none", 0, 0)]
-)
-def test_norms_are_where_they_are_asked_for(norm, hidden, decoder):
-    network = MeshGraphNetwork(4, 5, layers=2, width=8, mlp_layers=3, norm=norm)
+def test_norms_are_at_the_end_of_all_networks_but_the_decoder():
+    network = MeshGraphNetwork(4, 5, layers=2, width=8, mlp_layers=3)
     for module in (network.node_encoder, network.edge_encoder, network.rounds[0].node,
                    network.rounds[1].node, *(r.edge_rest for r in network.rounds)):  # fmt: skip
-        assert sum(isinstance(m, torch.nn.LayerNorm) for m in module) == hidden
-        assert isinstance(module[-1], torch.nn.LayerNorm) == bool(hidden)
-    assert isinstance(network.decoder[-1], torch.nn.LayerNorm) == bool(decoder)
-
-
-def test_shared_rounds_are_one_round_repeated():
-    bodies = samples.body()
-    x = torch.randn(len(bodies.rest), 4)
-    e = torch.randn(bodies.edge_index.shape[1], 5)
-    network = MeshGraphNetwork(4, 5, layers=3, width=8, mlp_layers=2, shared=True)
-    assert len(network.rounds) == 1
-    y, f = network.node_encoder(x), network.edge_encoder(e)
-    for _ in range(3):
-        y, f = network.rounds[0](y, f, bodies.edge_index)
-    assert torch.equal(network(x, e, bodies.edge_index), network.decoder(y))
-    alone = MeshGraphNetwork(4, 5, layers=3, width=8, mlp_layers=2)
-    assert len({id(r) for r in alone.rounds}) == 3
+        assert sum(isinstance(m, torch.nn.LayerNorm) for m in module) == 1
+        assert isinstance(module[-1], torch.nn.LayerNorm)
+    assert not any(isinstance(m, torch.nn.LayerNorm) for m in network.decoder)
+    assert len({id(r) for r in network.rounds}) == 2
 
 
 @pytest.mark.parametrize("rounds", [1, 2, 3])
@@ -369,12 +349,7 @@ def test_the_thesis_has_the_parameters_of_its_description():
     assert sum(p.numel() for p in model.parameters()) == by_hand == 2_878_467
 
 
-CONFIGS = {
-    **PRESETS,
-    "shared": preset("compact", shared=True, mlp_layers=2),
-    "norms": preset("equivariant", norm="all"),
-    "bare": preset("thesis", norm="none", layers=3, width=20),
-}
+CONFIGS = {**PRESETS, "small": preset("thesis", layers=3, width=20)}
 
 
 @pytest.mark.parametrize("name", list(CONFIGS))

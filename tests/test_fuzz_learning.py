@@ -27,8 +27,12 @@ from fuzzing import (  # noqa: E402
     renumbered,
 )
 from pdcorrect.cli.common import BAD_INPUT  # noqa: E402
-from pdcorrect.corrector.model_description import content_digest  # noqa: E402
-from pdcorrect.corrector.model_io import DESCRIPTION, WEIGHTS, load_model  # noqa: E402
+from pdcorrect.corrector.model_io import (  # noqa: E402
+    DESCRIPTION,
+    WEIGHTS,
+    content_digest,
+    load_model,
+)
 from pdcorrect.data.check import check_dataset  # noqa: E402
 from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402

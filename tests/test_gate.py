@@ -9,8 +9,6 @@ from conftest import box_mesh, disturbed, problem_on
 from hybrid_samples import (
     CELL,
     EULER,
-    PLACEMENTS,
-    PRESSURE,
     TORSION,
     Prescribed,
     bumped,
@@ -28,8 +26,7 @@ from hybrid_samples import (
 from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchHybrid, BatchParts
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Gate, GateMeasures, Reason, Refusal, refusals
-from pdcorrect.corrector.hybrid import HybridStepper
-from pdcorrect.corrector.single_step import SingleCoarseStep
+from pdcorrect.corrector.hybrid import HybridStepper, SingleCoarseStep
 from pdcorrect.errors import InputError
 
 OPEN = Gate(outside=None, crushing=None, energy=None)
@@ -48,15 +45,12 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("placement", ["state", "force"])
 @pytest.mark.parametrize("reason", CASES)
-def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason, placement):
+def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason):
     gate, answer, pushed = CASES[reason]
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     correction = answer(problem)
-    if placement == "force" and reason in (Reason.INVERSION, Reason.ENERGY):
-        correction = 100.0 * correction  # the body resists
-    corrector = prescribed(problem, correction, placement=placement)
+    corrector = prescribed(problem, correction)
     coarse = pc.ProjectiveDynamics(problem)
     stepper = HybridStepper(coarse, corrector, gate=gate)
     push = strange(problem) if pushed else None
@@ -71,15 +65,13 @@ def test_each_reason_refuses_a_correction_and_keeps_the_coarse_step(reason, plac
         assert not same(open_.state, plain.state)
 
 
-@pytest.mark.parametrize("placement", ["state", "force"])
 @pytest.mark.parametrize("reason", [Reason.NOT_FINITE, Reason.INVERSION, Reason.ENERGY])
-def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason, placement):
+def test_a_batch_refuses_one_scene_s_correction_and_not_the_other_s(reason):
     gate, answer, _ = CASES[reason]
     scenes = problems((3, 1, 1), (2, 2, 1))
-    corrector = fitted(scenes, kind=Prescribed, placement=placement)
-    factor = 100.0 if placement == "force" else 1.0
+    corrector = fitted(scenes, kind=Prescribed)
     small = 1e-4 * bumped(scenes[1])
-    corrector.answer = np.concatenate([factor * answer(scenes[0]), small])
+    corrector.answer = np.concatenate([answer(scenes[0]), small])
     stepper = pc.BatchStepper(scenes)
     result = BatchHybrid(stepper, corrector, gate=gate)(stepper.rest_state())
     plain = stepper(stepper.rest_state())
@@ -148,10 +140,9 @@ def test_a_correction_may_improve_what_the_coarse_step_inverted():
     assert HybridStepper(coarse, corrector, gate=gate)(bad).stats["gate"] == Reason.INVERSION
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
-def test_a_failed_coarse_step_is_not_corrected(placement):
+def test_a_failed_coarse_step_is_not_corrected():
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    corrector = prescribed(problem, bumped(problem), placement=placement)
+    corrector = prescribed(problem, bumped(problem))
     coarse = pc.ProjectiveDynamics(problem, 1e-13, max_iterations=1, recover=False)
     result, plain = (s(shaken(problem)) for s in (HybridStepper(coarse, corrector), coarse))
     assert not plain.status.ok
@@ -160,7 +151,7 @@ def test_a_failed_coarse_step_is_not_corrected(placement):
     assert result.stats["gate"] == Reason.SOLVER
     assert result.stats["correction"] == 0.0
     scenes = problems((3, 1, 1), (2, 2, 1))
-    corrector = fitted(scenes, placement=placement)
+    corrector = fitted(scenes)
     stepper = pc.BatchStepper(scenes, 1e-13, max_iterations=1, recover=False)
     state = stepper.state([shaken(p) for p in scenes])
     result, plain = BatchHybrid(stepper, corrector)(state), stepper(state)
@@ -193,10 +184,10 @@ def measured(ratios, stored=1.0, work=0.0):
 def test_a_gate_looks_at_each_cell(ratios, passes):
     coarse = measured([[-1.0, 0.9, np.inf], [1.0, 1.0, 1.0]])
     answer = measured([[*ratios, np.inf], [1.0, 1.0, 1.0]])
-    found = Gate().reasons(answer, coarse, None)
+    found = Gate(energy=None).reasons(answer, coarse)
     assert found.tolist() == [0 if passes else Reason.INVERSION, 0]
-    found = Gate().reasons(
-        measured([[1.0, 1.0, 1.0], [*ratios, 1.0]]), measured([[1.0] * 3, [-1.0, 0.9, 1.0]]), None
+    found = Gate(energy=None).reasons(
+        measured([[1.0, 1.0, 1.0], [*ratios, 1.0]]), measured([[1.0] * 3, [-1.0, 0.9, 1.0]])
     )
     assert found.tolist() == [0, 0 if passes else Reason.INVERSION]
 
@@ -210,7 +201,7 @@ def test_the_test_of_cells_is_switched_off_or_is_one_of_inversion_alone():
         (Gate(crushing=None), (0, 0)),
         (Gate(crushing=0.05), (0, Reason.INVERSION)),
     ):
-        found = [int(gate.reasons(x, coarse, 1e9)) for x in (crushed, inverted)]
+        found = [int(gate.reasons(x, coarse)) for x in (crushed, inverted)]
         assert found == list(expected)
 
 
@@ -230,16 +221,15 @@ def test_a_crushed_cell_refuses_a_correction():
         assert many.reasons.tolist() == [reason]
 
 
-@pytest.mark.parametrize("placement", ["state", "force"])
 @pytest.mark.parametrize(
     ("push", "refused"), [(0.999, False), (1.001, True), (100.0, True), (-1.5, False), (-3.1, True)]
 )
-def test_the_bound_on_energy_does_not_grow_with_the_correction(placement, push, refused):
+def test_the_bound_on_energy_does_not_grow_with_the_correction(push, refused):
     """A push of x times the way makes the energy (1 + x)^2 times as large; 4 is allowed."""
     problem, before = flying()
     way = np.zeros_like(problem.positions)
     way[:, 0] = push * problem.time_step * before.velocities[:, 0]
-    corrector = prescribed(problem, way, placement=placement)
+    corrector = prescribed(problem, way)
     gate = Gate(outside=None, energy=3.0)
     result = HybridStepper(pc.ProjectiveDynamics(problem, 1e-10), corrector, gate=gate)(before)
     assert result.stats["gate"] == (Reason.ENERGY if refused else 0)
@@ -272,43 +262,6 @@ def test_a_kick_s_right_answer_passes_where_the_coarse_mass_is_four_times_too_he
     assert hybrid(problem.rest_state(), kick).stats["refused"] == refused
 
 
-@pytest.mark.parametrize(
-    ("push", "steps"), [(-0.5, ["forced"]), (0.5, ["forced", "plain"]), (9.0, ["forced", "plain"])]
-)
-def test_the_plain_step_is_solved_only_where_energy_rises_beyond_the_loads_work(push, steps):
-    problem, before = flying()
-    way = np.zeros_like(problem.positions)
-    way[:, 0] = push * problem.time_step * before.velocities[:, 0]
-    corrector = prescribed(problem, way, placement="force")
-    taken = []
-
-    class Counting(pc.ProjectiveDynamics):
-        def __call__(self, state, forces=None, *args, **options):
-            taken.append("plain" if forces is None else "forced")
-            return super().__call__(state, forces, *args, **options)
-
-    gate = Gate(outside=None, energy=3.0)
-    result = HybridStepper(Counting(problem), corrector, gate=gate)(before)
-    assert taken == steps
-    assert result.stats["refused"] == (push == 9.0)
-
-
-@pytest.mark.parametrize("push", [False, True])
-def test_the_work_of_a_correction_s_forces_is_no_work_of_loads(push):
-    problem = pc.discretise(soft_beam(loads=[PRESSURE]))
-    corrector = prescribed(problem, bumped(problem), placement="force")
-    stepper = HybridStepper(pc.ProjectiveDynamics(problem), corrector)
-    before = shaken(problem)
-    extra = np.full(problem.positions.shape, 1e-3) if push else None
-    result = stepper(before, extra)
-    loads = problem.external_forces(0.0, problem.time_step) + (0.0 if extra is None else extra)
-    work = np.vdot(loads, result.state.positions - before.positions)
-    assert result.stats["correction"] > 0.0
-    assert result.stats["external_work"] == pytest.approx(work, rel=1e-9)
-    other = stepper.coarse(before, extra).stats["external_work"]
-    assert abs(other - work) > 0.1 * abs(work)
-
-
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble"])
 @pytest.mark.parametrize("integrator", ["backward-euler", "midpoint"])
 def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element):
@@ -329,38 +282,19 @@ def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element)
         alone = one.solved()
         pairs = (
             (many.measured(answer), one.measured(alone), True),
-            (many.measured(moved), one.measured(one.moved(alone, shift)), False),
-            (many.before(), one.before(), True),
+            (many.measured(moved), one.measured(one.moved(alone, torch.tensor(shift))), False),
         )
         for found, expected, same_modes in pairs:
-            if found is None:
-                assert element == "hex8-bubble"
-                continue
             count = len(problem.cells)
             ratios = found.ratios[i, :count].numpy()
-            assert ratios == pytest.approx(expected.ratios[0], rel=1e-8)
+            assert ratios == pytest.approx(expected.ratios[0].numpy(), rel=1e-8)
             assert torch.isinf(found.ratios[i, count:]).all()
-            assert float(found.work[i]) == pytest.approx(expected.work[0], rel=1e-8)
+            assert float(found.work[i]) == pytest.approx(float(expected.work[0]), rel=1e-8)
             stored, least = float(found.stored[i]), float(expected.stored[0])
             if same_modes or element == "hex8" or integrator == "midpoint":
                 assert stored == pytest.approx(least, rel=1e-8)
             else:
                 assert stored > least
-
-
-def test_a_gate_judges_arrays_as_it_judges_tensors():
-    rng, gates = np.random.default_rng(0), (Gate(), Gate(crushing=0.0))
-    numbers = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
-    others = [rng.normal(size=(40, 6)) + 1.0, *rng.normal(size=(2, 40))]
-    numbers[0][0, 0] = others[0][1, 1] = numbers[1][2] = others[2][3] = np.nan
-    arrays = GateMeasures(*numbers), GateMeasures(*others)
-    tensors = [GateMeasures(*map(torch.tensor, each)) for each in (numbers, others)]
-    for gate in gates:
-        for rise in (None, 0.0, 0.5):
-            found, expected = gate.reasons(*arrays, rise), gate.reasons(*tensors, rise)
-            assert found.dtype == np.int64
-            assert np.array_equal(found, expected.numpy())
-            assert len(set(found.tolist())) == (2 if rise is None else 3)
 
 
 @pytest.mark.parametrize(

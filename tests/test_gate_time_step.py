@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import pdcorrect as pc
-from hybrid_samples import PLACEMENTS, TORSION, Watched, fitted, problems, seen, soft_beam
+from hybrid_samples import TORSION, Watched, fitted, problems, seen, soft_beam
 from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
@@ -121,11 +121,10 @@ def test_the_larger_score_of_body_and_time_step_counts():
     assert corrector.rest_score(bodies).tolist() == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("placement", PLACEMENTS)
 @pytest.mark.parametrize("factor", [0.5, 2.0])
-def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(factor, placement):
+def test_half_and_double_steps_are_the_coarse_ones_and_the_network_is_not_asked(factor):
     problem = stepped(factor)
-    corrector = fitted(problems((3, 1, 1)), kind=Watched, placement=placement)
+    corrector = fitted(problems((3, 1, 1)), kind=Watched)
     coarse = pc.ProjectiveDynamics(problem)
     hybrid = HybridStepper(coarse, corrector, gate=Gate()).prepare()
     run, plain = pc.rollout(hybrid, 4), pc.rollout(coarse, 4)
@@ -234,7 +233,7 @@ def test_of_several_time_steps_only_the_out_of_distribution_one_is_refused():
     corrector = fitted(scenes, kind=Watched)
     stepper = pc.BatchStepper(scenes)
     hybrid = BatchHybrid(stepper, corrector, gate=ONLY_OUTSIDE)
-    nodes = hybrid._hybrid.nodes
+    nodes = hybrid.nodes
     nodes._graph = replace(nodes.graph, time_step=torch.tensor([2.0 * H, H], dtype=torch.float64))
     result, plain = hybrid(stepper.rest_state()), stepper(stepper.rest_state())
     assert result.reasons.tolist() == [Reason.OUTSIDE, 0]

@@ -96,33 +96,41 @@ def test_trainings_are_spread_over_the_visible_gpus(tmp_path):
     assert sorted(each.gpu for each in jobs) == ["2", "2", "5", "5"]
 
 
+def copied(folder):
+    """Another recipe for the data of one that there is."""
+    other = folder / "recipes" / "torsion-exact" / "other.toml"
+    other.parent.mkdir(parents=True)
+    other.write_text((RECIPES / "torsion-exact" / "through.toml").read_text())
+    return other
+
+
 def test_the_plan_has_data_trainings_and_an_evaluation_for_each_data_set(tmp_path):
     recipes = [
         RECIPES / "torsion-exact" / "through.toml",
         RECIPES / "torsion-many" / "best-without-ahead.toml",  # starts from the first
-        RECIPES / "torsion-exact" / "force.toml",
+        copied(tmp_path),
     ]
     jobs = {each.name: each for each in make.plan(tmp_path, recipes, OPTIONS)}
     assert list(jobs) == [
         "generate-torsion-exact", "generate-torsion-many", "train-torsion-exact-through",
-        "train-torsion-many-best-without-ahead", "train-torsion-exact-force",
+        "train-torsion-many-best-without-ahead", "train-torsion-exact-other",
         "evaluate-torsion-exact-evaluation", "evaluate-torsion-many-evaluation",
     ]  # fmt: skip
     for name in ("generate-torsion-exact", "evaluate-torsion-exact-evaluation"):
         given = jobs[name].arguments
         assert given[given.index("--batch") + 1] == "7"
     needed = {name: [one.name for one in each.needs] for name, each in jobs.items()}
-    assert needed["train-torsion-exact-force"] == ["generate-torsion-exact"]
+    assert needed["train-torsion-exact-other"] == ["generate-torsion-exact"]
     assert needed["train-torsion-many-best-without-ahead"] == [
         "generate-torsion-many", "train-torsion-exact-through",
     ]  # fmt: skip
     last = jobs["evaluate-torsion-exact-evaluation"]
-    assert [model.parent.name for model in last.models] == ["through", "force"]
+    assert [model.parent.name for model in last.models] == ["through", "other"]
 
 
 def test_data_that_are_there_are_not_generated(tmp_path):
     options = Namespace(**{**vars(OPTIONS), "generators": 0})
-    jobs = make.plan(tmp_path, [RECIPES / "torsion-exact" / "force.toml"], options)
+    jobs = make.plan(tmp_path, [copied(tmp_path)], options)
     assert [each.queue for each in jobs] == ["train", "evaluate"]
     assert list(jobs[0].needs) == []
 

@@ -15,12 +15,15 @@ from pdcorrect import discretise  # noqa: E402
 from pdcorrect.corrector import features  # noqa: E402
 from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
-from pdcorrect.corrector.envelope import Envelope  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
     NODE_FEATURES,
     FeatureView,
 )
-from pdcorrect.corrector.normaliser import Normaliser, RunningMoments  # noqa: E402
+from pdcorrect.corrector.normaliser import (  # noqa: E402
+    Envelope,
+    Normaliser,
+    RunningMoments,
+)
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from reader_samples import shard, write  # noqa: E402
@@ -122,17 +125,17 @@ def test_out_of_distribution_scores_of_bodies_are_deviations_of_their_mean_input
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(4000, 2)) * [1.0, 3.0] + [5.0, -2.0]
     envelope = averaged(*rows)
-    found = envelope.strangeness(tensor([[5.0, -2.0], [7.0, -2.0], [5.0, 10.0], [9.0, -11.0]]))
+    found = envelope.average_excess(tensor([[5.0, -2.0], [7.0, -2.0], [5.0, 10.0], [9.0, -11.0]]))
     expected = [[0.0, 0.0], [2.0, 0.0], [0.0, 4.0], [4.0, 3.0]]
     np.testing.assert_allclose(found.numpy(), expected, rtol=0.12, atol=0.1)
-    assert Envelope({"a": 1}, {}).strangeness(tensor([[0.0]])).isposinf().all()
+    assert Envelope({"a": 1}, {}).average_excess(tensor([[0.0]])).isposinf().all()
     cancelled = averaged([0.0, 0.0], [1e-9, -1e-9])
-    assert largest(cancelled.strangeness(tensor([[0.1, -0.3]])) - tensor([[1.0, 3.0]])) < 1e-6
+    assert largest(cancelled.average_excess(tensor([[0.1, -0.3]])) - tensor([[1.0, 3.0]])) < 1e-6
     rows = np.zeros((1000, 2))  # with a rare extreme
     rows[0] = 30.0, -7.0
     envelope = averaged(*rows)
-    assert largest(envelope.strangeness(tensor(rows[:1])) - 3.5) < 1e-9
-    beyond = envelope.strangeness(tensor([[36.0, 0.0], [-6.0, 0.0]]))
+    assert largest(envelope.average_excess(tensor(rows[:1])) - 3.5) < 1e-9
+    beyond = envelope.average_excess(tensor([[36.0, 0.0], [-6.0, 0.0]]))
     assert 4.1 < float(beyond[0, 0]) < 4.3  # by a fifth
     assert float(beyond[1, 0]) > 6.0  # on the other side, where none was
 
@@ -141,10 +144,10 @@ def test_mean_inputs_of_further_data_widen_the_range():
     envelope = averaged([0.0, 0.0], [1.0, 1.0], [0.5, 0.2])
     further, averages = tensor([[9.0, 0.5]]), RunningMoments()
     averages.add(further)
-    assert float(envelope.strangeness(further)[0, 0]) > 10.0
+    assert float(envelope.average_excess(further)[0, 0]) > 10.0
     envelope.widen({"average": averages})
-    assert float(envelope.strangeness(further)[0, 0]) <= 3.5 + 1e-12
-    assert float(envelope.strangeness(-further)[0, 0]) > 10.0
+    assert float(envelope.average_excess(further)[0, 0]) <= 3.5 + 1e-12
+    assert float(envelope.average_excess(-further)[0, 0]) > 10.0
 
 
 def test_inputs_bend_towards_the_clip():

@@ -12,7 +12,6 @@ import pytest
 import pdcorrect as pc
 from conftest import beam
 from pdcorrect.cli.common import BAD_INPUT
-from pdcorrect.scene import trained_coarse
 
 weights_digest = pytest.importorskip("pdcorrect.corrector.model_io").weights_digest
 
@@ -182,16 +181,8 @@ def test_a_quasi_static_scene_is_refused_unless_the_model_was_trained_on_such(
     assert pc.hybrid_of(static, own).coarse.integrator == "quasi-static"
 
 
-def test_a_problem_in_place_of_the_models_own_is_checked(learned):
-    scene = pc.Scene.load(SCENE)
-    model = pc.load_model(MODEL)
-    assert pc.hybrid_of(scene, model, problem=pc.coarse_model(scene, "best")).origin == {}
-    for problem, told in (
-        (pc.discretise(scene), "hex8 and mass lumped"),
-        (pc.discretise(trained_coarse(scene), 2), "refined 2"),
-    ):
-        with pytest.raises(pc.errors.InputError, match=told):
-            pc.hybrid_of(scene, model, problem=problem)
+def test_a_loaded_model_has_no_origin(learned):
+    assert pc.hybrid_of(pc.Scene.load(SCENE), pc.load_model(MODEL)).origin == {}
 
 
 def test_without_torch_the_extra_is_named(program, scene_file, tmp_path, monkeypatch):

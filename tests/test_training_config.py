@@ -28,7 +28,6 @@ ROOT = Path(__file__).parent.parent
 
 BASIC = '[[stages]]\nkind = "one-step"\niterations = 1\n'
 UNROLLED = BASIC.replace("one-step", "unrolled")
-FORCED = '[corrector]\nchanges = {placement = "force"}\n'
 START = 'start_from = "tiny"\n'
 
 
@@ -63,7 +62,10 @@ START = 'start_from = "tiny"\n'
         ("[corrector]\nchanges = {widths = 3}\n" + BASIC, r"corrector\.changes\.widths: .*width"),
         ("[corrector]\nchanges = {layers = 0}\n" + BASIC, r"corrector\.changes\.layers = 0"),
         ("[corrector]\nchanges = {edge_features = ['load']}\n" + BASIC, "'load'"),
-        ('[corrector]\nchanges = {placement = "force"}\n' + BASIC, "placement|solver"),
+        (
+            '[corrector]\nchanges = {placement = "force"}\n' + BASIC,
+            r"placement = \"force\"",
+        ),
         ("[validate_every]\nseconds = 1.0\niterations = 2\n" + BASIC, "validate_every"),
         ("base = 'plain", "TOML"),
         ("start_from = 3\n" + BASIC, "start_from = 3"),

@@ -85,19 +85,6 @@ class BatchStaging:
             [(a, x(known)) for a, x in scheme.strains],
         )
 
-    def start(self, stage: BatchStepEquation, guess: Tensor | None = None) -> Tensor:
-        """First iterate (B, U, 3), prescribed where clamped.
-
-        Where positions after the step are ``guess`` (B, N, 3), in scenes where it is finite.
-        """
-        scheme = stage.scheme
-        nodal = stage.start
-        if guess is not None:
-            y = nodal_solution(scheme, stage.known["positions"], guess)
-            usable = torch.isfinite(y).all(dim=2, keepdim=True).all(dim=1, keepdim=True)
-            nodal = torch.where(usable & self.free, y, nodal)
-        return self.extended(nodal)
-
     def finish(
         self, stage: BatchStepEquation, y: Tensor, state: BatchState, internal: Tensor | None
     ) -> BatchState:

@@ -313,13 +313,8 @@ class BatchStepper:
 
     # --- a step ---------------------------------------------------------------------------
 
-    def __call__(
-        self, state: BatchState, forces: Tensor | None = None, guess: Tensor | None = None
-    ) -> BatchResult:
+    def __call__(self, state: BatchState, forces: Tensor | None = None) -> BatchResult:
         """Advance all scenes by one step, with extra nodal forces (B, N, 3), N.
-
-        The minimisation begins where positions after the step are ``guess`` (B, N, 3), m, but
-        as without one where a component is clamped, and in scenes whose guess is not finite.
 
         Raises
         ------
@@ -327,16 +322,14 @@ class BatchStepper:
             If the state is not the stepper's, or a tensor has another shape, type or device.
         """
         with self.alone():
-            result = self._step(state, forces, guess)
+            result = self._step(state, forces)
             if self._recover:
                 self._one_by_one(state, forces, result, self.problem_now)
             return result
 
-    def _step(self, state: BatchState, forces: Tensor | None, guess: Tensor | None) -> BatchResult:
-        if guess is not None:
-            check_nodal(self.cells, "guess", guess)
+    def _step(self, state: BatchState, forces: Tensor | None) -> BatchResult:
         stage = self.prepare(state, forces)
-        m, start = self._minimiser, self.staging.start(stage, guess)
+        m, start = self._minimiser, self.staging.extended(stage.start)
         alive = torch.isfinite(start).all(dim=2).all(dim=1) & self.present.sound
         m.run(torch.where(by_scene(alive), start, self.cells.rest), alive)
         found = m.y.clone(), m.phase, m.iterations, m.evaluations, m.estimate  # y is overwritten

@@ -1,4 +1,4 @@
-"""`BodyGraph`: what a corrector knows of bodies before they move."""
+"""`BodyGraph`: what a corrector, and its gate, know of bodies before they move."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from pdcorrect.corrector.frames import (
@@ -18,10 +21,13 @@ from pdcorrect.corrector.frames import (
     turned_back,
     turns_between,
 )
-from pdcorrect.corrector.shapes import shape_measures
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import mesh_edges, node_means
+from pdcorrect.fem.mesh import boundary_faces
 from pdcorrect.fem.problem import Problem
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,11 +173,8 @@ class BodyGraph:
     @cached_property
     def shapes(self) -> Tensor:
         """What a gate knows of the bodies at rest, (B, 10), see `shape_measures`."""
-        parts = (self.rest, self.free, self.edge_index, self.cells, self.graph, self.cell_size)
-        exact = (part.double() if part.is_floating_point() else part for part in parts)
         with torch.inference_mode(False):
-            found = shape_measures(*(part.detach().cpu().numpy() for part in exact))
-            return torch.as_tensor(found).to(self.rest)
+            return torch.as_tensor(shape_measures(self)).to(self.rest)
 
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""
@@ -260,3 +263,92 @@ def _cell_sizes(rest: Tensor, cells: Tensor, graph: Tensor, bodies: int) -> Tens
     sums = volumes.new_zeros(bodies).index_add(0, owner, volumes)
     counts = torch.bincount(owner, minlength=bodies).to(volumes.dtype)
     return torch.pow(sums / counts, 1.0 / 3.0)
+
+
+# --- the shape of a body at rest ---------------------------------------------------------
+
+SHAPE_MEASURES = (
+    "nodes", "largest radius", "middle radius", "smallest radius", "volume to surface",
+    "supported", "fixity", "distance", "overhang", "spread",
+)  # fmt: skip
+"""What `shape_measures` gives, in order."""
+
+_LEAST_RADIUS = 0.1
+"""Cell sizes; flatter bodies count as this."""
+
+_LEAST_SHARE = 1e-3
+"""Of the nodes; fewer count as this."""
+
+
+def shape_measures(bodies: BodyGraph) -> Array:
+    """Size, slenderness and supports of B bodies, (B, 10).
+
+    No measure depends on place, orientation, units or numbering, nor on whether a body is alone
+    in its batch.  Supports are nodes with a held component; lengths are in cell sizes:
+
+    - ``nodes``: the logarithm of their number;
+    - ``largest radius``, ``middle radius``, ``smallest radius``: logarithms of the principal radii
+      of gyration, that is of the nodes' root mean squared distances from their centre along the
+      principal axes;
+    - ``volume to surface``: the logarithm of the number of cells over that of outer faces;
+    - ``supported``: the logarithm of the share of supports among the nodes;
+    - ``fixity``: the logarithm of the share of the supports' components that are held;
+    - ``distance``: the logarithm of 1 plus the mean length of the shortest paths along edges from
+      nodes to a support; where there is none it counts as two for each node of the body, unless
+      the body has no support;
+    - ``overhang``: the distance between the centres of the supports and of all nodes, over the
+      root mean squared distance of all nodes from theirs;
+    - ``spread``: the logarithm of 1 plus the root mean squared distance of the supports from their
+      centre: small for one clamp, large for supports at several places.
+
+    The last four are 0 for bodies without supports.
+    """
+    parts = bodies.rest.double(), bodies.cell_size.double(), bodies.free, bodies.edge_index
+    rest, cell_size, free, edge_index = (part.detach().cpu().numpy() for part in parts)
+    cells, graph = bodies.cells.cpu().numpy(), bodies.graph.cpu().numpy()
+
+    def count(which: Numbers) -> Numbers:
+        return np.bincount(which, minlength=bodies.bodies).astype(np.int64)
+
+    def means(values: Array, which: Numbers, number: Numbers) -> Array:
+        total = np.zeros((bodies.bodies, *values.shape[1:]))
+        np.add.at(total, which, values)
+        return total / np.maximum(number, 1).reshape(-1, *[1] * (values.ndim - 1))
+
+    counts = count(graph)
+    x = rest / cell_size[graph][:, None]
+    arms = x - means(x, graph, counts)[graph]
+    gyration = means(arms[:, :, None] * arms[:, None, :], graph, counts)
+    radii = np.sqrt(np.linalg.eigvalsh(gyration).clip(_LEAST_RADIUS**2))[:, ::-1]
+    owners = graph[cells[:, 0]]
+    faces = count(owners[boundary_faces(cells)[1]])
+
+    held = ~free.all(axis=1)
+    at, supports = graph[held], count(graph[held])
+    fixity = np.where(supports > 0, means((~free[held]).mean(axis=1), at, supports), 1.0)
+    centre = means(arms[held], at, supports)
+    apart = means(np.square(arms[held] - centre[at]).sum(axis=1), at, supports)
+    overhang = np.linalg.norm(centre, axis=1) / np.sqrt(np.square(radii).sum(axis=1))
+    paths = _distances(x, edge_index, np.flatnonzero(held))
+    paths = np.where(np.isfinite(paths), paths, 2.0 * counts[graph] * (supports[graph] > 0))
+    return np.column_stack([
+        np.log(counts),
+        np.log(radii),
+        np.log(count(owners) / faces),
+        np.log((supports / counts).clip(_LEAST_SHARE)),
+        np.log(fixity),
+        np.log1p(means(paths, graph, counts)),
+        overhang,
+        np.log1p(np.sqrt(apart)),
+    ])  # fmt: skip
+
+
+def _distances(x: Array, edge_index: Numbers, sources: Numbers) -> Array:
+    """Lengths (n,) of the shortest paths from the nearest source; infinite where there is none."""
+    if not len(sources):
+        return np.full(len(x), np.inf)
+    here, there = edge_index
+    lengths = np.linalg.norm(x[there] - x[here], axis=1)
+    paths = csr_array((lengths, (here, there)), shape=(len(x), len(x)))
+    found: Array = dijkstra(paths, indices=sources, min_only=True)
+    return found

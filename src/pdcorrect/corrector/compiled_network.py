@@ -2,6 +2,10 @@
 
 Nodes are taken in groups of 16 with the edges that they receive from.  A round is one loop
 over groups: what a group needs of others is from the round before.
+
+Products of tall and narrow matrices are taken by vectors of 16 numbers, whose sums stay in
+registers: what BLAS does, for callers that are in a parallel loop already, where OpenBLAS may not
+be asked.  Loops that numba makes vectors of itself take three times as long.
 """
 
 from __future__ import annotations
@@ -9,15 +13,147 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.core.errors import TypingError
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pdcorrect.corrector.matrix_products import ROWS, filled_up, product, strips
-from pdcorrect.corrector.network import MeshGraphNetwork
+from pdcorrect.corrector.architecture import MeshGraphNetwork
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.kernels import PARALLEL, REDUCE
 
 Array = NDArray[Any]
+
+parts: Any = cgutils
+
+STRIP = 16
+"""Columns whose sums are in registers together: one of AVX-512 in single precision."""
+ROWS = 8
+"""Rows of them: enough sums under way to hide how long a fused multiply-add takes."""
+
+
+def filled_up(count: int, to: int = STRIP) -> int:
+    """The next multiple of ``to``."""
+    return -(-count // to) * to
+
+
+def strips(matrix: Array) -> Array:
+    """A factor (a, b) as strips (b / 16, a, 16); b is a multiple of 16."""
+    return np.ascontiguousarray(matrix.reshape(len(matrix), -1, STRIP).transpose(1, 0, 2))
+
+
+@njit(**OPTIONS)
+def product(x, factor, bias, least, out):  # type: ignore[no-untyped-def]
+    """The larger of ``least`` and x factor + bias.
+
+    A ``least`` of 0 is ReLU, minus infinity leaves all as it is; what is not a number stays so.
+
+    Parameters
+    ----------
+    x : (m, a or more)
+        m is a multiple of 8.
+    factor : (b / 16, a, 16)
+        See `strips`.
+    bias : (b,)
+    out : (m, b or more)
+    """
+    for strip in range(factor.shape[0]):
+        for row in range(0, x.shape[0], ROWS):
+            _tile(x, row, factor, strip, bias, least, out)  # type: ignore[call-arg]
+
+
+class _Vectors:
+    """Arrays of an intrinsic's arguments, taken by 16 numbers of numba's type ``number``."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, args: Any, number: Any) -> None:
+        self._context, self._builder, self._number = context, builder, number
+        self._signature, self._args = signature, args
+        self.kind = ir.VectorType(context.get_value_type(number), STRIP)
+        self._size = context.get_abi_sizeof(context.get_value_type(number))
+
+    def array(self, index: int) -> tuple[Any, list[Any]]:
+        """Pointer and shape of an argument."""
+        kind = self._signature.args[index]
+        found = self._context.make_array(kind)(self._context, self._builder, self._args[index])
+        return found.data, parts.unpack_tuple(self._builder, found.shape)
+
+    def integer(self, index: int) -> Any:
+        """An argument that counts something."""
+        given = self._args[index], self._signature.args[index]
+        return self._context.cast(self._builder, *given, types.intp)
+
+    def scalar(self, index: int) -> Any:
+        """An argument as one of the numbers."""
+        given = self._args[index], self._signature.args[index]
+        return self._context.cast(self._builder, *given, self._number)
+
+    def count(self, value: int) -> Any:
+        """A number of rows or columns."""
+        return self._context.get_constant(types.intp, value)
+
+    def _at(self, pointer: Any, offset: Any) -> Any:
+        at = self._builder.gep(pointer, [offset])
+        return self._builder.bitcast(at, self.kind.as_pointer())
+
+    def load(self, pointer: Any, offset: Any) -> Any:
+        """16 numbers from an offset on, wherever they are aligned."""
+        return self._builder.load(self._at(pointer, offset), align=self._size)
+
+    def store(self, vector: Any, pointer: Any, offset: Any) -> None:
+        """The reverse of `load`."""
+        self._builder.store(vector, self._at(pointer, offset), align=self._size)
+
+    def spread(self, value: Any) -> Any:
+        """A number 16 times."""
+        nothing = ir.Constant(self.kind, ir.Undefined)
+        one = self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
+        same = ir.Constant(ir.VectorType(ir.IntType(32), STRIP), None)
+        return self._builder.shuffle_vector(one, nothing, same)
+
+
+def _check_arrays(*arrays: Any) -> None:
+    """Refuse types of arrays that would be misread: vectors know pointers and one type alone."""
+    kinds = {(getattr(a, "layout", None), getattr(a, "dtype", None)) for a in arrays}
+    if len(kinds) > 1 or kinds.pop()[0] != "C":
+        raise TypingError(f"{arrays}: expected C-contiguous arrays of one type of numbers.")
+
+
+@intrinsic  # type: ignore[misc]
+def _tile(typing, x, row, factor, strip, bias, least, out):  # type: ignore[no-untyped-def]
+    """Rows ``row`` to row + 7 of `product` in the columns of one strip."""
+    _check_arrays(x, factor, bias, out)
+    number = factor.dtype
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        v = _Vectors(context, builder, signature, args, number)
+        (xs, (_, x_width)), (ws, (_, depth, _)), (bs, _), (outs, (_, out_width)) = map(
+            v.array, (0, 2, 4, 6)
+        )
+        first, column = v.integer(1), builder.mul(v.integer(3), v.count(STRIP))
+        rows = [builder.add(first, v.count(r)) for r in range(ROWS)]
+        sums = [parts.alloca_once_value(builder, v.load(bs, column)) for _ in rows]
+        starts = [builder.mul(r, x_width) for r in rows]
+        with parts.for_range(builder, depth, intp=depth.type) as loop:
+            line = builder.add(builder.mul(v.integer(3), depth), loop.index)
+            w = v.load(ws, builder.mul(line, v.count(STRIP)))
+            for start, total in zip(starts, sums, strict=True):
+                value = builder.load(builder.gep(xs, [builder.add(start, loop.index)]))
+                by = builder.fmul(v.spread(value), w, flags=("contract",))
+                builder.store(builder.fadd(builder.load(total), by, flags=("contract",)), total)
+        floor = v.spread(v.scalar(5))
+        for r, total in zip(rows, sums, strict=True):
+            value = builder.load(total)
+            value = builder.select(builder.fcmp_ordered("<", value, floor), floor, value)
+            v.store(value, outs, builder.add(builder.mul(r, out_width), column))
+        return context.get_dummy_value()
+
+    return types.void(x, row, factor, strip, bias, least, out), generate
+
+
+# --- the network ---------------------------------------------------------------------------
 
 _EPSILON = 1e-5
 """LayerNorm's, as torch has it by default."""
@@ -29,11 +165,7 @@ GROUP = 16
 class Groups:
     """Nodes and directed edges of a mesh in groups, each with room for a multiple of 8 edges.
 
-    Parameters
-    ----------
-    edge_index : (2, E) int64
-        Ordered by the first row, the receivers.
-    nodes : int
+    ``edge_index`` (2, E) is ordered by its first row, the receivers.
 
     Attributes
     ----------
@@ -67,15 +199,8 @@ class Groups:
 class CompiledNetwork:
     """The answer of a `MeshGraphNetwork`, with a copy of its weights, in their precision.
 
-    Parameters
-    ----------
-    network : MeshGraphNetwork
-    groups : Groups
-
-    Attributes
-    ----------
-    x : (nodes, a), e : (edges, b)
-        Features of nodes and edges, to be filled in before a call; zero in spare rows.
+    Features of nodes x (nodes, a) and edges e (edges, b) are to be filled in before a call; they
+    are zero in spare rows.
     """
 
     def __init__(self, network: MeshGraphNetwork, groups: Groups) -> None:
@@ -93,7 +218,6 @@ class CompiledNetwork:
         self._decoder = _maps(network.decoder, self._width)
         self._outputs = _linears(network.decoder)[-1].out_features
         rounds: list[Any] = list(network.rounds)
-        self._order = [i % len(rounds) for i in range(network.count)]
         self._updates = [
             (*_maps([r.of_edge, *r.edge_rest], self._width), *_maps(r.node, self._width))
             for r in rounds
@@ -102,16 +226,16 @@ class CompiledNetwork:
 
     def __call__(self) -> Array:
         """Outputs (nodes, 3 or more) for `x` and `e`; the next call overwrites them."""
-        groups, order = self._groups, self._order
+        groups = self._groups
         _encode(
-            self.x, self.e, *self._encoders, *self._ends[order[0]], self._width, groups.first,
+            self.x, self.e, *self._encoders, *self._ends[0], self._width, groups.first,
             self._values, self._edges, self._to, self._start[0],
         )  # fmt: skip
-        for i, number in enumerate(order):
-            last = i + 1 == len(order)
-            after = self._decoder if last else self._ends[order[i + 1]]
+        for i, updates in enumerate(self._updates):
+            last = i + 1 == len(self._updates)
+            after = self._decoder if last else self._ends[i + 1]
             _round(
-                *self._updates[number], *after, last, self._width, self._outputs, groups.first,
+                *updates, *after, last, self._width, self._outputs, groups.first,
                 groups.last, groups.sender, self._values, self._edges, self._to,
                 self._start[i % 2], self._start[(i + 1) % 2], self._out,
             )  # fmt: skip
@@ -122,18 +246,14 @@ def _array(x: Tensor) -> Array:
     return x.detach().numpy()
 
 
-def _linears(network: nn.Sequential) -> list[nn.Linear]:
+def _linears(network: Any) -> list[nn.Linear]:
     return [part for part in network if isinstance(part, nn.Linear)]
 
 
 def _maps(parts: Any, width: int | None = None) -> tuple[Array, Array, Array, Array]:
     """Linear maps one after another, and a LayerNorm at the end, for loops.
 
-    Parameters
-    ----------
-    parts : iterable of modules
-    width : int, optional
-        Where the first map's input comes in parts of this width, each with spare columns.
+    With a ``width`` the first map's input comes in parts of it, each with spare columns.
 
     Returns
     -------
@@ -145,7 +265,7 @@ def _maps(parts: Any, width: int | None = None) -> tuple[Array, Array, Array, Ar
     norm : (2, k)
         LayerNorm's weight and bias; without rows where there is none.
     """
-    linears, room = [part for part in parts if isinstance(part, nn.Linear)], 0
+    linears = _linears(parts)
     room = max(filled_up(part.out_features) for part in linears)
     factors, biases = [], np.zeros((len(linears), room), _array(linears[0].weight).dtype)
     for number, part in enumerate(linears):

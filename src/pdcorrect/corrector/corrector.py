@@ -9,13 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import CorrectorConfig
+from pdcorrect.corrector.architecture import CorrectorConfig, MeshGraphNetwork
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.envelope import Envelope
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.frames import turned, turned_back
-from pdcorrect.corrector.network import MeshGraphNetwork
-from pdcorrect.corrector.normaliser import Normaliser
+from pdcorrect.corrector.normaliser import Envelope, Normaliser
+from pdcorrect.errors import InputError
 
 
 class Answers(Protocol):
@@ -29,7 +28,7 @@ class Answers(Protocol):
         """Corrections (n, 3), m."""
 
     def rest_score(self, bodies: BodyGraph) -> Tensor:
-        """See `pdcorrect.corrector.envelope.Envelope.rest_score`, (B,)."""
+        """See `pdcorrect.corrector.normaliser.Envelope.rest_score`, (B,)."""
 
     def score(self, view: FeatureView) -> Tensor:
         """Out-of-distribution score of a step of each body, (B,)."""
@@ -39,18 +38,8 @@ class Corrector(nn.Module):
     """Displacements (n, 3), m, that are to be added to a coarse step.
 
     Clamped components get none.  With output "frame" it is exactly zero where the body is
-    not deformed, however it has moved.
-
-    Parameters
-    ----------
-    config : CorrectorConfig
-
-    Attributes
-    ----------
-    normaliser : Normaliser
-    envelope : Envelope
-        Both to be fitted before the first call; see `pdcorrect.training.fitting`.
-    network : MeshGraphNetwork
+    not deformed, however it has moved.  ``normaliser`` and ``envelope`` are to be fitted before the
+    first call; see `pdcorrect.training.fitting`.
     """
 
     def __init__(self, config: CorrectorConfig) -> None:
@@ -61,7 +50,7 @@ class Corrector(nn.Module):
         self.normaliser, self.envelope = Normaliser(nodes, edges), Envelope(nodes, edges)
         self.network = MeshGraphNetwork(
             sum(nodes.values()), sum(edges.values()), layers=config.layers, width=config.width,
-            mlp_layers=config.mlp_layers, norm=config.norm, shared=config.shared,
+            mlp_layers=config.mlp_layers,
         )  # fmt: skip
 
     def forward(self, bodies: BodyGraph, snapshot: Snapshot) -> Tensor:
@@ -119,6 +108,24 @@ class Corrector(nn.Module):
         if self.config.output == "world":
             return correction
         return turned_back(view.frames, correction) / (view.size * view.scale)
+
+
+def check_corrector(corrector: object, device: torch.device) -> Corrector:
+    """A corrector that can be asked on a device; others are refused with an `InputError`."""
+    if not isinstance(corrector, Corrector):
+        raise InputError(f"corrector is a {type(corrector).__name__}: expected a Corrector.")
+    if not corrector.normaliser.fitted:
+        raise InputError(
+            "corrector: its normaliser has seen no data, so its inputs and output have no "
+            "scale. Expected one that was trained or loaded."
+        )
+    found = corrector.normaliser.output_scale.device
+    if found != device:
+        raise InputError(
+            f"corrector: on {found}, expected {device} as the coarse solver: move it there "
+            f"with corrector.to({str(device)!r})."
+        )
+    return corrector
 
 
 def without_momentum(view: FeatureView, correction: Tensor) -> Tensor:

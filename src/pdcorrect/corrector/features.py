@@ -42,8 +42,7 @@ class Snapshot:
     positions, velocities : (n, 3)
         Before the step, m and m/s.
     proposed : (n, 3)
-        After it: what the coarse solver found, or, before it was asked, the positions that
-        inertia and loads alone would lead to, m.
+        After it, as the coarse solver found them, m.
     forces : (n, 3)
         Loads during the step, N.
     correction : (n, 3) or None
@@ -90,11 +89,6 @@ class FeatureView:
         """Nodes that edges come from, (E,) int64."""
         return self.bodies.edge_index[1]
 
-    @property
-    def rest_frames(self) -> Tensor:
-        """Rotations (n, 3, 3)."""
-        return self.bodies.rest_frames
-
     @cached_property
     def gradients(self) -> Tensor:
         """Deformation gradients F (n, 3, 3), after the step."""
@@ -111,7 +105,7 @@ class FeatureView:
     @cached_property
     def frames(self) -> Tensor:
         """Rotations (n, 3, 3), after the step."""
-        return product(self.turns, self.rest_frames)
+        return product(self.turns, self.bodies.rest_frames)
 
     @cached_property
     def receiver_frames(self) -> Tensor:
@@ -123,7 +117,9 @@ class FeatureView:
         """U - 1 in the node's frame, (n, 3, 3)."""
         identity = torch.eye(3, dtype=self.gradients.dtype, device=self.gradients.device)
         stretch = product(self.turns.transpose(1, 2), self.gradients) - identity
-        return product(product(self.rest_frames.transpose(1, 2), stretch), self.rest_frames)
+        return product(
+            product(self.bodies.rest_frames.transpose(1, 2), stretch), self.bodies.rest_frames
+        )
 
     @cached_property
     def deformation(self) -> Tensor:
@@ -264,13 +260,7 @@ UNSCALED = frozenset({"node-type"})
 
 
 def width(features: dict[str, Feature], names: Sequence[str]) -> int:
-    """Components of some features together.
-
-    Raises
-    ------
-    InputError
-        If one is unknown, or named twice.
-    """
+    """Components of some features together; an `InputError` if one is unknown or named twice."""
     for name in names:
         if name not in features:
             raise InputError(f"feature {name!r}: expected one of {', '.join(features)}.")

@@ -16,7 +16,6 @@ from torch import Tensor
 from pdcorrect.batch.gpu import Recorder
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.stepper import BatchStepper
-from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import Contents, usual
 from pdcorrect.corrector.corrector import Corrector
@@ -49,23 +48,8 @@ class RecordedCorrector:
     call and replayed; elsewhere it is run.  Recorded anew for other bodies, so also for each
     change of material, and where modules or tensors of the corrector are replaced.  Values of
     weights are those of the last `of_view`.  What is recorded holds memory for all intermediate
-    results.
-
-    Parameters
-    ----------
-    corrector : Corrector
-        One that `recordable` accepts.
-
-    Attributes
-    ----------
-    config : CorrectorConfig
-
-    Notes
-    -----
-    For one thread at a time.
+    results.  For a corrector that `recordable` accepts, and one thread at a time.
     """
-
-    config: CorrectorConfig
 
     def __init__(self, corrector: Corrector) -> None:
         self._corrector, self.config = corrector, corrector.config

@@ -17,23 +17,30 @@ from typing import Self, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pdcorrect.batch.gpu import one_thread
-from pdcorrect.corrector.batch_bodies import check_corrector
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.corrected_step import Decision, corrected_step
-from pdcorrect.corrector.corrector import Answers, Corrector
-from pdcorrect.corrector.gate import Gate, check_gate
+from pdcorrect.corrector.corrector import Answers, Corrector, check_corrector
+from pdcorrect.corrector.features import FeatureView, Snapshot
+from pdcorrect.corrector.gate import (
+    Gate,
+    GateMeasures,
+    Velocity,
+    asked,
+    check_gate,
+    check_velocity,
+    corrected_step,
+    moved,
+)
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
-from pdcorrect.corrector.placements import Velocity, check_velocity
-from pdcorrect.corrector.single_step import SingleCoarseStep
 from pdcorrect.errors import InputError, PdcorrectWarning
-from pdcorrect.fem.problem import BASES, Problem, coarse_model
-from pdcorrect.scene import Scene, check_scene, trained_coarse
+from pdcorrect.fem.problem import BASES, coarse_model
+from pdcorrect.scene import Scene, check_scene
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.projective import ProjectiveDynamics
-from pdcorrect.state import State, StepResult
+from pdcorrect.state import State, Status, StepResult
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -52,12 +59,9 @@ class HybridStepper:
     coarse_stepper : ImplicitStepper
         `ProjectiveDynamics` or `Newton`, of any element with 8 nodes a cell.
     corrector : Corrector
-        Fitted, on the CPU.  Its placement says what is corrected: the answer ("state"), the
-        loads ("force": m delta/h2 is added, with the row sums of the mass matrix, and the
-        converged answer to that is the result), or only the first iterate ("guess": where the
-        step has several minima the result may be another one than without).
+        Fitted, on the CPU.
     velocity : {"recomputed", "kept"}
-        Of corrected answers: what the integrator makes of the corrected positions, by
+        Of corrected states: what the integrator makes of the corrected positions, by
         backward Euler v = (p - p_before)/h, or the coarse solver's own.
     gate : Gate, optional
         What else is refused than corrections that are not finite, and those of steps that
@@ -84,8 +88,7 @@ class HybridStepper:
     corrected state, and besides: ``correction``, its largest node norm, m; ``refused``, 0 or 1;
     ``gate``, the number of the `Reason` (`pdcorrect.corrector.gate.refusals` counts them);
     ``network_seconds``, wall clock of all but the coarse solver.  Residual and estimated error
-    are those of the coarse solver's equation.  ``external_work`` is that of the scene's loads and
-    the caller's, not that of the forces of corrections.
+    are those of the coarse solver's equation.
 
     A coarse step that ended with inverted cells counts as converged and is corrected like
     others; the status then says whether the corrected state has some.  One that converged only
@@ -117,7 +120,6 @@ class HybridStepper:
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate)
         self.velocity, self.gate, self.origin = velocity, gate, dict(origin or {})
-        self.placement = corrector.config.placement
         h = coarse_stepper.time_step
         self.bodies = BodyGraph.of([self.problem], h, dtype=torch.float64)
         self.compiled = compilable(self.corrector, self.bodies)
@@ -127,7 +129,7 @@ class HybridStepper:
         self.remembers = "previous-correction" in corrector.config.node_features
 
     def __repr__(self) -> str:
-        return f"{self.coarse!r}, corrected ({self.placement})"
+        return f"{self.coarse!r}, corrected"
 
     def prepare(self) -> Self:
         """Factorise and load everything now, so that the first step is like the others."""
@@ -135,8 +137,10 @@ class HybridStepper:
         with torch.no_grad(), one_thread(torch.device("cpu")):
             if isinstance(self._answers, CompiledCorrector):
                 self._answers.refresh()
-            step = self._step(self.problem.rest_state())
-            Decision.of(step, step.view(None), self._answers, self.gate)
+            step = SingleCoarseStep(
+                self.coarse, self.bodies, self.velocity, self.problem.rest_state()
+            )
+            asked(step.view_of(self.problem.positions), self._answers, self.gate)
         return self
 
     def describe(self) -> dict[str, str]:
@@ -147,7 +151,6 @@ class HybridStepper:
             "corrector": digest(self.corrector),
             "corrector_size": f"{config.layers} rounds of width {config.width}",
             "corrector_code": "compiled" if self.compiled else "torch",
-            "placement": self.placement,
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
             "trained_step": self.trained_step,
@@ -174,32 +177,111 @@ class HybridStepper:
             If shapes are wrong or a number is not finite.
         """
         before, _ = self.coarse.accepted(_without(state), forces, None)
-        step = self._step(before, forces, self._previous(state))
+        previous = state.memory.get(MEMORY) if self.remembers else None
+        step = SingleCoarseStep(self.coarse, self.bodies, self.velocity, before, forces, previous)
         started = time.perf_counter()
         with torch.no_grad(), one_thread(torch.device("cpu")):
-            result, _, decision = corrected_step(step, self._answers, self.gate)
-        correction: Array = decision.correction
-        reason = float(decision.reasons.item())
+            found = corrected_step(step, self._answers, self.gate)
+        result, correction, reason = found.answer, found.correction.numpy(), found.reasons.item()
         after = result.state
         if self.remembers:
             after = replace(after, memory={**after.memory, MEMORY: correction})
         stats = {
             **result.stats,
             "correction": float(np.sqrt(np.square(correction).sum(axis=1).max())),
-            "refused": float(reason > 0.0),
-            "gate": reason,
+            "refused": float(reason > 0),
+            "gate": float(reason),
             "network_seconds": time.perf_counter() - started - step.seconds,
         }
         return replace(result, state=after, stats=stats)
 
-    def _previous(self, state: State) -> Array | None:
-        """The correction of the step before, m, where the network asks for it."""
-        return state.memory.get(MEMORY) if self.remembers else None
 
-    def _step(
-        self, state: State, forces: Array | None = None, previous: Array | None = None
-    ) -> SingleCoarseStep:
-        return SingleCoarseStep(self.coarse, self.bodies, self.velocity, state, forces, previous)
+class SingleCoarseStep:
+    """A `CoarseStep` of one scene, on the CPU, from ``state`` under ``forces`` of the caller too.
+
+    ``bodies`` is the scene, in float64; ``previous`` (N, 3) the correction of the step before, m;
+    ``seconds`` the wall clock in the coarse solver.
+    """
+
+    def __init__(
+        self,
+        coarse: ImplicitStepper,
+        bodies: BodyGraph,
+        velocity: Velocity,
+        state: State,
+        forces: Array | None = None,
+        previous: Array | None = None,
+    ) -> None:
+        self._coarse, self._graph, self._velocity = coarse, bodies, velocity
+        self._problem, self._state, self._forces = coarse.problem, state, forces
+        self._previous, self.seconds = previous, 0.0
+        stage = coarse.integrate(self._problem, state, coarse.time_step)
+        loads = self._problem.external_forces(*stage.loads_over, state.positions)
+        self._loads: Array = loads if forces is None else loads + forces
+
+    def solved(self) -> StepResult:
+        """See `CoarseStep`."""
+        started = time.perf_counter()
+        answer = self._coarse(self._state, self._forces)
+        self.seconds = time.perf_counter() - started
+        return answer
+
+    def view(self, answer: StepResult) -> FeatureView:
+        """See `CoarseStep`."""
+        return self.view_of(answer.state.positions)
+
+    def view_of(self, proposed: Array) -> FeatureView:
+        """What the network sees with positions (N, 3) after the step."""
+        arrays = self._state.positions, self._state.velocities, proposed, self._loads
+        positions, velocities, after, loads = map(_tensor, arrays)
+        old = None if self._previous is None else _tensor(self._previous)
+        return FeatureView(self._graph, Snapshot(positions, velocities, after, loads, old))
+
+    def ok(self, answer: StepResult) -> Tensor:
+        """See `CoarseStep`."""
+        return torch.tensor([answer.status.ok])
+
+    def moved(self, answer: StepResult, correction: Tensor) -> StepResult:
+        """See `CoarseStep`; statistics are those of the corrected state."""
+        problem, shift = self._problem, correction.numpy()
+        positions, velocities, memory = moved(
+            self._coarse.integrate.scheme(self._state, self._coarse.time_step),
+            answer.state, shift, self._velocity, lambda x: problem.mass_times(x) * problem.free,
+        )  # fmt: skip
+        ratios = problem.volume_ratios(positions)
+        status = answer.status
+        if status in (Status.CONVERGED, Status.INVERTED):  # how else it was found stays
+            status = Status.INVERTED if ratios.min() <= 0.0 else Status.CONVERGED
+        stats = {
+            **answer.stats,
+            "elastic_energy": problem.energy(positions, answer.modes),
+            "kinetic_energy": 0.5 * float(np.vdot(velocities, problem.mass_times(velocities))),
+            "external_work": answer.stats["external_work"] + float(np.vdot(self._loads, shift)),
+            "smallest_volume_ratio": float(ratios.min()),
+        }
+        return replace(
+            answer, state=State(positions, velocities, answer.state.time, memory), status=status,
+            stats=stats, modes=None, volume_ratios=ratios,
+        )  # fmt: skip
+
+    def measured(self, answer: StepResult) -> GateMeasures:
+        """See `CoarseStep`."""
+        stored = answer.stats["elastic_energy"] + answer.stats["kinetic_energy"]
+        positions, ratios = answer.state.positions, answer.volume_ratios
+        if ratios is None:
+            ratios = self._problem.volume_ratios(positions)
+        work = float(np.vdot(self._loads, positions - self._state.positions))
+        numbers = torch.tensor([[stored], [work]], dtype=torch.float64)
+        return GateMeasures(_tensor(ratios)[None], *numbers)
+
+    def chosen(self, which: Tensor, one: StepResult, other: StepResult) -> StepResult:
+        """See `CoarseStep`."""
+        return one if which.item() else other
+
+
+def _tensor(array: Array) -> Tensor:
+    """Of the same memory, which nobody writes to, or of a copy where torch would warn of that."""
+    return torch.from_numpy(array if array.flags.writeable else array.copy())
 
 
 def digest(corrector: Corrector) -> str:
@@ -224,7 +306,6 @@ def hybrid_of(
     model: str | Path | LoadedModel,
     *,
     gate: bool | Gate | None = True,
-    problem: Problem | None = None,
 ) -> HybridStepper:
     """Projective dynamics on the coarse model that a corrector was trained for, corrected.
 
@@ -237,15 +318,13 @@ def hybrid_of(
         Name or folder, see `load_model`, or one that is loaded.
     gate : bool, Gate or None
         True: the default `Gate`; None and False: none.
-    problem : Problem, optional
-        That coarse model of the scene if it is there already, or with another total mass.
 
     Raises
     ------
     FileFormatError, InputError
-        If there is no such model, it is damaged, it corrects an unknown coarse model or another
-        one than ``problem``, it does not fit the scene, the scene is quasi-static and the model's
-        training was not, or ``gate`` is something else.
+        If there is no such model, it is damaged, it corrects an unknown coarse model, it does not
+        fit the scene, the scene is quasi-static and the model's training was not, or ``gate`` is
+        something else.
     """
     check_scene(scene)
     loaded = model if isinstance(model, LoadedModel) else load_model(model)
@@ -254,26 +333,18 @@ def hybrid_of(
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
     _check_integrator(scene.time.integrator, loaded.integrator, name)
     chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
-    if problem is None:
-        problem = coarse_model(scene, loaded.base)
-    else:
-        _check_problem(problem, scene, loaded.base, name)
     return HybridStepper(
-        ProjectiveDynamics(problem),
+        ProjectiveDynamics(coarse_model(scene, loaded.base)),
         loaded.corrector,
         velocity=loaded.velocity,
         gate=chosen,
-        origin=None if isinstance(model, LoadedModel) else about_model(model),
+        origin=None if isinstance(model, LoadedModel) else about_model(model, loaded),
     )
 
 
-def about_model(model: str | Path) -> dict[str, str]:
-    """Which model that is.
-
-    Keys are ``model``, its name, ``base``, ``dataset``, ``trained_integrator`` and
-    ``weights_sha256``.  Time steps are known by a body's cells: `HybridStepper.trained_step`.
-    """
-    loaded, folder = load_model(model), model_folder(model)
+def about_model(model: str | Path, loaded: LoadedModel | None = None) -> dict[str, str]:
+    """Which model that is, for `HybridStepper.describe`; ``loaded`` where it is already."""
+    loaded, folder = loaded or load_model(model), model_folder(model)
     return {
         "model": folder.name, "base": loaded.base, "dataset": loaded.record.dataset,
         "trained_integrator": loaded.integrator, "weights_sha256": weights_digest(folder),
@@ -291,16 +362,3 @@ def _check_integrator(found: str, trained: str, name: str) -> None:
         )
     change = f'set integrator = "{trained}" in [time], or leave the model out'
     warnings.warn(f"{told}: it may be of no use; {change}", PdcorrectWarning, stacklevel=3)
-
-
-def _check_problem(problem: Problem, scene: Scene, base: str, name: str) -> None:
-    """Refuse another mesh, element or mass rule than the coarse model has."""
-    solver = (trained_coarse(scene) if base == "best" else scene).solver
-    found = problem.refine, problem.element, problem.mass_rule
-    expected = 1, solver.element, solver.mass
-    if found != expected:
-        raise InputError(
-            f"{name}: problem is refined {found[0]} times with element {found[1]} and mass "
-            f"{found[2]}: expected {expected[0]}, {expected[1]} and {expected[2]}, the scene's "
-            f"coarse model {base!r}."
-        )

@@ -11,35 +11,125 @@ that, like any other damage, is refused.  Nothing is ever unpickled.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from pydantic import Field, JsonValue, ValidationError
 from torch import Tensor
 
-from pdcorrect._environment import home_folder
+from pdcorrect._config import Strict
+from pdcorrect._environment import code_digest, home_folder
 from pdcorrect._files import make_folder, part_of_process, replacing
+from pdcorrect._version import __version__
 from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_description import (
-    DESCRIPTION,
-    WEIGHTS,
-    Description,
-    ModelRecord,
-    read_description,
-    read_file,
+from pdcorrect.errors import (
+    FileFormatError,
+    FileVersionError,
+    InputError,
+    OutputError,
+    require_extra,
 )
-from pdcorrect.errors import FileFormatError, InputError, OutputError, require_extra
 
 require_extra("safetensors", "learn")
 
 from safetensors import SafetensorError  # noqa: E402
 from safetensors import torch as safetensors  # noqa: E402
 
-_EXPECTED = f"expected a folder with {DESCRIPTION} and {WEIGHTS}"
+FORMAT = "pdcorrect-model"
+VERSION = 5
+WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
+
+_CHECKSUM = "checksum"
+
+
+class ModelRecord(Strict):
+    """Where a model comes from.
+
+    Attributes
+    ----------
+    dataset, dataset_hash
+        Name of the data set, or names of several with a plus sign between them; and the hash of
+        the configuration or content of what its last training learned.
+    training, metrics
+        Settings of the training, and what the model achieved; any JSON with finite numbers.
+    code_version, code_digest
+        Of the code that made it, see `pdcorrect._environment.code_digest`.
+    """
+
+    dataset: str
+    dataset_hash: str
+    training: dict[str, JsonValue] = Field(default_factory=dict)
+    metrics: dict[str, JsonValue] = Field(default_factory=dict)
+    code_version: str = __version__
+    code_digest: str = Field(default_factory=code_digest)
+
+
+class Description(Strict):
+    """``model.json`` without its checksum; all versions of the format since 2 have these keys."""
+
+    format: Literal["pdcorrect-model"] = "pdcorrect-model"
+    version: int = VERSION
+    architecture: CorrectorConfig
+    parameters: int
+    dtype: Literal["float32"] = "float32"
+    normalisation: dict[str, list[float] | float]
+    record: ModelRecord
+    weights_sha256: str
+
+    def to_json(self) -> str:
+        """The file's text; a ValueError if a number is not finite."""
+        content = self.model_dump(mode="json")
+        whole = {**content, _CHECKSUM: content_digest(content)}
+        return json.dumps(whole, indent=1, allow_nan=False) + "\n"
+
+
+def content_digest(content: dict[str, Any]) -> str:
+    """SHA-256 of JSON content, however it is laid out."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def read_description(folder: Path) -> Description:
+    """What ``model.json`` in a folder says; for errors see `load_model`."""
+    path = folder / DESCRIPTION
+    try:
+        content = json.loads(_read(path).decode("utf-8"))
+        whole = content.pop(_CHECKSUM, None) == content_digest(content)
+    except (ValueError, AttributeError, TypeError, RecursionError) as error:
+        raise FileFormatError(f"{path}: damaged: not JSON of a model ({error}).") from None
+    if content.get("format") != FORMAT:
+        raise FileFormatError(f"{path}: expected format {FORMAT!r}: damaged or something else.")
+    version = content.get("version")
+    newer = type(version) is int and version > VERSION  # whose checksum may be another one
+    if not whole and not newer:
+        raise FileFormatError(
+            f"{path}: damaged: its checksum is not that of its content; copy or save it again."
+        )
+    if type(version) is not int or version != VERSION:
+        remedy = "update pdcorrect" if newer else "train the model anew"
+        raise FileVersionError(f"{path}: format version {version!r}: expected {VERSION}: {remedy}.")
+    try:
+        return Description.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(map(str, first["loc"]))
+        raise FileFormatError(f"{path}: {place}: {first['msg']}.") from None
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f"{path}: cannot be read ({error.strerror or error}).") from None
+
+
+# --- where models are ----------------------------------------------------------------------
 
 
 def model_folder(path_or_name: str | Path) -> Path:
@@ -57,40 +147,28 @@ def model_folder(path_or_name: str | Path) -> Path:
     named = isinstance(path_or_name, str) and path_or_name.strip(".") != ""
     named = named and not set(str(path_or_name)) & {"/", os.sep}
     folder = models_folder() / path_or_name if named else Path(path_or_name)
-    if has_model(folder):
+    if any((folder / name).is_file() for name in (DESCRIPTION, WEIGHTS)):
         return folder
     if not named:
-        raise InputError(f"{folder}: {_without_model(folder)}.")
-    here = ", which is a folder here" if Path(path_or_name).is_dir() else ""
+        raise InputError(
+            f"{folder}: holds no model: expected a folder with {DESCRIPTION} and {WEIGHTS}."
+        )
+    known = sorted(path.parent.name for path in models_folder().glob(f"*/{DESCRIPTION}"))
     raise InputError(
         f"model {path_or_name!r}: not in {models_folder()}: expected one of "
-        f"{', '.join(_released()) or '(none)'}, or a path such as ./{path_or_name}{here}."
+        f"{', '.join(known) or '(none)'}, or a path such as ./{path_or_name}."
     )
 
 
-def has_model(folder: Path) -> bool:
-    """Whether a folder holds a model, be it half of one."""
-    return any((folder / name).is_file() for name in (DESCRIPTION, WEIGHTS))
-
-
 def models_folder() -> Path:
-    """Where models are looked up by name.
-
-    Raises
-    ------
-    InputError
-        If the environment does not say, and the code is not in its checkout.
-    """
+    """Where models are looked up by name."""
     return home_folder("models", ", or the path of a model")
 
 
 def unlike_ends(folders: Sequence[Path]) -> list[str]:
     """The shortest ends of paths that are all unlike, such as "seed-1/model".
 
-    Raises
-    ------
-    InputError
-        If a folder comes twice.
+    A folder that comes twice is an `InputError`.
     """
     for folder in folders:
         if folders.count(folder) > 1:
@@ -101,29 +179,6 @@ def unlike_ends(folders: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     return []
-
-
-def _without_model(path: Path) -> str:
-    """What is there in place of a model's folder, and what is expected."""
-    if path.is_dir():
-        inner = _models_in(path)
-        such_as = f", such as {path}{os.sep}{inner[0]}" if inner else ""
-        return f"holds no model: {_EXPECTED}{such_as}"
-    try:
-        released = _released()
-    except InputError:  # no models can be given by name
-        released = []
-    names = f", or the name of a released model: {', '.join(released)}" if released else ""
-    return f"{'a file' if path.is_file() else 'not there'}: {_EXPECTED}{names}"
-
-
-def _released() -> list[str]:
-    return _models_in(models_folder())
-
-
-def _models_in(folder: Path) -> list[str]:
-    """Names of the folders in a folder that hold models."""
-    return sorted(path.parent.name for path in folder.glob(f"*/{DESCRIPTION}"))
 
 
 BACKWARD_EULER = "backward-euler"
@@ -199,7 +254,13 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
         _filed(name): tensor.detach().to("cpu").contiguous()
         for name, tensor in corrector.state_dict().items()
     }
-    _check_layout(f"model for {folder}", corrector, state)
+    with torch.device("meta"):
+        wanted = Corrector(corrector.config).state_dict()
+    if _layout(state) != _layout(wanted):
+        raise InputError(
+            f"model for {folder}: its {type(corrector.network).__name__} has other weights than "
+            "its configuration describes, and could not be loaded: keep its state_dict()."
+        )
     _check_values(f"model for {folder}", state, InputError)
     weights = safetensors.save(state)
     description = Description(
@@ -226,16 +287,9 @@ def save_model(corrector: Corrector, folder: str | Path, *, record: ModelRecord)
     return folder
 
 
-def _check_layout(where: str, corrector: Corrector, state: dict[str, Tensor]) -> None:
-    """Refuse a network that could not be loaded again, for the configuration tells of another."""
-    with torch.device("meta"):
-        wanted = Corrector(corrector.config).state_dict()
-    if {n: x.shape for n, x in state.items()} != {_filed(n): x.shape for n, x in wanted.items()}:
-        raise InputError(
-            f"{where}: its network is a {type(corrector.network).__name__} with other weights than "
-            "its configuration describes, and could not be loaded: expected the configuration's "
-            "own; keep state_dict() of others."
-        )
+def _layout(state: dict[str, Tensor]) -> dict[str, torch.Size]:
+    """Shapes of a corrector's tensors by their names in files."""
+    return {_filed(name): tensor.shape for name, tensor in state.items()}
 
 
 def _filed(name: str) -> str:
@@ -277,80 +331,47 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     folder = model_folder(path_or_name)
     path = folder / WEIGHTS
     found = read_description(folder)
-    state = read_weights(folder, found)
-    corrector = _empty(path, found.architecture, state)
+    data = _read(path)
+    if hashlib.sha256(data).hexdigest() != found.weights_sha256:
+        raise FileFormatError(
+            f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "
+            "the program that replaced the model was ended half-way; copy or save it again."
+        )
+    try:
+        state: dict[str, Tensor] = safetensors.load(data)
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"{path}: not a file of tensors ({error}).") from None
+    config = found.architecture
+    if config.layers + config.mlp_layers > len(state):
+        raise FileFormatError(
+            f"{path}: {len(state)} tensors: expected more for the architecture in {DESCRIPTION}."
+        )
+    with torch.device("meta"):  # random numbers are left alone
+        corrector = Corrector(config)
     own = corrector.state_dict()
-    _check_tensors(path, state, {_filed(name): tensor for name, tensor in own.items()})
+    different = {name for name, _ in _layout(state).items() ^ _layout(own).items()}
+    if different:
+        raise FileFormatError(
+            f"{path}: tensor {min(different)} is missing, unexpected or of another shape than by "
+            f"the architecture in {DESCRIPTION}."
+        )
     _check_values(str(path), state, FileFormatError)
     if found.normalisation != _normalisation(state):
         raise FileFormatError(
             f"{folder / DESCRIPTION}: its normalisation is not that of {WEIGHTS}: damaged."
         )
-    moved = _moved(state, device)
+    try:
+        moved = {name: tensor.to(device) for name, tensor in state.items()}
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).split("\n")[0]
+        raise InputError(f"device {str(device)!r}: cannot be used ({reason}).") from None
     corrector.load_state_dict({name: moved[_filed(name)] for name in own}, assign=True)
     return LoadedModel(corrector.eval(), found.record)
 
 
 def weights_digest(path_or_name: str | Path) -> str:
     """SHA-256 of a model's file of weights."""
-    return hashlib.sha256(read_file(model_folder(path_or_name) / WEIGHTS)).hexdigest()
-
-
-def read_weights(folder: Path, description: Description) -> dict[str, Tensor]:
-    """The tensors in a folder, if they are those that its description is of.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is damaged or another one.
-    """
-    path = folder / WEIGHTS
-    data = read_file(path)
-    if hashlib.sha256(data).hexdigest() != description.weights_sha256:
-        raise FileFormatError(
-            f"{path}: its checksum (SHA-256) is not the one in {DESCRIPTION}: it is damaged, or "
-            "the program that replaced the model was ended half-way; copy or save it again."
-        )
-    return _tensors(path, data)
-
-
-def _tensors(path: Path, data: bytes) -> dict[str, Tensor]:
-    try:
-        found: dict[str, Tensor] = safetensors.load(data)
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise FileFormatError(f"{path}: not a file of tensors ({error}).") from None
-    return found
-
-
-def _empty(path: Path, config: CorrectorConfig, state: dict[str, Tensor]) -> Corrector:
-    """A corrector without values; random numbers are left alone."""
-    layers = (1 if config.shared else config.layers) + config.mlp_layers
-    if layers > len(state):
-        raise FileFormatError(
-            f"{path}: {len(state)} tensors: expected more for {config.layers} layers of networks "
-            f"with {config.mlp_layers}, as {DESCRIPTION} says."
-        )
-    with torch.device("meta"):
-        return Corrector(config)
-
-
-def _check_tensors(path: Path, state: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
-    for what, names in (
-        ("missing", expected.keys() - state.keys()),
-        ("unexpected", state.keys() - expected.keys()),
-    ):
-        if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            raise FileFormatError(
-                f"{path}: {what} tensor {min(names)}{more}: the architecture in {DESCRIPTION} is "
-                "another one."
-            )
-    for name, tensor in expected.items():
-        if state[name].shape != tensor.shape:
-            raise FileFormatError(
-                f"{path}: {name} has shape {tuple(state[name].shape)}: expected "
-                f"{tuple(tensor.shape)} for the architecture in {DESCRIPTION}."
-            )
+    return hashlib.sha256(_read(model_folder(path_or_name) / WEIGHTS)).hexdigest()
 
 
 def _check_values(where: str, state: dict[str, Tensor], error: type[InputError]) -> None:
@@ -364,11 +385,3 @@ def _check_values(where: str, state: dict[str, Tensor], error: type[InputError])
             raise error(f"{where}: {name} has values that are infinite or not a number.")
         if name.endswith("_deviation") and not bool((tensor > 0.0).all()):
             raise error(f"{where}: {name} has values that are not positive.")
-
-
-def _moved(state: dict[str, Tensor], device: str | torch.device) -> dict[str, Tensor]:
-    try:
-        return {name: tensor.to(device) for name, tensor in state.items()}
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).split("\n")[0]
-        raise InputError(f"device {str(device)!r}: cannot be used ({reason}).") from None

@@ -16,7 +16,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.follower import settle
-from pdcorrect.solvers.integrators import Integrator, backward_euler, nodal_solution
+from pdcorrect.solvers.integrators import Integrator, backward_euler
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
 from pdcorrect.solvers.schemes import WHOLE_MEMORY
@@ -25,7 +25,6 @@ from pdcorrect.solvers.step import (
     StepObjective,
     check_input,
     hessian_factors,
-    nodal_array,
 )
 from pdcorrect.state import State, Status, StepResult
 
@@ -120,8 +119,6 @@ class ImplicitStepper:
         state: State,
         forces: Array | None = None,
         time_step: float | None = None,
-        *,
-        guess: Array | None = None,
     ) -> StepResult:
         """Advance ``state`` by one step.
 
@@ -132,10 +129,6 @@ class ImplicitStepper:
             Nodal forces besides the scene's loads, N.
         time_step : float, optional
             For this step only, s; a new value is factorised and kept.
-        guess : (N, 3), optional
-            Positions after the step from which the minimisation begins, m; clamped components
-            do not count.  A good one saves iterations, a bad one costs some, and one that leads
-            nowhere is left; where gamma has several minima it may lead to another of them.
 
         Raises
         ------
@@ -143,10 +136,8 @@ class ImplicitStepper:
             If shapes are wrong or a number is not finite.
         """
         state, h = self.accepted(state, forces, time_step)
-        if guess is not None:
-            guess = nodal_array(self.problem, "guess", guess)
         with quiet_blas():
-            return self._step(state, forces, h, guess)
+            return self._step(state, forces, h)
 
     def accepted(
         self, state: State, forces: Array | None, time_step: float | None
@@ -166,13 +157,9 @@ class ImplicitStepper:
         positive("time_step", h)
         return (state if h == self.time_step else replace(state, memory={})), h
 
-    def _step(
-        self, state: State, forces: Array | None, h: float, guess: Array | None
-    ) -> StepResult:
+    def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
         effort = _Effort()
-        outcome = self._attempt(state, forces, h, effort, self.integrate, guess)
-        if guess is not None and not outcome.minimum.status.ok:
-            outcome = self._attempt(state, forces, h, effort, self.integrate)
+        outcome = self._attempt(state, forces, h, effort, self.integrate)
         if not outcome.minimum.status.ok and self._recover:
             outcome = self._substeps(state, forces, h, effort) or outcome
         if h != self.time_step:
@@ -250,17 +237,10 @@ class ImplicitStepper:
         forces: Array | None,
         time_step: float,
         integrate: Integrator | None = None,
-        guess: Array | None = None,
     ) -> StepObjective:
-        """What a step minimises; ``integrate`` is the stepper's own integrator by default.
-
-        From where positions after the step are ``guess`` (N, 3), if that is given.
-        """
+        """What a step minimises; ``integrate`` is the stepper's own integrator by default."""
         integrate = self.integrate if integrate is None else integrate
         stage = integrate(self.problem, state, time_step)
-        if guess is not None:
-            y = nodal_solution(integrate.scheme(state, time_step), state.positions, guess)
-            stage = replace(stage, start=np.where(self.problem.free, y, stage.start))
         return StepObjective(self.problem, state, stage, forces)
 
     def _attempt(
@@ -270,9 +250,8 @@ class ImplicitStepper:
         h: float,
         effort: _Effort,
         integrate: Integrator,
-        guess: Array | None = None,
     ) -> _Outcome:
-        objective = self.objective(state, forces, h, integrate, guess)
+        objective = self.objective(state, forces, h, integrate)
         stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
         if self.problem.has_followers:

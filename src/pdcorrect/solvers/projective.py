@@ -144,10 +144,8 @@ class ProjectiveDynamics(ImplicitStepper):
             if self._true.lagged:
                 self._true.forget()
 
-    def _step(
-        self, state: State, forces: Array | None, h: float, guess: Array | None
-    ) -> StepResult:
-        result = super()._step(state, forces, h, guess)
+    def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
+        result = super()._step(state, forces, h)
         if self._true is None or not self._true.lagged:
             return result
         self._true.note(result.iterations, result.state.time)

@@ -9,9 +9,8 @@ import torch
 
 from pdcorrect.corrector import features
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.envelope import TIME_STEP
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView
-from pdcorrect.corrector.normaliser import RunningMoments
+from pdcorrect.corrector.normaliser import TIME_STEP, RunningMoments
 from pdcorrect.errors import InputError
 from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 

@@ -247,18 +247,6 @@ class TrainingConfig(TomlConfig):
 
     @model_validator(mode="after")
     def _possible(self) -> TrainingConfig:
-        placement = self.corrector.config().placement
-        for k, stage in enumerate(self.stages):
-            if placement == "force" and not (stage.kind == "unrolled" and stage.through_solver):
-                raise ValueError(
-                    f"stages[{k}]: a correction of forces is only learned through the solver: "
-                    "expected kind = 'unrolled', through_solver = true"
-                )
-            if placement == "guess" and stage.kind == "unrolled":
-                raise ValueError(
-                    f"stages[{k}]: a first guess does not change a step's result: expected kind = "
-                    "'one-step'"
-                )
         if self.start_from is None and not self.fitting.widen:
             raise ValueError("fitting.widen = false is about a model to start from: expected one")
         return self

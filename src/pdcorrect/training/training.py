@@ -18,10 +18,10 @@ from pdcorrect._config import as_toml
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.batch.checks import usable_device
 from pdcorrect.corrector.corrector import Corrector
-from pdcorrect.corrector.model_description import ModelRecord
 from pdcorrect.corrector.model_io import (
     JOINT,
     LoadedModel,
+    ModelRecord,
     load_model,
     save_model,
     weights_digest,

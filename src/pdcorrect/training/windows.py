@@ -19,7 +19,6 @@ from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import Snapshot
-from pdcorrect.corrector.placements import ballistic
 from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
 from pdcorrect.fem.problem import Base
@@ -41,9 +40,14 @@ _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 class StepBatch:
     """A step of B bodies with n nodes.
 
-    ``target`` (n, 3) is the correction that leads to the reference, m; for placement "guess" to
-    the base model's answer.  ``scale`` (B,) is the mean squared one-step error of the base model
-    on each trajectory, m2.
+    Attributes
+    ----------
+    bodies : BodyGraph
+    snapshot : Snapshot
+    target : (n, 3)
+        The correction that leads to the reference, m.
+    scale : (B,)
+        Mean squared one-step error of the base model on each trajectory, m2.
     """
 
     bodies: BodyGraph
@@ -84,7 +88,7 @@ class StepWindows:
         device: str | torch.device = "cpu",
         without: Collection[str] = (),
     ) -> None:
-        self.config, self.device = config, torch.device(device)
+        self.device = torch.device(device)
         self._history = "previous-correction" in config.node_features
         self.dataset = TrajectoryDataset(
             folder, TRAINING, window=2 if self._history else 1, base=base, without=without
@@ -150,12 +154,6 @@ class StepWindows:
         bodies = joined([self._bodies[file] for file in files.tolist()])
         state = Snapshot(positions, velocities, coarse, forces, previous)
         target = self._taken("positions", ahead) - coarse
-        if self.config.placement != "state":
-            h: Any = bodies.by_node(bodies.time_step)[:, None]
-            # the clamps of the stored coarse step are where they are prescribed
-            start = ballistic(state, h, state.forces, bodies.mass, bodies.free, coarse)
-            state = replace(state, proposed=start)
-            target = coarse - start if self.config.placement == "guess" else target
         which = torch.from_numpy(self._numbers[files, simulations]).to(self.device)
         return StepBatch(bodies, state, target, self._errors.of(which).after(1))
 
