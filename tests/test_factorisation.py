@@ -111,10 +111,10 @@ def test_multigrid_solves_tangents_as_cholesky_does(clamps, rng):
 
 
 def test_multigrid_steps_hardly_grow_with_the_mesh(rng):
-    few, many = (steps_of(*tangent((n, n, n)), rng) for n in (8, 16))
+    few, many = (steps_of(*tangent((n, n, n)), rng) for n in (6, 12))
     assert many <= 1.5 * few
     few, many = (
-        steps_of(pc.discretise(beam((n, n, n))).global_matrix(0.01), None, rng) for n in (10, 20)
+        steps_of(pc.discretise(beam((n, n, n))).global_matrix(0.01), None, rng) for n in (8, 16)
     )
     assert many <= 1.5 * few
 
@@ -202,7 +202,7 @@ def test_the_linear_solver_follows_size_and_back_end():
 @pytest.mark.parametrize(
     ("cells", "nodes", "expected"),
     [
-        ((171, 16, 16), 49_708, "cholespy"),
+        ((40, 16, 16), 11_849, "cholespy"),
         ((18, 18, 18), 6_859, "amg"),
         ((12, 12, 12), 2_197, "cholespy"),
     ],
