@@ -139,7 +139,7 @@ def test_a_mode_loses_its_amplitude_at_the_rate_of_theory(kind, integrator):
     assert rate == pytest.approx(ratio * omega, rel=1e-2)
 
 
-@pytest.mark.parametrize("kind", ["viscosity", "stiffness"])
+@pytest.mark.parametrize("kind", ["viscosity", pytest.param("stiffness", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("integrator", ALL)
 def test_damping_keeps_the_order_in_time(kind, integrator):
     table = np.linspace(0.0, 0.4, 401)
