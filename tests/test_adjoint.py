@@ -639,6 +639,8 @@ def test_wrong_input_is_refused_by_name():
         pc.adjoint(stepper, state, result, g, g * np.nan)
     with pytest.raises(InputError, match="solver = 'magic'"):
         pc.adjoint(stepper, state, result, g, solver="magic")
+    with pytest.raises(InputError, match=r"tolerance = -1.0: expected a number between"):
+        pc.adjoint(stepper, state, result, g, tolerance=-1.0)
     for status, words in (
         (pc.Status.LINE_SEARCH, "no decrease"),
         (pc.Status.SUBSTEPPED, "smaller parts"),
@@ -710,11 +712,3 @@ def test_without_a_loss_there_is_nothing_to_solve():
     assert not found.positions.any()
     assert not found.young.any()
     assert found.time_step == 0.0
-
-
-def test_a_tolerance_that_is_not_positive_is_refused():
-    problem = pc.discretise(beam(time={"frames": 1}))
-    stepper = pc.ProjectiveDynamics(problem)
-    state = problem.rest_state()
-    with pytest.raises(InputError, match=r"tolerance = -1.0: expected a number between"):
-        pc.adjoint(stepper, state, stepper(state), state.positions, tolerance=-1.0)

@@ -611,6 +611,11 @@ def test_wrong_shapes_and_options_are_refused():
     for bad in ({"frames": -1}, {"frames": 2.5}, {"on_failure": "pray"}):
         with pytest.raises(InputError, match="expected"):
             pc.rollout(pc.ProjectiveDynamics(problem), **bad)
+    with pytest.raises(InputError, match=r"problem is a Scene: expected pc.discretise"):
+        pc.ProjectiveDynamics(problem.scene)
+    for forces in ({}, 1.0):
+        with pytest.raises(InputError, match=r"forces is a \w+: expected an array"):
+            pc.ProjectiveDynamics(problem)(problem.rest_state(), forces)
 
 
 def test_an_indefinite_tangent_is_replaced_by_its_projection():
@@ -641,15 +646,3 @@ def test_restriction_keeps_the_coincident_nodes():
     np.testing.assert_array_equal(here.velocities, run.velocities[:, nodes])
     with pytest.raises(pc.errors.MeshError, match="no coincident node"):
         pc.restrict(run, to=pc.discretise(beam((4, 2, 1))))
-
-
-def test_what_is_no_problem_is_named():
-    with pytest.raises(pc.errors.InputError, match=r"problem is a Scene: expected pc.discretise"):
-        pc.ProjectiveDynamics(beam(time={"frames": 1}))
-
-
-def test_forces_that_are_no_array_are_named():
-    problem = pc.discretise(beam())
-    for forces in ({}, 1.0):
-        with pytest.raises(pc.errors.InputError, match=r"forces is a \w+: expected an array"):
-            pc.ProjectiveDynamics(problem)(problem.rest_state(), forces)

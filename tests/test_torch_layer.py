@@ -291,6 +291,14 @@ def test_wrong_input_is_refused_by_name():
         layer(p, v.float())
     with pytest.raises(InputError, match="forces: "):
         layer(p, v, f[:1])
+    two = pc.PDLayer(stepper, 2)
+    for frames in (1, 5):
+        with pytest.raises(InputError, match=f"forces of {frames} steps"):
+            two(p, v, torch.stack([f] * frames))
+    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
+        two(p, v, f, young=torch.ones(4, 7, dtype=torch.float64))
+    with pytest.raises(InputError, match="times = "):
+        two(p, v, f, times=[0.0])
 
 
 @pytest.mark.parametrize(
@@ -589,19 +597,6 @@ def test_steps_in_inference_mode_come_out_the_same():
     after.sum().backward()
     assert torch.equal(first, after)
     assert p.grad.any()
-
-
-def test_inputs_that_do_not_fit_are_refused_by_name():
-    stepper = small_batch()
-    p, v, f = inputs(stepper)
-    layer = pc.PDLayer(stepper, 2)
-    for frames in (1, 5):
-        with pytest.raises(InputError, match=f"forces of {frames} steps"):
-            layer(p, v, torch.stack([f] * frames))
-    with pytest.raises(InputError, match=r"young: \(4, 7\)"):
-        layer(p, v, f, young=torch.ones(4, 7, dtype=torch.float64))
-    with pytest.raises(InputError, match="times = "):
-        layer(p, v, f, times=[0.0])
 
 
 def test_a_layer_with_follower_loads_can_be_copied():
