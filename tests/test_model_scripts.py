@@ -61,10 +61,7 @@ def test_a_script_ends_with_the_status_of_its_error(error, status):
     with pytest.raises(SystemExit) as stop:
         script("models/program.py").run_script(raising(error))
     assert stop.value.code == status
-
-
-def test_a_mistake_of_a_script_s_own_is_no_wrong_input():
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError):  # a mistake of its own, which is no wrong input
         script("models/program.py").run_script(raising(KeyError("wrong")))
 
 
