@@ -379,7 +379,7 @@ def test_viscosity_takes_energy_however_soft_the_matrices(poisson, rng):
     problem = learned_problem(scene)
     own, a, h = problem.correction, problem.cell_size, 1e-6
     C = 1e5 * a * learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
-    softest = np.broadcast_to(-learned.BOUND * C, own.matrices.shape)
+    softest = np.tile(-learned.BOUND * C, (len(own.matrices), 1, 1))
     problem = problem.with_correction(softest, own.masses)
     X, free = problem.positions, problem.free * a
     motions = [
