@@ -15,11 +15,16 @@ demo-learn: $(VENV)/learn.stamp
 	rm -rf demo-learn
 	OMP_NUM_THREADS=1 $(BIN)/pdcorrect train examples/training/tiny.toml --data datasets/tiny -o demo-learn --evaluate evaluation
 
-test: $(VENV)/dev.stamp lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile
+# Kernels are compiled once and beside the linters, not by each process of the tests.
+test: $(VENV)/dev.stamp
+	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/dev.stamp
 	$(BIN)/python -m pytest -m slow
+
+kernels-%: $(VENV)/dev.stamp
+	-OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python tests/compile_kernels.py $*
 
 lint: $(VENV)/dev.stamp
 	$(BIN)/ruff check

@@ -24,8 +24,18 @@ ELEMENTS = (
 if "PYTEST_XDIST_WORKER" in os.environ:  # kernels of one thread each, as the others want cores
     numba.set_num_threads(1)
 
+LONG = (
+    "test_faults", "test_pages", "test_resume", "test_steppers", "test_tiny_again",
+    "test_torch_layer", "test_training_together", "test_training_unrolled", "test_validation",
+)  # fmt: skip
+"""Files of long tests, late in the alphabet: first, so that no process ends far behind."""
+
 CLAMPED = [{"region": {"plane": "x", "at": 0.0}}]
 GRAVITY = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 def beam(cells=(6, 2, 2), cell_size=0.02, poisson=0.45, **changes):

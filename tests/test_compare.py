@@ -88,12 +88,16 @@ def test_scenes_without_another_best_coarse_model_are_compared_as_they_are(thick
     assert "best coarse PD" in labels(cases_for(other))
 
 
-def test_27_node_elements_are_measured_on_the_coarse_nodes(program, thick, tmp_path):
+def test_27_node_elements_are_measured_on_the_coarse_nodes_and_all_rows_written_for_paraview(
+    program, thick, tmp_path
+):
     (tmp_path / "scene.toml").write_text(thick.to_toml())
-    arguments = ("-o", tmp_path / "r", "--hex27", "--no-figures")
-    status, _, _ = program("compare", tmp_path / "scene.toml", *arguments)
+    folder = tmp_path / "r"
+    status, out, _ = program(
+        "compare", tmp_path / "scene.toml", "-o", folder, "--vtu", "--hex27", "--no-figures"
+    )
     assert status == 0
-    rows = {r["label"]: r for r in csv.DictReader((tmp_path / "r" / "report.csv").open())}
+    rows = {r["label"]: r for r in csv.DictReader((folder / "report.csv").open())}
     assert list(rows)[3] == HEX27.label == "coarse PD, hex27"
     assert int(rows[HEX27.label]["nodes"]) == 7 * 5 * 5
     coarse, steps = pc.discretise(thick), pc.ProjectiveDynamics
@@ -106,8 +110,20 @@ def test_27_node_elements_are_measured_on_the_coarse_nodes(program, thick, tmp_p
     error = float(rows[HEX27.label]["rms_error"])
     assert error == pytest.approx(pc.metrics.rms_error(own, fine), rel=1e-9)
     assert error < 0.3 * float(rows["coarse PD"]["rms_error"])
-    record = json.loads((tmp_path / "r" / "report.json").read_text())
+    record = json.loads((folder / "report.json").read_text())
     assert [case["element"] for case in record["cases"]] == [None] * 5 + ["hex27"]
+
+    names = ["best-coarse-pd", "coarse-newton", "coarse-pd", "coarse-pd-hex27", "fine-best-pd",
+             "intermediate-pd"]  # fmt: skip
+    assert sorted(path.stem for path in (folder / "vtu").glob("*.pvd")) == names
+    for name in names:
+        assert f"{name}.pvd" in out
+        frames = sorted((folder / "vtu").glob(f"{name}_[0-9]*.vtu"))
+        assert len(frames) == 3
+        data = meshio.read(frames[-1])
+        assert {"displacement", "velocity", "stress", "von_mises"} == set(data.point_data)
+        assert {"cell_von_mises", "smallest_volume_ratio"} == set(data.cell_data)
+    assert meshio.read(folder / "vtu" / "coarse-pd-hex27_0002.vtu").cells[0].type == "hexahedron27"
 
 
 def test_27_nodes_have_no_mass_per_node(thick):
@@ -221,26 +237,6 @@ def test_refused_corrections_are_told_with_their_numbers_and_meanings():
     told = refused_corrections([0.0, outside, energy, outside])
     assert "3 of 4" in told
     assert told.index(f"2 because {outside.meaning}") < told.index(f"1 because {energy.meaning}")
-
-
-def test_compare_writes_all_rows_for_paraview(program, thick, tmp_path):
-    (tmp_path / "scene.toml").write_text(thick.to_toml())
-    folder = tmp_path / "report"
-    status, out, _ = program(
-        "compare", tmp_path / "scene.toml", "-o", folder, "--vtu", "--hex27", "--no-figures"
-    )
-    assert status == 0
-    names = ["best-coarse-pd", "coarse-newton", "coarse-pd", "coarse-pd-hex27", "fine-best-pd",
-             "intermediate-pd"]  # fmt: skip
-    assert sorted(path.stem for path in (folder / "vtu").glob("*.pvd")) == names
-    for name in names:
-        assert f"{name}.pvd" in out
-        frames = sorted((folder / "vtu").glob(f"{name}_[0-9]*.vtu"))
-        assert len(frames) == 3
-        data = meshio.read(frames[-1])
-        assert {"displacement", "velocity", "stress", "von_mises"} == set(data.point_data)
-        assert {"cell_von_mises", "smallest_volume_ratio"} == set(data.cell_data)
-    assert meshio.read(folder / "vtu" / "coarse-pd-hex27_0002.vtu").cells[0].type == "hexahedron27"
 
 
 @pytest.mark.parametrize("length", [20, 60, 160])

@@ -318,7 +318,13 @@ def test_a_strip_that_cannot_bend_out_of_its_plane_is_not_warned_of(low):
 
 
 @every_element
-@pytest.mark.parametrize("make", [None, MESHES["random"]], ids=["box", "random"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(None, id="box", marks=pytest.mark.slow),
+        pytest.param(MESHES["random"], id="random"),
+    ],
+)
 def test_projective_dynamics_is_newton_for_every_element(make, element):
     mesh = box_mesh((4, 2, 2), (0.08, 0.04, 0.05)) if make is None else make()
     changes = {

@@ -48,6 +48,10 @@ def test_the_choice_falls_back(monkeypatch):
     assert choose_backend(10_000_000, memory=1e9) == "amg"
     assert choose_backend(30_000, memory=4e8) == "cholespy"
     assert choose_backend(30_000, unknowns=3, memory=4e8) == "amg"
+    # a thin factor is expected to fit where a compact one is not
+    assert choose_backend(90_000, memory=1e9) == "amg"
+    assert choose_backend(90_000, memory=1e9, bandwidth=300) == "cholespy"
+    assert choose_backend(900_000, memory=1e9, bandwidth=300) == "amg"
     found = importlib.util.find_spec
     monkeypatch.setattr(
         factorisation.importlib.util,
@@ -111,10 +115,10 @@ def test_multigrid_solves_tangents_as_cholesky_does(clamps, rng):
 
 
 def test_multigrid_steps_hardly_grow_with_the_mesh(rng):
-    few, many = (steps_of(*tangent((n, n, n)), rng) for n in (8, 16))
+    few, many = (steps_of(*tangent((n, n, n)), rng) for n in (6, 12))
     assert many <= 1.5 * few
     few, many = (
-        steps_of(pc.discretise(beam((n, n, n))).global_matrix(0.01), None, rng) for n in (10, 20)
+        steps_of(pc.discretise(beam((n, n, n))).global_matrix(0.01), None, rng) for n in (8, 16)
     )
     assert many <= 1.5 * few
 
@@ -185,24 +189,21 @@ def test_newton_by_conjugate_gradients_takes_no_saddle_for_a_minimum():
         assert exact == minimum
 
 
-def test_nearly_incompressible_tangents_are_factorised_where_others_are_not():
-    usual, hard = (pc.discretise(beam((14, 14, 14), poisson=nu)) for nu in (0.45, 0.4999))
-    assert pc.Newton(usual).linear_solver == "cg"
-    assert pc.Newton(hard).linear_solver == "direct"
-
-
 def test_the_linear_solver_follows_size_and_back_end():
     problem = pc.discretise(beam((3, 2, 2)))
     assert pc.Newton(problem).linear_solver == "direct"
     assert pc.Newton(problem, backend="amg").linear_solver == "cg"
     with pytest.raises(InputError, match="expected 'auto', 'direct' or 'cg'"):
         pc.Newton(problem, linear_solver="magic")
+    usual, nearly = (pc.discretise(beam((14, 14, 14), poisson=nu)) for nu in (0.45, 0.4999))
+    assert pc.Newton(usual).linear_solver == "cg"
+    assert pc.Newton(nearly).linear_solver == "direct"  # incompressible
 
 
 @pytest.mark.parametrize(
     ("cells", "nodes", "expected"),
     [
-        ((171, 16, 16), 49_708, "cholespy"),
+        ((40, 16, 16), 11_849, "cholespy"),
         ((18, 18, 18), 6_859, "amg"),
         ((12, 12, 12), 2_197, "cholespy"),
     ],
@@ -223,12 +224,6 @@ def test_elements_for_which_multigrid_is_slow_are_factorised_up_to_a_size():
         )
         assert problem.band_order.bandwidth > factorisation.LARGEST_BANDWIDTH
         assert global_backend(problem) == "cholespy"
-
-
-def test_a_thin_factor_is_expected_to_fit_where_a_compact_one_is_not():
-    assert choose_backend(90_000, memory=1e9) == "amg"
-    assert choose_backend(90_000, memory=1e9, bandwidth=300) == "cholespy"
-    assert choose_backend(900_000, memory=1e9, bandwidth=300) == "amg"
 
 
 def test_a_block_steps_by_multigrid_without_being_told():

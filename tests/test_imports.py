@@ -81,45 +81,44 @@ def loaded_after(code):
 HEAVY = {"torch", "pyvista", "vtk", "vtkmodules", "h5py", "meshio", "matplotlib"}
 
 
-def test_importing_the_package_loads_nothing_heavy():
-    assert not loaded_after("import pdcorrect") & (HEAVY | {"numpy", "scipy", "numba", "skfem"})
-
-
-def test_help_loads_nothing_heavy():
-    code = (
-        "import sys; sys.argv = ['pdcorrect', '--help']\n"
-        "from pdcorrect.cli.program import app\n"
-        "try:\n    app()\nexcept SystemExit:\n    pass"
-    )
-    assert not loaded_after(code) & (HEAVY | {"numpy", "scipy", "numba", "skfem"})
-
-
-def test_stepping_loads_neither_torch_nor_files_nor_pictures():
-    code = (
-        "import pdcorrect as pc\n"
-        "scene = pc.Scene(body={'shape': 'beam', 'cells': [2, 1, 1], 'cell_size': 0.1},\n"
-        "    material={'young': 1e5, 'poisson': 0.3, 'density': 1e3}, time={'step': 0.01,"
-        " 'frames': 1})\n"
-        "pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))\n"
-        "pc.rollout(pc.Newton(pc.discretise(scene)))"
-    )
-    assert not loaded_after(code) & HEAVY
-
-
-def test_rendering_does_not_load_torch():
-    code = "import pdcorrect.figures\nimport pdcorrect.evaluation.report"
-    assert "torch" not in loaded_after(code)
-
-
+LIBRARIES = HEAVY | {"numpy", "scipy", "numba", "skfem"}
+HELP = """
+import sys
+sys.argv = ["pdcorrect", "--help"]
+from pdcorrect.cli.program import app
+try:
+    app()
+except SystemExit:
+    pass
+"""
+STEPS = """
+import pdcorrect as pc
+body = {"shape": "beam", "cells": [2, 1, 1], "cell_size": 0.1}
+material = {"young": 1e5, "poisson": 0.3, "density": 1e3}
+scene = pc.Scene(body=body, material=material, time={"step": 0.01, "frames": 1})
+pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
+pc.rollout(pc.Newton(pc.discretise(scene)))
+"""
 WITHOUT_TORCH = (
     "data.check", "data.generate", "data.import_files", "data.summary", "io.trajectory",
-    "evaluation.compare", "cli.program",
+    "evaluation.compare", "evaluation.report", "figures", "cli.program",
 )  # fmt: skip
 
 
-def test_data_sets_files_comparisons_and_the_program_do_not_load_torch():
-    modules = ", ".join(f"pdcorrect.{name}" for name in WITHOUT_TORCH)
-    assert "torch" not in loaded_after(f"import {modules}")
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        pytest.param("import pdcorrect", LIBRARIES, id="import"),
+        pytest.param(HELP, LIBRARIES, id="help"),
+        pytest.param(STEPS, HEAVY, id="steps"),
+        pytest.param(
+            f"import {', '.join(f'pdcorrect.{name}' for name in WITHOUT_TORCH)}", {"torch"},
+            id="data sets, files, comparisons, pictures and the program",
+        ),
+    ],
+)  # fmt: skip
+def test_heavy_modules_are_not_loaded_until_needed(code, heavy):
+    assert not loaded_after(code) & heavy
 
 
 def test_a_data_set_is_checked_without_torch():

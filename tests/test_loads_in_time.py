@@ -85,8 +85,14 @@ def followed(name, integrator, **time):
                 loads=[load])  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FOLLOWERS)
-@pytest.mark.parametrize("integrator", ALL)
+@pytest.mark.parametrize(
+    ("name", "integrator"),
+    [
+        *(("pressure", integrator) for integrator in ALL),
+        ("torsion", "generalised-alpha"),
+        *(pytest.param("torsion", integrator, marks=pytest.mark.slow) for integrator in ALL[:3]),
+    ],
+)
 def test_loads_that_follow_keep_the_order_in_time(name, integrator):
     problem = followed(name, integrator)
     ends = []

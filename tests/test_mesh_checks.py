@@ -92,29 +92,40 @@ def test_duplicate_nodes_are_named_both_with_their_places():
     assert len(HexMesh.create(positions, cells).cells) == 3
 
 
-def test_a_cell_with_a_node_twice_is_refused_as_collapsed():
-    cells = np.array([[0, 1, 2, 3, 4, 5, 6, 6]])
-    with pytest.raises(MeshError, match="cell 0 around .* contains node 6 more than once"):
-        HexMesh.create(CUBE[:7], cells)
+def twice(mesh):
+    """With one of its cells once more, in another turn."""
+    return mesh.positions, np.vstack([mesh.cells, mesh.cells[1][TURNS[7]]])
 
 
-def test_the_same_cell_twice_is_refused_in_any_turn():
-    mesh = grid(3, 1, 1)
-    cells = np.vstack([mesh.cells, mesh.cells[1][TURNS[7]]])
-    with pytest.raises(MeshError, match=r"cells 1 and 3 around \[1.5 0.5 0.5\]"):
-        HexMesh.create(mesh.positions, cells)
+WRONG = {
+    "a node twice in a cell": (
+        (CUBE[:7], np.array([[0, 1, 2, 3, 4, 5, 6, 6]])),
+        "cell 0 around .* contains node 6 more than once",
+    ),
+    "a cell twice": (twice(grid(3, 1, 1)), r"cells 1 and 3 around \[1.5 0.5 0.5\]"),
+    "three cells at a face": (
+        glue(np.array([
+            box([0, 0, 0], [1, 1, 1]), box([1, 0, 0], [2, 1, 1]), box([1, 0, 0], [1.7, 1, 1]),
+        ])),
+        r"face around \[1.  0.5 0.5\] .* 3 cells 0, 1, 2",
+    ),
+    "two cells on one side": (
+        glue(np.array([box([0, 0, 0], [1, 1, 1]), box([0, 0, 0], [0.6, 1, 1])])),
+        r"cells 0 and 1 .*\[0\.  0\.5 0\.5\]",
+    ),
+    "a node on an edge": (
+        glue(np.array([
+            box([0, 0, 0], [1, 1, 1]), box([1, 1, 0], [2, 2, 0.4]), box([1, 1, 0.4], [2, 2, 1]),
+        ])),
+        r"at \[1.  1.  0.4\] lies on .* cell 0 ",
+    ),
+}  # fmt: skip
 
 
-def test_a_face_of_three_cells_is_refused():
-    cells = [box([0, 0, 0], [1, 1, 1]), box([1, 0, 0], [2, 1, 1]), box([1, 0, 0], [1.7, 1, 1])]
-    with pytest.raises(MeshError, match=r"face around \[1.  0.5 0.5\] .* 3 cells 0, 1, 2"):
-        HexMesh.create(*glue(np.array(cells)))
-
-
-def test_two_cells_on_one_side_of_a_face_are_refused():
-    cells = [box([0, 0, 0], [1, 1, 1]), box([0, 0, 0], [0.6, 1, 1])]
-    with pytest.raises(MeshError, match=r"cells 0 and 1 .*\[0\.  0\.5 0\.5\]"):
-        HexMesh.create(*glue(np.array(cells)))
+@pytest.mark.parametrize(("mesh", "words"), WRONG.values(), ids=WRONG)
+def test_cells_that_do_not_join_at_whole_faces_are_refused(mesh, words):
+    with pytest.raises(MeshError, match=words):
+        HexMesh.create(*mesh)
 
 
 def beside(mesh, cell, k):
@@ -130,12 +141,6 @@ def beside(mesh, cell, k):
 def test_hanging_nodes_of_a_cell_that_is_cut_alone_are_refused(make, k):
     with pytest.raises(MeshError, match=r"node \d+ at .* lies on a face or an edge of cell \d+ "):
         HexMesh.create(*beside(make(), 4, k))
-
-
-def test_hanging_nodes_on_an_edge_alone_are_found():
-    upper = [box([1, 1, 0], [2, 2, 0.4]), box([1, 1, 0.4], [2, 2, 1])]
-    with pytest.raises(MeshError, match=r"at \[1.  1.  0.4\] lies on .* cell 0 "):
-        HexMesh.create(*glue(np.array([box([0, 0, 0], [1, 1, 1]), *upper])))
 
 
 def test_different_divisions_on_both_sides_are_refused_and_a_gap_is_not():

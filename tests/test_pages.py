@@ -64,17 +64,13 @@ def anchors(page):
 
 
 @each_page
-def test_links_lead_somewhere(page):
+def test_links_lead_somewhere_and_files_that_are_named_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     for path, anchor in re.findall(r"\]\((?!http)([^)#\s]*)(?:#([^)\s]+))?\)", text):
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), f"{page.name} -> {path}"
         assert not anchor or anchor in anchors(target), f"{page.name} -> {path}#{anchor}"
-
-
-@each_page
-def test_files_that_a_page_names_exist(page):
-    """Paths of the package, the examples and the validation cases in `...`."""
+    # paths of the package, the examples and the validation cases in `...`
     places = (ROOT, ROOT / "src" / "pdcorrect")
     for name in re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.(?:py|toml))`", page.read_text("utf-8")):
         assert any((place / name).exists() for place in places), f"{page.name}: {name}"

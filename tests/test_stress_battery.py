@@ -71,9 +71,11 @@ def test_every_scene_and_solver_has_an_expectation_and_there_are_no_others():
     assert quick == {name for name in names if SCENES[name.split(",")[0]].quick}
 
 
-def test_the_distance_from_rest_is_in_cells():
+def test_the_distance_from_rest_is_in_cells_and_of_no_number_is_far():
     found = run_of(SCENES["plane"], at_rest, pushed([0.0, 0.03, 0.04], nodes=7))
     assert BATTERY.distance(SCENES["plane"], found, None) == pytest.approx(1.0)
+    found = run_of(SCENES["plane"], at_rest, pushed([np.nan, 0.0, 0.0], nodes=3))
+    assert BATTERY.distance(SCENES["plane"], found, None) == BATTERY.UNDEFINED
 
 
 def test_a_free_body_may_move_rigidly_but_not_change_its_shape():
@@ -104,11 +106,6 @@ def test_a_motion_is_compared_in_all_frames_with_the_largest_displacement_as_uni
     assert BATTERY.distance(scenario, found, truth) == pytest.approx(0.1)
 
 
-def test_a_run_that_is_no_number_is_far_from_everything():
-    found = run_of(SCENES["plane"], at_rest, pushed([np.nan, 0.0, 0.0], nodes=3))
-    assert BATTERY.distance(SCENES["plane"], found, None) == BATTERY.UNDEFINED
-
-
 @pytest.mark.parametrize(
     ("statuses", "iterations", "far", "word"),
     [
@@ -128,9 +125,7 @@ def test_verdicts(statuses, iterations, far, word):
     found = run_of(scenario, at_rest, end, statuses=statuses, iterations=iterations)
     figures = BATTERY.figures_of(scenario, "PD", found, None)
     assert BATTERY.verdict("PD", found, figures) == word
-
-
-def test_newton_is_slow_sooner():
+    # Newton is slow sooner
     found = run_of(SCENES["plane"], at_rest, at_rest, iterations=[31])
     figures = BATTERY.figures_of(SCENES["plane"], "Newton", found, None)
     assert BATTERY.verdict("Newton", found, figures) == "slow"
@@ -161,6 +156,11 @@ def test_the_reversing_load_turns_round_at_every_step():
     first, second = (SCENES["reversal"].forces(problem, k) for k in (0, 1))
     np.testing.assert_array_equal(first, -second)
     assert first.sum(axis=0)[2] == pytest.approx(-100.0 * problem.mass.sum())
+    scenario = SCENES["cross reversal 10"]
+    problem = pc.discretise(scenario.scene)
+    load = problem.external_forces(0.0, problem.time_step)
+    for step, sign in ((0, 1.0), (1, -1.0), (2, 1.0)):
+        np.testing.assert_allclose(load + scenario.forces(problem, step), sign * load)
 
 
 def test_a_solver_that_fails_is_seen_as_failing(monkeypatch):
@@ -233,14 +233,6 @@ def test_the_model_knows_the_cross_at_rest_and_not_with_its_far_end_held():
         problem = pc.discretise(trained_coarse(SCENES[name].scene))
         bodies = BodyGraph.of([problem], dtype=torch.float64)
         assert (found.corrector.envelope.rest_score(bodies) <= pc.Gate().outside) == known
-
-
-def test_the_crosses_load_turns_round_at_every_step():
-    scenario = SCENES["cross reversal 10"]
-    problem = pc.discretise(scenario.scene)
-    load = problem.external_forces(0.0, problem.time_step)
-    for step, sign in ((0, 1.0), (1, -1.0), (2, 1.0)):
-        np.testing.assert_allclose(load + scenario.forces(problem, step), sign * load)
 
 
 def test_the_twisted_cross_has_its_ends_where_they_were_and_its_middle_upside_down():

@@ -142,17 +142,6 @@ def test_a_failed_write_leaves_the_old_file(run, tmp_path, monkeypatch):
 # --- meshes from files -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".inp", ".msh"])
-def test_hexahedra_survive_the_formats(tmp_path, suffix):
-    mesh = cross_mesh()
-    path = tmp_path / f"mesh{suffix}"
-    options = {"file_format": "gmsh22", "binary": False} if suffix == ".msh" else {}
-    meshio.write(path, meshio.Mesh(mesh.positions, [("hexahedron", mesh.cells)]), **options)
-    found = read_hex_mesh(path, scale=2.0)
-    np.testing.assert_allclose(found.positions, 2 * mesh.positions, atol=1e-14)
-    np.testing.assert_array_equal(found.cells, mesh.cells)
-
-
 def test_hexahedra_are_read_and_other_cells_and_unused_nodes_dropped(tmp_path, capfd):
     mesh = cross_mesh()
     points = np.concatenate([[[9.0, 9.0, 9.0]], mesh.positions, [[8.0, 8.0, 8.0]]])

@@ -13,6 +13,7 @@ from pdcorrect.fem import turned_strains
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.cube_symmetry import PATTERNS
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
+from pdcorrect.fem.operators import freeze
 from pdcorrect.fem.turned_strains import SHARES
 
 Array = NDArray[np.float64]
@@ -71,6 +72,9 @@ class CellCorrection:
     masses: Array
     learned: NDArray[np.bool_]
     writer: Writer | None = None
+
+    def __post_init__(self) -> None:
+        freeze(self.cells)
 
     def energy_and_forces(self, u: Array, shift: Array = _NO_SHIFT) -> tuple[float, Array]:
         """1/2 z . K z - shift . z (J) and its forces (N, 3) for displacements (N or more, 3)."""

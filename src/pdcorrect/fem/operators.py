@@ -101,6 +101,12 @@ class _Values:
         return {}
 
 
+def freeze(*arrays: NDArray[np.generic]) -> None:
+    """Make arrays read-only; numba compiles its kernels anew for those that are not."""
+    for array in arrays:
+        array.flags.writeable = False
+
+
 class Space:
     """A scalar finite element space on a mesh; vector fields use it three times.
 
@@ -143,6 +149,7 @@ class Space:
             self.internal = 3 * len(self.cells)
             modes = len(self.positions) + np.arange(self.internal).reshape(-1, 3)
             self.local = np.concatenate([self.cells, modes], axis=1)
+        freeze(self.positions, self.cells, self.local)
 
     def quadrature(self) -> Quadrature:
         """Gradients and volumes at the quadrature points."""
@@ -153,7 +160,9 @@ class Space:
         if self._kind.bubbles:
             out = out.with_incompatible_modes(self._corners, self._basis.quadrature[0].T)
         shares = self.volume_shares()
-        return out if shares is None else out.with_volume_points(shares)
+        out = out if shares is None else out.with_volume_points(shares)
+        freeze(out.lanes, out.weights, out.volume_weights)
+        return out
 
     def volume_shares(self) -> Array | None:
         """How much stress at the volume term's own points counts at the others, (C, Q, P).

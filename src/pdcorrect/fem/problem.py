@@ -23,7 +23,7 @@ from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
 from pdcorrect.fem.mesh import refine as refine_mesh
-from pdcorrect.fem.operators import Space, lumped, mass_matrix, summed_cells
+from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix, summed_cells
 from pdcorrect.fem.thin_cells import warn_of_thin_cells
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
@@ -338,9 +338,8 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
             space.cells, materials.density[:, None, None] * correction.masses, matrix.shape[0]
         )
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
-    _freeze(space.positions, space.cells, clamps.free, quadrature.lanes, quadrature.weights)
-    _freeze(quadrature.volume_weights, matrix.indices, matrix.indptr)
-    _freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
+    freeze(clamps.free, matrix.indices, matrix.indptr)
+    freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
         loads, correction=correction,
@@ -402,11 +401,6 @@ def _check_size(scene: Scene, cells: int, refine: int) -> None:
             f"{most:.0f} in the {memory / 1e9:.3g} GB of memory that this program may use. Use "
             "larger cells or a smaller refine."
         )
-
-
-def _freeze(*arrays: NDArray[np.generic]) -> None:
-    for array in arrays:
-        array.flags.writeable = False
 
 
 Base = Literal["plain", "best", "total-mass"]
