@@ -96,8 +96,8 @@ def _what(config: DatasetConfig) -> Iterable[str]:
         f"{config.frames} frames of {config.step:g} s from rest."
     )
     yield (
-        f"**Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
-        f"{config.cell_size:g} m."
+        f"**Bodies**: {_BODIES.get(config.family, config.family)}; {nodes[0]} to {nodes[1]} nodes, "
+        f"cells of {config.cell_size:g} m."
     )
     several = "one or two of these a simulation: " if config.mixed else ""
     yield f"**Loads**: {several}{'; '.join(map(_load, config.motions))}."
