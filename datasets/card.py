@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-from pdcorrect.data.configuration import EVALUATION, DatasetConfig, ExtraSplit, MotionRange
+from pdcorrect.data.configuration import EVALUATION, DatasetConfig, MotionRange
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
 from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN
@@ -24,11 +24,6 @@ _LOADS = {
     "impulse": "a force during {duration:g} s",
     "stretch": "a force that rises in {duration:g} s and stays",
     "body-force": "an acceleration of the whole body that rises in {duration:g} s and stays",
-}
-_SETTINGS = {
-    "as-published": "the thesis's setting: coarse meshes are too heavy, forces act on coarse nodes",
-    "exact": "right masses and moduli, loads integrated, reference by the best coarse model",
-    "converged": "as exact, with the best element, and a reference at a quarter of the step",
 }
 
 
@@ -101,8 +96,8 @@ def _what(config: DatasetConfig) -> Iterable[str]:
         f"{config.frames} frames of {config.step:g} s from rest."
     )
     yield (
-        f"**Bodies**: {_BODIES[config.family]}; {nodes[0]} to {nodes[1]} nodes, cells of "
-        f"{config.cell_size:g} m."
+        f"**Bodies**: {_BODIES.get(config.family, config.family)}; {nodes[0]} to {nodes[1]} nodes, "
+        f"cells of {config.cell_size:g} m."
     )
     several = "one or two of these a simulation: " if config.mixed else ""
     yield f"**Loads**: {several}{'; '.join(map(_load, config.motions))}."
@@ -112,7 +107,7 @@ def _what(config: DatasetConfig) -> Iterable[str]:
     )
     refine = "×".join([str(config.reference.refine)] * 3)
     yield (
-        f"**Setting** `{config.setting}`: {_SETTINGS[config.setting]}. "
+        f"**Setting** `{config.setting}`. "
         f"**Reference**: {config.reference.solver.upper()} on cells cut {refine}."
     )
 
@@ -145,32 +140,11 @@ def _use(
     where = made_with.get("device", "cpu")
     machine = made_with.get("processor", "?") if where == "cpu" else where
     yield (
-        f"**Made** by `pdcorrect dataset generate {CONFIG} -o FOLDER`, seed {config.seed}, in "
-        f"{info.whole.seconds:.0f} worker seconds, {made_with.get('date', '?')}, "
-        f"pdcorrect {made_with.get('pdcorrect', '?')}, {machine}; "
-        f"{info.whole.bytes / 1e6:.0f} MB. SHA-256 `{content}`; other devices differ within the "
-        "solver's tolerance."
+        f"**Made** with seed {config.seed} in {info.whole.seconds:.0f} worker seconds, "
+        f"{made_with.get('date', '?')}, pdcorrect {made_with.get('pdcorrect', '?')}, {machine}; "
+        f"{info.whole.bytes / 1e6:.0f} MB. SHA-256 `{content}`."
     )
-    yield (
-        f"**Evaluate** by mean Ω of rollouts on `{EVALUATION}`, the share of the `{PLAIN}` run's "
-        "squared error that is gone; choose on `validation`. Splits are by mesh."
-    )
-    if config.extra:
-        extra = "; ".join(f"`{each.name}` {_difference(each)}" for each in config.extra)
-        yield f"**Further splits**: {extra}."
-    yield f"**Limits**: {_time_error(info)} Loads that failed were drawn again."
-
-
-def _difference(extra: ExtraSplit) -> str:
-    """What a split changes against the data set."""
-    told = [f"family {extra.family}"] if extra.family is not None else []
-    told += [f"E {_range(extra.young)} Pa"] if extra.young is not None else []
-    told += [f"ν {_range(extra.poisson)}"] if extra.poisson is not None else []
-    told += [f"reference cut {extra.refine}"] if extra.refine is not None else []
-    factors = {"strength": extra.strength_factor, "step": extra.step_factor}
-    factors["frames"] = extra.frames_factor
-    told += [f"{name} ×{factor:g}" for name, factor in factors.items() if factor != 1]
-    return ", ".join(told) or "the same distribution"
+    yield f"**Limits**: {_time_error(info)}"
 
 
 def _time_error(info: DatasetInfo) -> str:

@@ -101,18 +101,6 @@ def batches() -> Rows:
     return head, rows
 
 
-def batch_integrators() -> Rows:
-    """Steps and derivatives of a batch by integrator."""
-    rows = [
-        [
-            row["integrator"], number(row["step_ms"]), number(row["backward_ms"]),
-            number(row["iterations"], 2), number(row["memory_bytes"] / 1e9, 2),
-        ]
-        for row in results_of(H100, "batch integrators")
-    ]  # fmt: skip
-    return ("integrator", "step, ms", "derivative, ms", "iterations", "memory, GB"), rows
-
-
 def elements() -> Rows:
     """A step with the learned element over one with the best coarse one."""
     rows = [
@@ -187,7 +175,6 @@ def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "peer": peer, "derivatives": derivatives, "integrators": integrators, "batches": batches,
-        "batch-integrators": batch_integrators, "batch-elements": batch_elements,
-        "elements": elements,
+        "batch-elements": batch_elements, "elements": elements,
         "corrected-steps": corrected_steps, "networks": networks, "reading": reading,
     }.items()  # fmt: skip

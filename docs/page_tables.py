@@ -56,32 +56,6 @@ def time_and_mesh_error() -> Rows:
     return ("error", "RMS, mm", "% of the displacement"), rows
 
 
-def breakdown() -> Rows:
-    """Midpoint and generalised-alpha over a long run, by mesh."""
-    (table,) = read(RECORDS / "breakdown.json")["tables"]
-    at = table["headings"].index
-    columns = {
-        "frames with inverted cells": 0,
-        "time error, % of the displacement": 2,
-    }
-    rows = [
-        [
-            f"`{row[at('mesh')]}`" if row[at("mesh")].startswith("hex") else row[at("mesh")],
-            f"`{row[at('integrator')]}`",
-            *(_cell(row[at(name)], digits) for name, digits in columns.items()),
-        ]
-        for row in table["rows"]
-        if row[at("step, ms")] == 10.0
-    ]
-    return ("coarse mesh", "integrator", *columns), rows
-
-
-def _cell(value: float | str, digits: int) -> str:
-    if isinstance(value, str):
-        return value
-    return number(value, digits) if digits else f"{value:.0f}"
-
-
 def own_body_evaluation() -> Rows:
     """Means over the evaluation simulations of the hook, before and after fine-tuning."""
     record = read(_OWN)
@@ -130,6 +104,6 @@ def own_body_runs() -> Rows:
 
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By their names on the pages."""
-    every = (error_and_time, time_and_mesh_error, breakdown, own_body_evaluation, own_body_runs)
+    every = (error_and_time, time_and_mesh_error, own_body_evaluation, own_body_runs)
     for table in every:
         yield table.__name__.replace("_", "-"), table

@@ -7,10 +7,9 @@ from functools import partial
 from statistics import fmean
 from typing import Any
 
-from records import RECORDS, ROOT, Rows, number, percent, read
+from records import RECORDS, ROOT, Rows, number, read
 
 FREQUENCIES = "Error of the lowest 10 frequencies, %"
-INTEGRATORS = ("backward-euler", "bdf2", "midpoint", "generalised-alpha")
 
 
 def table_of(case: str, name: str) -> tuple[Sequence[str], list[list[Any]]]:
@@ -28,15 +27,6 @@ def as_measured(case: str, name: str, digits: int = 3, columns: slice = slice(No
         for row in rows
     ]
     return heads[columns], cells
-
-
-def orders() -> Rows:
-    """Orders of positions in time by load and damping."""
-    _, rows = table_of("time_orders", "Orders in time")
-    found = {tuple(row[:3]): row[3] for row in rows}
-    pairs = dict.fromkeys((row[0], row[1]) for row in rows)
-    cells = [[*pair, *(percent(found[*pair, name], 2) for name in INTEGRATORS)] for pair in pairs]
-    return ("load", "damping", *INTEGRATORS), cells
 
 
 def errors() -> Rows:
@@ -86,7 +76,6 @@ def aims(case: str) -> Rows:
 
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By name."""
-    yield "time-orders", orders
     yield "time-errors", errors
     yield "energy-long", partial(as_measured, "energy", "Energy over that of the start")
     for which, start in (("twist", "Stiff body let go twisted"), ("weight", "Stiff body under")):

@@ -32,7 +32,7 @@ def test_the_published_ranges_are_the_theses():
     assert PUBLISHED["weight"] == ((237, 471), (8433, 16857))
 
 
-@pytest.mark.parametrize("family", ["beam", "cross", "weight"])
+@pytest.mark.parametrize("family", PUBLISHED)
 def test_the_published_ranges_of_nodes_are_kept_and_their_ends_reached(family):
     coarse, fine = PUBLISHED[family]
     for largest in (False, True):
@@ -46,7 +46,7 @@ def test_the_published_ranges_of_nodes_are_kept_and_their_ends_reached(family):
         assert fine[0] <= mesh_nodes(design, 4) <= fine[1]
 
 
-@pytest.mark.parametrize("family", ["beam", "cross", "weight"])
+@pytest.mark.parametrize("family", PUBLISHED)
 def test_bodies_are_held_where_they_should_be_and_loads_find_their_part(family):
     rng = RNG(3)
     for motion in ("torsion", "impulse", "stretch"):

@@ -73,7 +73,8 @@ def test_the_peers_trajectory_is_reproduced(request):
     assert len(run) == 50
     assert np.abs(data["positions"] - problem.positions).max() > 0.1
     assert np.abs(run.positions - data["positions"]).max() < 1e-7
-    assert np.abs(run.velocities - data["velocities"]).max() < 1e-5
+    velocities = np.diff(data["positions"], axis=0) / data["time_step"]
+    assert np.abs(run.velocities[1:] - velocities).max() < 1e-5
 
 
 def test_local_global_reaches_the_same_state():

@@ -108,11 +108,11 @@ def conditions(sections: Sequence[Section]) -> str:
 
 
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
-    """A paragraph a case: question, verdict, finding, figure."""
+    """A paragraph a case: verdict, finding, figure."""
     yield from ("# Validation report", "", conditions(sections), "")
     for each in sections:
         case, record = each.case, each.record
-        yield from (f"## {case.title}", "", case.question, "")
+        yield from (f"## {case.title}", "")
         yield f"**{harness.verdict(case, record).capitalize()}.** {each.finding}".rstrip()
         yield from ("", "```text", record.error.rstrip(), "```") if record.error else ()
         yield from ("", f"![{case.title}]({each.figure})", "") if each.figure else ("",)

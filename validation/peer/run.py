@@ -89,6 +89,7 @@ def times() -> tuple[common.Figures, common.Table]:
 def case(quick: bool) -> common.Outcome:
     """All figures; it takes seconds."""
     truth = peer()["positions"]
+    velocities = np.diff(truth, axis=0) / peer()["time_step"]  # exactly those of DiffPD
     same = pc.discretise(scene())
     by_pd = pc.rollout(pc.ProjectiveDynamics(same))
     by_newton = pc.rollout(pc.Newton(same))
@@ -96,7 +97,7 @@ def case(quick: bool) -> common.Outcome:
         "displacement, mm": 1e3 * pc.metrics.largest_displacement(truth),
         "PD, distance, um": 1e6 * pc.metrics.largest_error(by_pd.positions, truth),
         "Newton, distance, um": 1e6 * pc.metrics.largest_error(by_newton.positions, truth),
-        "PD, velocities, um/s": 1e6 * float(np.abs(by_pd.velocities - peer()["velocities"]).max()),
+        "PD, velocities, um/s": 1e6 * float(np.abs(by_pd.velocities[1:] - velocities).max()),
     }
     for tolerance in TOLERANCES:
         problem = pc.discretise(scene(tolerance=tolerance))
