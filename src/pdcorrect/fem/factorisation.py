@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError
+from pdcorrect.fem.multigrid import Multigrid, conjugate_gradients
 from pdcorrect.fem.multigrid import NotPositiveDefinite as NotPositiveDefinite
-from pdcorrect.fem.multigrid import conjugate_gradients
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
@@ -112,14 +112,8 @@ class MultigridSolver:
 
     The columns of a right-hand side advance together, as one system.
 
-    Parameters
-    ----------
-    matrix, near_nullspace
-        See `factorise`.
-
     Attributes
     ----------
-    hierarchy : Multigrid
     steps : int
         Conjugate gradient steps of the last solve.
     """
@@ -127,10 +121,8 @@ class MultigridSolver:
     backend = "amg"
 
     def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
-        from pdcorrect.fem.multigrid import Multigrid  # pyamg only where it is needed
-
         self._matrix = sp.csr_matrix(matrix)
-        self.hierarchy = Multigrid(self._matrix, near_nullspace)
+        self._cycle = Multigrid(self._matrix, near_nullspace)
         self.steps = 0
 
     def solve(self, b: Array) -> Array:
@@ -138,12 +130,9 @@ class MultigridSolver:
         if not np.isfinite(b).all():  # as the direct back ends do
             return np.full_like(b, np.nan)
         found = conjugate_gradients(
-            self._matrix.__matmul__,
-            b.reshape(len(b), -1),
-            self.hierarchy.cycle,
-            tolerance=_AMG_TOLERANCE,
-            max_steps=_AMG_STEPS,
-        )
+            self._matrix.__matmul__, b, self._cycle.solve,
+            tolerance=_AMG_TOLERANCE, max_steps=_AMG_STEPS,
+        )  # fmt: skip
         self.steps = found.steps
         if not found.convex:
             raise NotPositiveDefinite("multigrid-preconditioned CG met negative curvature")
@@ -151,22 +140,7 @@ class MultigridSolver:
             raise NotPositiveDefinite(
                 f"multigrid-preconditioned CG did not converge in {found.steps} steps"
             )
-        return found.x.reshape(b.shape)
-
-
-class MultigridCycle:
-    """One V-cycle in place of a solve: a fixed symmetric positive approximation of A^-1."""
-
-    backend = "amg"
-
-    def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
-        from pdcorrect.fem.multigrid import Multigrid
-
-        self._hierarchy = Multigrid(matrix, near_nullspace)
-
-    def solve(self, b: Array) -> Array:
-        b = np.asarray(b, dtype=np.float64)
-        return self._hierarchy.cycle(b.reshape(len(b), -1)).reshape(b.shape)
+        return found.x
 
 
 _DIRECT: dict[str, Callable[[sp.csc_matrix], Factor]] = {
@@ -209,7 +183,7 @@ def factorise(
     if backend in ("auto", "band"):
         backend = choose_backend(matrix.shape[0], unknowns)
     if backend == "amg":
-        return (MultigridCycle if approximate else MultigridSolver)(matrix, near_nullspace)
+        return (Multigrid if approximate else MultigridSolver)(matrix, near_nullspace)
     return _DIRECT[backend](sp.csc_matrix(matrix))
 
 
