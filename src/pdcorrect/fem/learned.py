@@ -19,14 +19,13 @@ another Poisson's ratio, or beside cells of much other modulus or density.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
+from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes, difference
 from pdcorrect.fem.clamps import Clamps
 from pdcorrect.fem.cube_symmetry import MANDEL, SCALAR_PATTERNS
 from pdcorrect.fem.elastic_body import ElasticBody
@@ -110,15 +109,7 @@ def root(matrix: Array) -> Array:
 
 
 class ElementWriter:
-    """What the network writes for the cells of one body, whatever its moduli.
-
-    Parameters
-    ----------
-    network : Network
-    body : ElasticBody
-        Of an element with 8 nodes.
-    clamps : Clamps
-    """
+    """What the network writes for the cells of one body, whatever its moduli."""
 
     def __init__(self, network: Network, body: ElasticBody, clamps: Clamps) -> None:
         self._network, self._body = network, body
@@ -166,9 +157,7 @@ class ElementWriter:
     ) -> tuple[Array, Array]:
         """Derivatives by mu and omega, each (C,), from those by K (C, 18, 18) and the masses.
 
-        Those that are None are zero.
-
-        What cells have of their own is differentiated by differences of fourth order, the
+        None is zero.  What cells have of their own is differentiated by differences, the
         network's answers by the chain rule.
         """
         young, poisson = effective_moduli(mu, omega)
@@ -190,8 +179,8 @@ class ElementWriter:
 
         step = _STEP * mu
         found = [
-            _difference(lambda t: own(mu + t * step, omega)) / step,
-            _difference(lambda t: own(mu, omega + t * step)) / step,
+            difference(lambda t: own(mu + t * step, omega)) / step,
+            difference(lambda t: own(mu, omega + t * step)) / step,
         ]
         stiff, heavy = self._roots(mu, omega)
         stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
@@ -292,11 +281,6 @@ def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.i
     if not plain.space.internal:
         return blocks
     return Condensed(blocks, plain.space.local[few], plain.cells.shape[1]).blocks
-
-
-def _difference(function: Callable[[float], Array]) -> Array:
-    """Derivative at 0 by central differences of fourth order."""
-    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
 
 
 def _bounded_transposed(N: Array, slopes: Array) -> Array:

@@ -26,18 +26,9 @@ class NotPositiveDefinite(ArithmeticError):
 
 @dataclass(eq=False)
 class Solution:
-    """Outcome of `conjugate_gradients`.
+    """The last iterate, whether the tolerance was met, and the number of products.
 
-    Attributes
-    ----------
-    x : array
-        The last iterate.
-    converged : bool
-        Whether the tolerance was met.
-    convex : bool
-        False where a direction of negative curvature ended the iteration.
-    steps : int
-        Products with the matrix.
+    ``convex`` is False where a direction of negative curvature ended the iteration.
     """
 
     x: Array
@@ -63,11 +54,8 @@ def conjugate_gradients(
     ----------
     product, precondition : callable
         x -> A x, and an approximation of b -> A^-1 b, on arrays of b's shape.
-    b : array
     tolerance : float
-        Of the residual in the preconditioner's norm, relative to its first
-        value.
-    max_steps : int
+        Of the residual in the preconditioner's norm, relative to its first value.
     start : array, optional
         First iterate; zero by default.
     residual_share : float
@@ -106,11 +94,7 @@ _COARSEST = 400
 """Unknowns at which a dense factor takes over."""
 
 _DEGREE = 2
-"""Of the Chebyshev smoother.
-
-Symmetric Gauss-Seidel takes fewer steps (16 instead of 22 for a beam of 7 857 nodes at
-Poisson's ratio 0.45), but each is slower and it advances one column at a time.
-"""
+"""Of the Chebyshev smoother; Gauss-Seidel takes fewer steps, but one column at a time."""
 
 _SMOOTHED = 8.0
 """Ratio of the largest eigenvalue of D^-1 A to the smallest one that the smoother damps."""
@@ -163,12 +147,8 @@ class _Level:
 class Multigrid:
     """A V-cycle for a symmetric positive definite matrix, in place of a factor.
 
-    Parameters
-    ----------
-    matrix : (n, n) sparse
-    near_nullspace : (n, k), optional
-        Vectors that the matrix hardly resists: the constant by default, which is right
-        for G; a tangent needs the rigid motions.
+    ``near_nullspace`` (n, k) are vectors that the matrix hardly resists: the constant by default,
+    which is right for G; a tangent needs the `rigid_motions`.
 
     Raises
     ------

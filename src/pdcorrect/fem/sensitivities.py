@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem import kernels
+from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.cell_correction import difference
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.energies import elasticity
 from pdcorrect.fem.hyperelasticity import model_name
@@ -74,30 +76,18 @@ def tangent_slopes(
         for j in range(3):
             step = np.zeros((3, 3))
             step[i, j] = _STEP
-            slope[..., i, j] = _difference(lambda t, e=step: contracted(F + t * e)) / _STEP
+            slope[..., i, j] = difference(lambda t, e=step: contracted(F + t * e)) / _STEP
     change = _STEP * body.materials.young
-    by_mu = _difference(lambda t: contracted(F, mu + t * change, omega)).sum(axis=1) / change
-    by_omega = _difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
+    by_mu = difference(lambda t: contracted(F, mu + t * change, omega)).sum(axis=1) / change
+    by_omega = difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
     by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
-    flat = cells.ravel()
-    by_shape = [np.bincount(flat, by_cell[..., i].ravel(), minlength=len(x)) for i in range(3)]
-    return np.stack(by_shape, axis=1), by_mu, by_omega
-
-
-def _difference(function) -> Array:  # type: ignore[no-untyped-def]
-    """Derivative at 0 of a function of t by central differences of fourth order, t = 1, 2."""
-    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
+    return scatter(cells, by_cell, len(x)), by_mu, by_omega
 
 
 class Following:
-    """Internal modes that follow the nodes, in equilibrium, at a configuration y.
+    """Internal modes that follow the nodes, in equilibrium, at a configuration (N + B, 3).
 
-    Parameters
-    ----------
-    body : ElasticBody
-    configuration : (N + B, 3)
-    project : bool
-        Whether their tangent is the projected one.
+    With ``project`` by their projected tangent.
     """
 
     def __init__(self, body: ElasticBody, configuration: Array, project: bool = False) -> None:
