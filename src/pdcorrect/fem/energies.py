@@ -283,7 +283,7 @@ def _spread(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 def _decompose(flat: Array) -> tuple[Array, ...]:
     """U (9, L), s (3, L), V (9, L) of matrices (9, L), and room for v (3, L) and k (L,)."""
-    U, s, V, B, S, v, k = scratch(flat.shape[1])
+    _, U, V, B, S, s, v, k = scratch(flat.shape[1])
     signed_svd_lanes(flat, U, s, V, B, S)
     return U, s, V, v, k
 
