@@ -105,11 +105,9 @@ def _candidates(positions: Array, cells: Index) -> Iterator[Index]:
 
 
 def _numbers(order: Index, free: NDArray[np.bool_]) -> Index:
-    number = np.full(free.shape, -1)
     inside = free[order]
-    ranked = np.full(free.shape, -1)
-    ranked[inside] = np.arange(inside.sum())
-    number[order] = ranked
+    number = np.empty(free.shape, dtype=np.int64)
+    number[order] = np.where(inside, np.cumsum(inside).reshape(inside.shape) - 1, -1)
     return number
 
 

@@ -153,14 +153,16 @@ class CellCorrection:
             H = alone.tangent(v, project=True).matrices
             return np.asarray((np.swapaxes(along, 1, 2) @ H @ across)[:, 0, 0])
 
+        def along_way(way: Array) -> Array:
+            return difference(lambda t: contracted(u_of + t * way))
+
         step = _STEP * self.sizes[:, None, None]
         slopes = np.empty((len(self.cells), 7, 3))
         for a in range(7):
             for i in range(3):
                 way = np.zeros((*self.cells.shape, 3))
                 way[..., i] = (step * unit)[..., a]
-                moved = way.reshape(-1, 3)
-                slopes[:, a, i] = difference(lambda t, way=moved: contracted(u_of + t * way))
+                slopes[:, a, i] = along_way(way.reshape(-1, 3))
         by_cell = np.swapaxes(self.shapes, 1, 2) @ (slopes / step)
         return self._gathered(u, by_cell), _symmetric_products(self.rates(u, x), self.rates(u, z))
 

@@ -183,19 +183,27 @@ class ElasticBody:
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
-        assembly, u = self.assembly, self._displacement(configuration)
-        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
-        forces = np.empty_like(u)
-        kernels.energy_and_forces(
-            self.materials.model, u, assembly.cells, self.quadrature.lanes,
-            self.point_weights, self.quadrature.first_volume, energy, by_cell,
-            assembly.start, assembly.slots, forces,
-        )  # fmt: skip
+        u = self._displacement(configuration)
+        energy, _, forces = self.element_forces(u, self.point_weights)
         total = float(energy.sum())
         if self.correction is not None:
             more, added = self.correction.energy_and_forces(u)
             total, forces = total + more, forces + added
         return total, forces
+
+    def element_forces(self, u: Array, weights: Array) -> tuple[Array, Array, Array]:
+        """Energy (C,), forces by cell (C, L, 3) and forces (N + B, 3) of the element alone.
+
+        For displacements u (N + B, 3), m, and ``weights`` like `point_weights`.
+        """
+        assembly, quadrature = self.assembly, self.quadrature
+        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
+        forces = np.empty_like(u)
+        kernels.energy_and_forces(
+            self.materials.model, u, assembly.cells, quadrature.lanes, weights,
+            quadrature.first_volume, energy, by_cell, assembly.start, assembly.slots, forces,
+        )  # fmt: skip
+        return energy, by_cell, forces
 
     def volume_ratios(self, positions: Array) -> Array:
         """Smallest det F over the quadrature points of each cell, (C,).

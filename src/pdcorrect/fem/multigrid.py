@@ -217,9 +217,6 @@ def rigid_motions(x: Array) -> Array:
     """Translations and linearised rotations of points x (N, 3): (3 N, 6), of similar size."""
     x = x - x.mean(axis=0)
     x = x / max(float(np.abs(x).max()), 1e-300)
-    out = np.zeros((len(x), 3, 6))
-    out[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        out[:, i, 3 + axis], out[:, j, 3 + axis] = -x[:, j], x[:, i]
-    return out.reshape(-1, 6)
+    translations = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    rotations = np.cross(np.eye(3)[:, None], x).transpose(1, 2, 0)
+    return np.concatenate([translations, rotations], axis=2).reshape(-1, 6)
