@@ -137,8 +137,7 @@ class ElementWriter:
         matrices, masses = np.zeros((count, STRAINS, STRAINS)), np.zeros((count, 8, 8))
         if learned.any():
             S, R = (bounded(N) for N in self._answers(graph, learned))
-            stiff, heavy = self._roots(mu, omega)
-            stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+            stiff, heavy = self._roots(mu, omega, learned)
             matrices[learned] = stiff @ S @ stiff
             masses[learned] = np.swapaxes(heavy, 1, 2) @ R @ heavy
         back, cell = self._back, np.arange(count)[:, None, None]
@@ -170,8 +169,7 @@ class ElementWriter:
         S, R = bounded(N), bounded(H)
 
         def own(mu: Array, omega: Array) -> Array:
-            stiff, heavy = self._roots(mu, omega)
-            stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+            stiff, heavy = self._roots(mu, omega, learned)
             out = np.zeros(len(learned))
             out[learned] = np.einsum("cij,cij->c", G, stiff @ S @ stiff)
             out[learned] += np.einsum("cij,cij->c", J, np.swapaxes(heavy, 1, 2) @ R @ heavy)
@@ -182,8 +180,7 @@ class ElementWriter:
             difference(lambda t: own(mu + t * step, omega)) / step,
             difference(lambda t: own(mu, omega + t * step)) / step,
         ]
-        stiff, heavy = self._roots(mu, omega)
-        stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+        stiff, heavy = self._roots(mu, omega, learned)
         original, own_cells = self._images.original, np.flatnonzero(learned)
         by_N, by_H = (np.zeros((len(original), *x.shape[1:])) for x in (N, H))
         by_N[own_cells] = _bounded_transposed(N, stiff @ G @ stiff)
@@ -257,8 +254,11 @@ class ElementWriter:
         N[inside, :6], N[inside, :, :6] = 0.0, 0.0
         return N, H
 
-    def _roots(self, mu: Array, omega: Array) -> tuple[Array, Array]:
-        """C^1/2 of stiffness (C, 18, 18) and of mass (C, 7, 7); like cells share the work."""
+    def _roots(self, mu: Array, omega: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """C^1/2 of stiffness (c, 18, 18), and of mass by a scalar's corner values (c, 7, 8).
+
+        Of the learned cells; like cells share the work.
+        """
         body, grid = self._body, self._grid
         values = np.column_stack([mu, omega, grid.order])
         if not body.quadrature.alike_gradients:
@@ -270,7 +270,8 @@ class ElementWriter:
         cells = blocks.transpose(0, 1, 3, 2, 4).reshape(-1, 24, 24)
         masses = body.space.cell_masses("averaged")[first][pairs]
         stiff = root(own_stiffness(cells, strain_map(self._shapes[first])))
-        return stiff[inverse.ravel()], root(own_mass(masses))[inverse.ravel()]
+        which = inverse.ravel()[learned]
+        return stiff[which], root(own_mass(masses))[which] @ scalar_map()
 
 
 def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.int64]) -> Array:
