@@ -252,7 +252,7 @@ def transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
                 out[3 * i + j, q] = total
 
 
-@njit(**OPTIONS)
+@njit(inline="always", **OPTIONS)
 def unit_change(gradient, i, U, V, out):  # type: ignore[no-untyped-def]
     """Out (9, Q) = U^T (e_i x grad N) V: the change of F by a shape function's component i."""
     for a in range(3):
