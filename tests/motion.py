@@ -6,15 +6,18 @@ import numpy as np
 
 from pdcorrect.fem.mesh import refine as cut
 from pdcorrect.fem.mesh import voxel_mesh
-from pdcorrect.scene import voxels
+from pdcorrect.scene import Cross
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
 
 def cross_mesh(refine=1):
     """14 coarse cells, not symmetric in any direction."""
-    solid, origin = voxels.cross((6, 1, 2), 2, 3, 1, 2)
-    return cut(voxel_mesh(solid, origin, 0.05), refine)
+    body = Cross(
+        shape="cross", cell_size=0.05, cells=(6, 1, 2), arms=2, arm_start=3, arm_width=1,
+        arm_length=2,
+    )  # fmt: skip
+    return cut(voxel_mesh(*body.occupancy(), 0.05), refine)
 
 
 def moved(points, time, angle):

@@ -1,5 +1,7 @@
 """The learned element with any network: what holds by construction, and how solvers take it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from pdcorrect.elements.answers import VoxelMesh, unit_cell
 from pdcorrect.elements.linear import unit_strains
 from pdcorrect.errors import PdcorrectWarning, SceneError
 from pdcorrect.fem import element_network, learned
+from pdcorrect.fem.assembly import summed_cells
 from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
 from pdcorrect.fem.cube_symmetry import PATTERNS, group, on_scalars, on_strains
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh
@@ -45,6 +48,17 @@ def any_network():
 
 def learned_problem(scene):
     return pc.discretise(pc.learned_coarse(scene))
+
+
+def with_correction(problem, matrices, masses):
+    """The same problem with other matrices K and masses in its cells."""
+    own = problem.correction
+    more = problem.materials.density[:, None, None] * (masses - own.masses)
+    return replace(
+        problem,
+        correction=replace(own, writer=None, matrices=matrices, masses=masses),
+        mass_matrix=problem.mass_matrix + summed_cells(problem.cells, more, len(problem.mass)),
+    )
 
 
 def u_shape():
@@ -327,7 +341,7 @@ def test_viscosity_is_of_the_stiffness_without_learned_volume():
     rest = problem.extended(problem.positions)
     blocks = objective.viscous.tangent(rest).blocks()
     own = problem.correction
-    shearing = problem.with_correction(own.without_volume().matrices, own.masses)
+    shearing = with_correction(problem, own.without_volume().matrices, own.masses)
     K = shearing.linearise(rest).blocks()
     assert blocks == pytest.approx(objective.viscous.rate * K, abs=1e-9 * np.abs(blocks).max())
 
@@ -339,7 +353,7 @@ def test_no_force_drives_a_cell_into_the_fades(poisson):
     problem = learned_problem(beam((1, 1, 1), 1.0, material=material, clamps=[], loads=[]))
     C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
     own = problem.correction
-    problem = problem.with_correction(learned.BOUND * C[None], own.masses)
+    problem = with_correction(problem, learned.BOUND * C[None], own.masses)
     X, cell = problem.positions, problem.cells[0]
     ways = [-X * np.isin(range(3), axes) for axes in ([0], [0, 1], [0, 1, 2])]
     ways.append(X * [1.5, -0.3, -0.3])
@@ -361,7 +375,7 @@ def test_cells_drawn_out_in_two_directions_have_a_shallow_well(poisson, most):
     material = {"young": 1.0, "poisson": poisson, "density": 1.0}
     problem = learned_problem(beam((1, 1, 1), 1.0, material=material, clamps=[], loads=[]))
     C = learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
-    stiffest = problem.with_correction(learned.BOUND * C[None], problem.correction.masses)
+    stiffest = with_correction(problem, learned.BOUND * C[None], problem.correction.masses)
     X = problem.positions
     for way, bound in ((X * [1.0, 1.0, -0.6], most), (X * [1.0, -0.5, -0.5], 0.0)):
         energies = np.array([stiffest.energy(X + t * way) for t in np.linspace(0.0, 0.98, 60)])
@@ -380,7 +394,7 @@ def test_viscosity_takes_energy_however_soft_the_matrices(poisson, rng):
     own, a, h = problem.correction, problem.cell_size, 1e-6
     C = 1e5 * a * learned.own_stiffness(unit_cell(poisson)[0], unit_strains())
     softest = np.tile(-learned.BOUND * C, (len(own.matrices), 1, 1))
-    problem = problem.with_correction(softest, own.masses)
+    problem = with_correction(problem, softest, own.masses)
     X, free = problem.positions, problem.free * a
     motions = [
         (X + size * free * rng.normal(size=X.shape), free * rng.normal(size=X.shape))
@@ -413,7 +427,7 @@ def test_derivatives_by_the_matrices(damping):
     dK, dM = dK + np.swapaxes(dK, 1, 2), dM + np.swapaxes(dM, 1, 2)
 
     def after(t):
-        changed = problem.with_correction(own.matrices + t * dK, own.masses + t * dM)
+        changed = with_correction(problem, own.matrices + t * dK, own.masses + t * dM)
         stepper = pc.ProjectiveDynamics(changed, tolerance=1e-12)
         return stepper, stepper(state)
 

@@ -11,18 +11,32 @@ from pdcorrect.fem.mesh import (
     VTK_EDGES,
     VTK_FACES,
     HexMesh,
-    _distinct_rows,
     boundary_faces,
     coincident_nodes,
     corner_jacobians,
     refine,
     voxel_mesh,
 )
-from pdcorrect.scene import voxels
+from pdcorrect.fem.mesh_checks import row_groups
+from pdcorrect.scene import Cross, Voxels, Weight
+
+
+def cross(cells, arms, start, width, length):
+    return Cross(
+        shape="cross", cell_size=0.05, cells=cells, arms=arms, arm_start=start, arm_width=width,
+        arm_length=length,
+    ).occupancy()  # fmt: skip
+
+
+def weight(support, second, start, pendulum, below, inflated):
+    return Weight(
+        shape="weight", cell_size=0.05, support_cells=support, second_support_length=second,
+        pendulum_start=start, pendulum_cells=pendulum, weight_start=below, weight_cells=inflated,
+    ).occupancy()  # fmt: skip
 
 
 def cross_mesh():
-    return voxel_mesh(*voxels.cross((6, 2, 2), 4, 3, 2, 1), 0.05)
+    return voxel_mesh(*cross((6, 2, 2), 4, 3, 2, 1), 0.05)
 
 
 def distorted_mesh():
@@ -145,12 +159,12 @@ def test_boundary_faces_point_outwards_and_close_the_body():
 
 
 def test_shapes_have_the_cells_they_promise():
-    solid, corner = voxels.cross((10, 2, 2), 4, 3, 2, 4)
+    solid, corner = cross((10, 2, 2), 4, 3, 2, 4)
     assert solid.sum() == 10 * 4 + 4 * 4 * 4
     assert corner == (0, 4, 4)
-    solid, corner = voxels.cross((10, 2, 2), 2, 3, 2, 4)
+    solid, corner = cross((10, 2, 2), 2, 3, 2, 4)
     assert solid.sum() == 10 * 4 + 2 * 4 * 4
-    solid, corner = voxels.weight((8, 2, 2), 6, 3, (2, 2, 7), 3, (4, 4, 2))
+    solid, corner = weight((8, 2, 2), 6, 3, (2, 2, 7), 3, (4, 4, 2))
     assert solid.sum() == 8 * 4 + (6 * 4 - 2 * 4) + 2 * 2 * 7 + (16 - 4) * 2
     np.testing.assert_array_equal(solid, solid[:, ::-1])  # symmetric across y
 
@@ -158,12 +172,15 @@ def test_shapes_have_the_cells_they_promise():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: voxels.cross((6, 2, 2), 4, 5, 2, 1), "at most the 6 cells"),
-        (lambda: voxels.weight((4, 2, 2), 0, 3, (2, 2, 4), 0, (2, 2, 2)), "at most the 4"),
-        (lambda: voxels.weight((8, 2, 2), 0, 3, (2, 2, 4), 3, (2, 2, 2)), "at most the 4"),
-        (lambda: voxels.weight((8, 2, 2), 0, 3, (2, 2, 4), 0, (3, 2, 2)), "even number"),
-        (lambda: voxels.weight((8, 2, 2), 5, 3, (2, 2, 4), 0, (2, 2, 2)), "second_support_length"),
-        (lambda: voxels.voxels(np.zeros((2, 2, 2))), "at least one 1"),
+        (lambda: cross((6, 2, 2), 4, 5, 2, 1), "at most the 6 cells"),
+        (lambda: weight((4, 2, 2), 0, 3, (2, 2, 4), 0, (2, 2, 2)), "at most the 4"),
+        (lambda: weight((8, 2, 2), 0, 3, (2, 2, 4), 3, (2, 2, 2)), "at most the 4"),
+        (lambda: weight((8, 2, 2), 0, 3, (2, 2, 4), 0, (3, 2, 2)), "even number"),
+        (lambda: weight((8, 2, 2), 5, 3, (2, 2, 4), 0, (2, 2, 2)), "second_support_length"),
+        (
+            lambda: Voxels(shape="voxels", cell_size=1.0, occupancy=[[[0, 0]]]).occupancy(),
+            "at least one 1",
+        ),
     ],
 )
 def test_impossible_shapes_are_refused(call, words):
@@ -192,9 +209,10 @@ def test_bad_meshes_are_refused_with_the_place():
         coincident_nodes(mesh.positions, mesh.positions + 0.01, 1e-9)
 
 
-def test_distinct_rows_are_those_of_numpy_in_its_order():
+def test_equal_rows_are_grouped_as_numpy_does_and_in_its_order():
     rows = np.random.default_rng(0).integers(0, 3, (500, 4))
-    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    found = _distinct_rows(rows)
-    assert (found[0] == first).all()
-    assert (found[1] == inverse.ravel()).all()
+    _, first, counts = np.unique(rows, axis=0, return_index=True, return_counts=True)
+    order, starts, found = row_groups(rows)
+    assert (order[starts] == first).all()
+    assert (found == counts).all()
+    assert (rows[order] == np.repeat(rows[first], counts, axis=0)).all()

@@ -14,8 +14,8 @@ from skfem import (
 import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
-from pdcorrect.fem.clamps import cofactor, torsion_field
 from pdcorrect.fem.elastic_body import ElasticBody
+from pdcorrect.fem.loads import cofactor, torsion_field
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import VTK_CORNERS
 from pdcorrect.fem.operators import Space, lumped

@@ -7,7 +7,7 @@ import pytest
 
 import pdcorrect as pc
 from pdcorrect.errors import PdcorrectWarning
-from pdcorrect.fem.thin_cells import bending_alone
+from pdcorrect.fem.mesh import bending_alone
 
 WALL = {"region": {"plane": "x", "at": "min"}}
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sp
@@ -12,7 +10,6 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem import kernels
-from pdcorrect.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
 
@@ -20,11 +17,8 @@ Array = NDArray[np.float64]
 class Assembly:
     """Connectivity of ``cells`` (C, K) between ``count`` nodes.
 
-    Attributes
-    ----------
-    cells : (C, K)
-    start : (count + 1,), slots : (C K,)
-        The places of each node in the raveled cells, compressed rows.
+    ``start`` (count + 1,) and ``slots`` (C K,) are the places of each node in the raveled cells, as
+    compressed rows.
     """
 
     def __init__(self, cells: NDArray[np.int64], count: int) -> None:
@@ -58,58 +52,15 @@ class Assembly:
         return indptr.astype(np.int32), (keys % self._count).astype(np.int32), place.ravel()
 
 
-class MoreTangent(Protocol):
-    """A second derivative that is added to that of the quadrature points."""
-
-    def apply(self, x: Array) -> Array:
-        """Times x (N, 3)."""
-
-    def add_to(self, blocks: Array) -> None:
-        """Add the cells' matrices to blocks (C, L, L, 3, 3)."""
+def summed_cells(cells: NDArray[np.int64], blocks: Array, count: int) -> sp.csr_matrix:
+    """Matrices of the cells (C, K, K) summed into (count, count)."""
+    width = cells.shape[1]
+    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
+    return sp.csr_matrix(sp.coo_matrix((blocks.ravel(), (rows, columns)), shape=(count, count)))
 
 
-@dataclass(frozen=True, eq=False)
-class Linearisation:
-    """The tangent of the elastic energy at one state, see `kernels.linearise_cells`.
-
-    Attributes
-    ----------
-    left, right : (C, 9, Q)
-        Factors of the signed SVD of F.
-    tangent : (C, 12, Q)
-        Tangent in their frame times the volumes, J.
-    correction : MoreTangent, optional
-        That of a learned element's own energy.
-    """
-
-    assembly: Assembly
-    quadrature: Quadrature
-    left: Array
-    right: Array
-    tangent: Array
-    correction: MoreTangent | None = None
-
-    def apply(self, x: Array) -> Array:
-        """Tangent times x, both (N, 3), without assembling."""
-        self.assembly.check(x)
-        assembly, out = self.assembly, np.empty_like(x)
-        kernels.apply_linearised(
-            x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
-            np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
-        )  # fmt: skip
-        return out if self.correction is None else out + self.correction.apply(x)
-
-    def assemble(self) -> sp.csr_matrix:
-        """The tangent as a sparse matrix (3N, 3N), N/m."""
-        return self.assembly.matrix(self.blocks())
-
-    def blocks(self) -> Array:
-        """The tangent of each cell, (C, L, L, 3, 3), N/m."""
-        count, width = self.assembly.cells.shape
-        blocks = np.empty((count, width, width, 3, 3))
-        kernels.cell_stiffness(
-            self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
-        )
-        if self.correction is not None:
-            self.correction.add_to(blocks)
-        return blocks
+def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:
+    """Sum cell-wise nodal values (C, K, 3) into (count, 3)."""
+    flat = cells.ravel()
+    columns = [np.bincount(flat, values[..., i].ravel(), minlength=count) for i in range(3)]
+    return np.stack(columns, axis=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -25,13 +26,7 @@ _NO_SHIFT = np.empty((0, 18))
 
 
 class Writer(Protocol):
-    """Writes corrections from the weights mu and omega of each cell, (C,), Pa.
-
-    Attributes
-    ----------
-    digest : str
-        Of what it was trained to write.
-    """
+    """Writes corrections from the weights mu and omega of each cell, (C,), Pa."""
 
     digest: str
 
@@ -143,11 +138,7 @@ class CellCorrection:
     def rates(self, u: Array, x: Array) -> Array:
         """Change (C, 18) of the strains by x, by differences of fourth order."""
         step = _STEP * self.sizes.mean() / max(float(np.abs(x).max()), 1e-300)
-        ahead, behind = (
-            8.0 * self.strains(u + step * s * x) - self.strains(u + 2.0 * step * s * x)
-            for s in (1.0, -1.0)
-        )
-        return np.asarray((ahead - behind) / (12.0 * step))
+        return difference(lambda t: self.strains(u + t * step * x)) / step
 
     def tangent_slopes(self, u: Array, x: Array, z: Array) -> tuple[Array, Array]:
         """Derivatives of x . K z, K the projected tangent at u: by u, and by the matrices.
@@ -166,18 +157,16 @@ class CellCorrection:
             H = alone.tangent(v, project=True).matrices
             return np.asarray((np.swapaxes(along, 1, 2) @ H @ across)[:, 0, 0])
 
+        def along_way(way: Array) -> Array:
+            return difference(lambda t: contracted(u_of + t * way))
+
         step = _STEP * self.sizes[:, None, None]
         slopes = np.empty((len(self.cells), 7, 3))
         for a in range(7):
             for i in range(3):
                 way = np.zeros((*self.cells.shape, 3))
                 way[..., i] = (step * unit)[..., a]
-                way = way.reshape(-1, 3)
-                ahead, behind = (
-                    8.0 * contracted(u_of + s * way) - contracted(u_of + 2.0 * s * way)
-                    for s in (1.0, -1.0)
-                )
-                slopes[:, a, i] = (ahead - behind) / 12.0
+                slopes[:, a, i] = along_way(way.reshape(-1, 3))
         by_cell = np.swapaxes(self.shapes, 1, 2) @ (slopes / step)
         return self._gathered(u, by_cell), _symmetric_products(self.rates(u, x), self.rates(u, z))
 
@@ -202,6 +191,11 @@ class CellCorrection:
         return Assembly(self.cells, int(self.cells.max()) + 1)
 
 
+def difference(function: Callable[[float], Array]) -> Array:
+    """Derivative at 0 of a function of t, by central differences of fourth order, t = 1, 2."""
+    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
+
+
 def without_trace(z: Array) -> Array:
     """Strains (..., 18) whose first three numbers have no mean."""
     out = z.copy()
@@ -218,10 +212,7 @@ def _symmetric_products(a: Array, b: Array) -> Array:
 class CorrectionTangent:
     """The second derivative of a correction's energy at one configuration.
 
-    Attributes
-    ----------
-    matrices : (C, 21, 21)
-        By the amplitudes of the cells' shapes, N/m.
+    ``matrices`` (C, 21, 21), N/m, are by the amplitudes of the cells' shapes.
     """
 
     correction: CellCorrection

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
@@ -18,16 +18,9 @@ _TOLERANCE = 1e-6
 
 
 class Selector:
-    """Resolves regions on one mesh.
+    """Resolves regions on one mesh, whose element has nodes at ``positions`` (N, 3) at rest, m.
 
-    Parameters
-    ----------
-    mesh : HexMesh
-    positions : (N, 3)
-        Rest positions of all element nodes, m; the first ones may be the
-        mesh's corners.
-    cell_size : float
-        Coarse cell size, m, the unit of the geometric tolerance.
+    The coarse ``cell_size``, m, is the unit of the geometric tolerance.
     """
 
     def __init__(self, mesh: HexMesh, positions: NDArray[np.float64], cell_size: float) -> None:
@@ -95,16 +88,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Clamps:
-    """Clamped components of all nodes.
+    """Components (N, 3) that are free, rest positions (N, 3), m, and the clamps that move.
 
-    Attributes
-    ----------
-    free : (N, 3) bool
-        Components that may move.
-    rest : (N, 3)
-        Rest positions, m.
-    moving : tuple of (nodes, components, Course)
-        Clamps with a prescribed motion.
+    Those by their nodes, components and course.
     """
 
     free: NDArray[np.bool_]
@@ -131,13 +117,7 @@ class Clamps:
 
 
 def resolve_clamps(clamps: tuple[Clamp, ...], selector: Selector, rest: Array) -> Clamps:
-    """Find the clamped components.
-
-    Raises
-    ------
-    SceneError
-        If a region selects nothing or two clamps move a component differently.
-    """
+    """Find the clamped components; two clamps may not move one differently."""
     owner = np.full(rest.shape, -1)
     moving = []
     for i, clamp in enumerate(clamps):
@@ -167,75 +147,16 @@ class Course:
     def __init__(self, motion: Motion) -> None:
         self._times = np.array(motion.times)
         self._angles = None if motion.rotation is None else np.array(motion.rotation)
-        self._axis, self._centre = "xyz".index(motion.axis), np.array(motion.centre)
+        self._axis, self._centre = motion.axis, np.array(motion.centre)
         self._ways = () if motion.displacement is None else tuple(np.array(motion.displacement).T)
 
     def __call__(self, points: Array, time: float) -> Array:
         """``points`` (n, 3) rotated and displaced as prescribed for a time (s)."""
         out = points
         if self._angles is not None:
-            angle = math.radians(float(np.interp(time, self._times, self._angles)))
-            out = self._centre + (points - self._centre) @ _rotation(self._axis, angle).T
+            angle = np.interp(time, self._times, self._angles)
+            turn = Rotation.from_euler(self._axis, angle, degrees=True)
+            out = self._centre + turn.apply(points - self._centre)
         if self._ways:
             out = out + [np.interp(time, self._times, way) for way in self._ways]
         return out
-
-
-def _rotation(axis: int, angle: float) -> Array:
-    matrix = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix[i, i] = matrix[j, j] = math.cos(angle)
-    matrix[j, i] = math.sin(angle)
-    matrix[i, j] = -math.sin(angle)
-    return matrix
-
-
-_ON_AXIS = 1e-9
-"""Distance from the axis, of the body's extent, that is taken as zero."""
-
-
-def torsion_field(points: Array, attraction: float, stretch: float) -> Array:
-    """Unit rotational field of the thesis, eq. 6-1 to 6-3, at ``points`` (..., 3).
-
-    f = (stretch, -z - attraction y, y - attraction z) / |...|, and 0 where the
-    numerator vanishes (on the axis with no stretch) or is only a rounding error
-    of the coordinates.
-    """
-    f, length = _torsion_vectors(points, attraction, stretch)
-    return np.divide(f, length, out=np.zeros_like(f), where=length > 0.0)
-
-
-def torsion_pull(points: Array, attraction: float, stretch: float, x: Array) -> Array:
-    """Derivatives of x . `torsion_field` by the points (..., 3); zero where the field is."""
-    f, length = _torsion_vectors(points, attraction, stretch)
-    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0.0)
-    f = f * inverse
-    rest = (x - f * (f * x).sum(axis=-1, keepdims=True)) * inverse  # d|f|^-1 f
-    out = np.zeros_like(points)
-    out[..., 1] = rest[..., 2] - attraction * rest[..., 1]
-    out[..., 2] = -rest[..., 1] - attraction * rest[..., 2]
-    return out
-
-
-def _torsion_vectors(points: Array, attraction: float, stretch: float) -> tuple[Array, Array]:
-    """The field before it is scaled, and its lengths (..., 1), 0 where it is only round-off."""
-    y, z = points[..., 1], points[..., 2]
-    f = np.stack([np.full_like(y, stretch), -z - attraction * y, y - attraction * z], axis=-1)
-    length = np.linalg.norm(f, axis=-1, keepdims=True)
-    rounding = _ON_AXIS * np.abs(points).max(initial=0.0)
-    return f, np.where(length > rounding, length, 0.0)
-
-
-def cofactor(F: Array) -> Array:
-    """Cofactor matrix det(F) F^-T of (..., 3, 3), also for singular F."""
-    rows = [np.cross(F[..., (i + 1) % 3, :], F[..., (i + 2) % 3, :]) for i in range(3)]
-    return np.stack(rows, axis=-2)
-
-
-def tensor_cross(A: Array, B: Array) -> Array:
-    """Derivative of `cofactor` at A in the direction B, (..., 3, 3); symmetric in both."""
-    rows = []
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        rows.append(np.cross(A[..., j, :], B[..., k, :]) + np.cross(B[..., j, :], A[..., k, :]))
-    return np.stack(rows, axis=-2)

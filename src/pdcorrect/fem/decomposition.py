@@ -35,48 +35,52 @@ _LARGE_VOLUME = 4.0
 
 
 @njit(inline="always", **OPTIONS)
+def _jacobi(a, b, d):  # type: ignore[no-untyped-def]
+    """Cosine, sine and tangent of the rotation that makes [[a, d], [d, b]] diagonal."""
+    gap = b - a
+    tangent = math.copysign(2.0, gap) * d
+    tangent /= abs(gap) + math.sqrt(gap * gap + 4.0 * d * d) + 1e-300
+    cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+    return cosine, tangent * cosine, tangent
+
+
+@njit(inline="always", **OPTIONS)
+def _turn(A, p, q, cosine, sine, l):  # type: ignore[no-untyped-def]
+    """Turn columns p and q of A in lane l."""
+    for i in range(3):
+        x, y = A[3 * i + p, l], A[3 * i + q, l]
+        A[3 * i + p, l] = cosine * x - sine * y
+        A[3 * i + q, l] = sine * x + cosine * y
+
+
+@njit(inline="always", **OPTIONS)
 def _rotate(S, V, p, q, pq, pr, qr):  # type: ignore[no-untyped-def]
     """Jacobi rotation that zeroes entry (p, q) of S = [00 11 22 01 02 12] in every lane."""
     for l in range(S.shape[1]):
-        a, b, d = S[p, l], S[q, l], S[pq, l]
-        e, f = S[pr, l], S[qr, l]
-        gap = b - a
-        tangent = math.copysign(2.0, gap) * d
-        tangent /= abs(gap) + math.sqrt(gap * gap + 4.0 * d * d) + 1e-300
-        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
-        sine = tangent * cosine
+        a, b, d, e, f = S[p, l], S[q, l], S[pq, l], S[pr, l], S[qr, l]
+        cosine, sine, tangent = _jacobi(a, b, d)
         S[p, l] = a - tangent * d
         S[q, l] = b + tangent * d
         S[pq, l] = 0.0
         S[pr, l] = cosine * e - sine * f
         S[qr, l] = sine * e + cosine * f
-        for i in range(3):
-            x, y = V[3 * i + p, l], V[3 * i + q, l]
-            V[3 * i + p, l] = cosine * x - sine * y
-            V[3 * i + q, l] = sine * x + cosine * y
+        _turn(V, p, q, cosine, sine, l)
 
 
 @njit(inline="always", **OPTIONS)
 def _order(B, V, i, j):  # type: ignore[no-untyped-def]
     """Exchange columns i < j (one negated, so det V stays +1) where column j is longer."""
     for l in range(B.shape[1]):
-        x0, x1, x2 = B[i, l], B[3 + i, l], B[6 + i, l]
-        y0, y1, y2 = B[j, l], B[3 + j, l], B[6 + j, l]
-        p0, p1, p2 = V[i, l], V[3 + i, l], V[6 + i, l]
-        q0, q1, q2 = V[j, l], V[3 + j, l], V[6 + j, l]
-        swap = y0 * y0 + y1 * y1 + y2 * y2 > x0 * x0 + x1 * x1 + x2 * x2
-        B[i, l] = y0 if swap else x0
-        B[3 + i, l] = y1 if swap else x1
-        B[6 + i, l] = y2 if swap else x2
-        B[j, l] = -x0 if swap else y0
-        B[3 + j, l] = -x1 if swap else y1
-        B[6 + j, l] = -x2 if swap else y2
-        V[i, l] = q0 if swap else p0
-        V[3 + i, l] = q1 if swap else p1
-        V[6 + i, l] = q2 if swap else p2
-        V[j, l] = -p0 if swap else q0
-        V[3 + j, l] = -p1 if swap else q1
-        V[6 + j, l] = -p2 if swap else q2
+        own, other = 0.0, 0.0
+        for a in range(3):
+            own += B[3 * a + i, l] * B[3 * a + i, l]
+            other += B[3 * a + j, l] * B[3 * a + j, l]
+        swap = other > own
+        for a in range(3):
+            x, y = B[3 * a + i, l], B[3 * a + j, l]
+            B[3 * a + i, l], B[3 * a + j, l] = y if swap else x, -x if swap else y
+            x, y = V[3 * a + i, l], V[3 * a + j, l]
+            V[3 * a + i, l], V[3 * a + j, l] = y if swap else x, -x if swap else y
 
 
 @njit(**OPTIONS)
@@ -127,22 +131,13 @@ def signed_svd_lanes(F, U, s, V, B, S):  # type: ignore[no-untyped-def]
 def _polish(B, V):  # type: ignore[no-untyped-def]
     """Make columns 1 and 2 of B orthogonal to their own size, which F^T F cannot resolve."""
     for l in range(B.shape[1]):
-        x0, x1, x2 = B[1, l], B[4, l], B[7, l]
-        y0, y1, y2 = B[2, l], B[5, l], B[8, l]
-        a, b = x0 * x0 + x1 * x1 + x2 * x2, y0 * y0 + y1 * y1 + y2 * y2
-        d = x0 * y0 + x1 * y1 + x2 * y2
-        gap = b - a
-        tangent = math.copysign(2.0, gap) * d
-        tangent /= abs(gap) + math.sqrt(gap * gap + 4.0 * d * d) + 1e-300
-        cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
-        sine = tangent * cosine
+        a, b, d = 0.0, 0.0, 0.0
         for i in range(3):
             x, y = B[3 * i + 1, l], B[3 * i + 2, l]
-            B[3 * i + 1, l] = cosine * x - sine * y
-            B[3 * i + 2, l] = sine * x + cosine * y
-            x, y = V[3 * i + 1, l], V[3 * i + 2, l]
-            V[3 * i + 1, l] = cosine * x - sine * y
-            V[3 * i + 2, l] = sine * x + cosine * y
+            a, b, d = a + x * x, b + y * y, d + x * y
+        cosine, sine, _ = _jacobi(a, b, d)
+        _turn(B, 1, 2, cosine, sine, l)
+        _turn(V, 1, 2, cosine, sine, l)
 
 
 @njit(**OPTIONS)
@@ -181,14 +176,12 @@ def _complete_basis(V, U, s, l):  # type: ignore[no-untyped-def]
             U[i, l] = V[i, l]
         s[0, l], s[1, l], s[2, l] = 0.0, 0.0, 0.0
         return
-    x = U[0:9:3, l].copy()
-    y = V[1:9:3, l].copy()
-    y -= (x[0] * y[0] + x[1] * y[1] + x[2] * y[2]) * x
-    length = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
-    if length < 1e-3:
-        y = V[2:9:3, l].copy()
-        y -= (x[0] * y[0] + x[1] * y[1] + x[2] * y[2]) * x
-        length = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
+    x, y, length = U[0:9:3, l].copy(), U[0:9:3, l].copy(), 0.0
+    for column in range(1, 3):
+        if length < 1e-3:
+            y = V[column:9:3, l].copy()
+            y -= (x[0] * y[0] + x[1] * y[1] + x[2] * y[2]) * x
+            length = math.sqrt(y[0] * y[0] + y[1] * y[1] + y[2] * y[2])
     y /= length
     U[1, l], U[4, l], U[7, l] = y[0], y[1], y[2]
     U[2, l] = x[1] * y[2] - x[2] * y[1]
@@ -285,7 +278,9 @@ def _smallest_stretch_large(s1, s2, s3):  # type: ignore[no-untyped-def]
     return best
 
 
-def scratch(lanes: int) -> tuple[np.ndarray, ...]:
-    """Work arrays U, s, V, B, S, v, k for ``lanes`` matrices."""
-    shapes = [(9, lanes), (3, lanes), (9, lanes), (9, lanes), (6, lanes), (3, lanes), (lanes,)]
-    return tuple(np.empty(shape) for shape in shapes)
+@njit(**OPTIONS)
+def scratch(lanes):  # type: ignore[no-untyped-def]
+    """Work arrays F, U, V, B (9, L), S (6, L), s, v (3, L) and k (L,) for L matrices."""
+    F, U, V = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    B, S = np.empty((9, lanes)), np.empty((6, lanes))
+    return F, U, V, B, S, np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import internal_modes, kernels
-from pdcorrect.fem.assembly import Assembly, Linearisation
-from pdcorrect.fem.cell_correction import CellCorrection
+from pdcorrect.fem.assembly import Assembly, summed_cells
+from pdcorrect.fem.cell_correction import CellCorrection, CorrectionTangent
 from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh
@@ -36,6 +36,47 @@ _NEAR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
+class Linearisation:
+    """The tangent of the elastic energy at one state, see `kernels.linearise_cells`.
+
+    ``left`` and ``right`` (C, 9, Q) are factors of the signed SVD of F, ``tangent`` (C, 12, Q), J,
+    is that in their frame times the volumes, ``correction`` that of a learned element's own energy.
+    """
+
+    assembly: Assembly
+    quadrature: Quadrature
+    left: Array
+    right: Array
+    tangent: Array
+    correction: CorrectionTangent | None = None
+
+    def apply(self, x: Array) -> Array:
+        """Tangent times x, both (N, 3), without assembling."""
+        self.assembly.check(x)
+        assembly, out = self.assembly, np.empty_like(x)
+        kernels.apply_linearised(
+            x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
+            np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
+        )  # fmt: skip
+        return out if self.correction is None else out + self.correction.apply(x)
+
+    def assemble(self) -> sp.csr_matrix:
+        """The tangent as a sparse matrix (3N, 3N), N/m."""
+        return self.assembly.matrix(self.blocks())
+
+    def blocks(self) -> Array:
+        """The tangent of each cell, (C, L, L, 3, 3), N/m."""
+        count, width = self.assembly.cells.shape
+        blocks = np.empty((count, width, width, 3, 3))
+        kernels.cell_stiffness(
+            self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
+        )
+        if self.correction is not None:
+            self.correction.add_to(blocks)
+        return blocks
+
+
+@dataclass(frozen=True, eq=False)
 class ElasticBody:
     """A body that stores elastic energy; it knows neither mass nor time.
 
@@ -44,9 +85,7 @@ class ElasticBody:
     mesh : HexMesh
         Corners, for pictures and refinement.
     space : Space
-        The scalar finite element space.
     quadrature : Quadrature
-        Gradients (C, Q, L, 3), 1/m, and weights (C, Q), m3.
     materials : Materials
     cell_size : float
         Coarse cell size (cube root of the mean cell volume), m: the unit of
@@ -114,8 +153,7 @@ class ElasticBody:
     def energy(self, positions: Array, modes: Array | None = None) -> float:
         """Elastic energy, J, with internal modes in equilibrium.
 
-        From near ``modes`` (B, 3), m, that is quicker.  Last steps may be longer then: what is
-        left is a tenth of them at most, and the energy is flat at the equilibrium.
+        From near ``modes`` (B, 3), m, that is quicker and a little less exact.
         """
         tolerance = None if modes is None else _FLAT
         return self.energy_and_forces(self.relaxed(positions, modes=modes, tolerance=tolerance))[0]
@@ -145,19 +183,27 @@ class ElasticBody:
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
-        assembly, u = self.assembly, self._displacement(configuration)
-        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
-        forces = np.empty_like(u)
-        kernels.energy_and_forces(
-            self.materials.model, u, assembly.cells, self.quadrature.lanes,
-            self.point_weights, self.quadrature.first_volume, energy, by_cell,
-            assembly.start, assembly.slots, forces,
-        )  # fmt: skip
+        u = self._displacement(configuration)
+        energy, _, forces = self.element_forces(u, self.point_weights)
         total = float(energy.sum())
         if self.correction is not None:
             more, added = self.correction.energy_and_forces(u)
             total, forces = total + more, forces + added
         return total, forces
+
+    def element_forces(self, u: Array, weights: Array) -> tuple[Array, Array, Array]:
+        """Energy (C,), forces by cell (C, L, 3) and forces (N + B, 3) of the element alone.
+
+        For displacements u (N + B, 3), m, and ``weights`` like `point_weights`.
+        """
+        assembly, quadrature = self.assembly, self.quadrature
+        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
+        forces = np.empty_like(u)
+        kernels.energy_and_forces(
+            self.materials.model, u, assembly.cells, quadrature.lanes, weights,
+            quadrature.first_volume, energy, by_cell, assembly.start, assembly.slots, forces,
+        )  # fmt: skip
+        return energy, by_cell, forces
 
     def volume_ratios(self, positions: Array) -> Array:
         """Smallest det F over the quadrature points of each cell, (C,).
@@ -175,10 +221,8 @@ class ElasticBody:
     def corner_volume_ratios(self, positions: Array) -> Array:
         """Volume ratios, det F, at the corners of each cell, (C, 8), of the trilinear map of them.
 
-        Folded layers of cells show here first: they may be at a minimum of the energy with
-        det F positive at all quadrature points (`volume_ratios`) and negative at corners,
-        which the energy does not see.  Steppers do not look at corners; of a run,
-        ``problem.corner_volume_ratios(run.positions[-1]).min()`` tells.
+        Folded layers of cells show here first: det F may be positive at all quadrature points
+        (`volume_ratios`) and negative at corners, which neither the energy nor steppers see.
         """
         self._check(positions, len(self.positions))
         corners = self.cells[:, :8]  # VTK order: also of cells with 27 nodes
@@ -217,8 +261,10 @@ class ElasticBody:
         ``volume_scale`` is s.
         """
         shear, volume = self.point_weights[:, 0], self.point_weights[:, 1]
-        coefficient = 2 * shear + volume_scale * volume
-        return self.quadrature.laplacian(coefficient, self.space.local, self.unknowns)
+        lanes, shape = self.quadrature.lanes, (*self.space.local.shape, -1)
+        scaled = lanes * (2 * shear + volume_scale * volume)[:, None, None, :]
+        blocks = lanes.reshape(shape) @ scaled.reshape(shape).transpose(0, 2, 1)
+        return summed_cells(self.space.local, blocks, self.unknowns)
 
     @cached_property
     def assembly(self) -> Assembly:

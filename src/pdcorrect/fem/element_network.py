@@ -37,20 +37,10 @@ _ROWS = 4096
 class Network:
     """The graph network that writes N, by NumPy, in the precision of its weights or single.
 
-    Parameters
-    ----------
-    arrays : dict
-        Weights by name, as `pdcorrect.elements.network` has them.
-    digest : str
-        Of their file.
+    Its weights have the names of `pdcorrect.elements.network`.
 
-    Attributes
-    ----------
-    digest : str
-    shape : (int, int)
-        Numbers of a cell, and of an answer.
-    reach : int
-        How many cells away an answer depends on, along each axis.
+    ``digest`` is that of their file, ``shape`` the numbers of a cell and of an answer, ``reach``
+    how many cells away an answer depends on, along each axis.
     """
 
     def __init__(self, arrays: dict[str, NDArray[Any]], digest: str = "") -> None:
@@ -193,14 +183,9 @@ def _hashed(turned: Iterable[NDArray[Any]]) -> NDArray[np.uint64]:
 
 
 class Halves(NamedTuple):
-    """Lower halves of symmetric matrices (n, n), and what they become when a cell is turned.
+    """Lower halves of symmetric matrices: the number (n, n) of each entry in the half.
 
-    Attributes
-    ----------
-    number : (n, n)
-        Place of each entry in the lower half.
-    places, signs : (48, h)
-        For each symmetry, y = signs * x[places] is the half of the matrix turned back.
+    For each of the 48 symmetries, y = signs * x[places] is the half of the matrix turned back.
     """
 
     number: NDArray[np.int64]
@@ -241,13 +226,7 @@ def _mean_transposed(slopes: Array, half: Halves) -> Array:
 
 @lru_cache(maxsize=1)
 def released() -> Network:
-    """The network that comes with the package.
-
-    Raises
-    ------
-    FileFormatError, FileVersionError
-        See `read_network`.
-    """
+    """The network that comes with the package."""
     return read_network(MODEL)
 
 
@@ -295,13 +274,7 @@ def read_network(path: Path) -> Network:
 
 
 def write_network(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write weights by name, as `pdcorrect.elements.network` has them.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write weights by name, as `pdcorrect.elements.network` has them."""
     from safetensors.numpy import save
 
     write_bytes(path, save(dict(arrays), metadata=KIND))

@@ -267,23 +267,19 @@ def _density_and_stress(
 
 def _weights(mu: ArrayLike, omega: ArrayLike, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Both weights, one a matrix of F."""
-    return _spread("mu", mu, shape), _spread("omega", omega, shape)
-
-
-def _spread(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(value, dtype=np.float64)
     try:
-        return np.broadcast_to(array, shape).flatten()
+        flat = [np.broadcast_to(w, shape).astype(np.float64).ravel() for w in (mu, omega)]
     except ValueError:
         raise InputError(
-            f"{name} has shape {array.shape}: expected a number, or a shape that broadcasts to "
-            f"F's {shape}."
+            f"mu {np.shape(mu)} and omega {np.shape(omega)}: expected numbers, or shapes that "
+            f"broadcast to F's {shape}."
         ) from None
+    return flat[0], flat[1]
 
 
 def _decompose(flat: Array) -> tuple[Array, ...]:
     """U (9, L), s (3, L), V (9, L) of matrices (9, L), and room for v (3, L) and k (L,)."""
-    U, s, V, B, S, v, k = scratch(flat.shape[1])
+    _, U, V, B, S, s, v, k = scratch(flat.shape[1])
     signed_svd_lanes(flat, U, s, V, B, S)
     return U, s, V, v, k
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError
+from pdcorrect.fem.multigrid import Multigrid, conjugate_gradients
 from pdcorrect.fem.multigrid import NotPositiveDefinite as NotPositiveDefinite
-from pdcorrect.fem.multigrid import conjugate_gradients
 
 Array = NDArray[np.float64]
 Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
@@ -31,16 +31,12 @@ Backend = Literal["auto", "band", "cholespy", "splu", "amg"]
 _AMG_TOLERANCE = 1e-12
 _AMG_STEPS = 500
 LARGEST_DIRECT = 100_000
-"""Rows of G, or nodes of a tangent, above which multigrid takes over.
-
-For a matrix of which no more than the size is known: a slender beam's step takes less time
-with multigrid at 180 000 nodes, and more at 56 000 (``benchmarks``, case growth).
-"""
+"""Nodes above which multigrid takes over where no more is known (``benchmarks``, case growth)."""
 LARGEST_BANDWIDTH = 1000
 """Unknowns of a `BandOrder`'s half bandwidth above which multigrid takes over for G.
 
 Size alone does not decide: a step takes less time with multigrid for a block of 6 859 nodes
-(1 085), and more for a block of 2 197 (509) and a beam of 55 777 (923; case growth).
+(1 085), and more for a beam of 55 777 (923; case growth).
 """
 MEMORY_SHARE = 0.5
 """Share of the memory that may be used which a factor may be expected to take."""
@@ -110,27 +106,14 @@ class LUFactor:
 class MultigridSolver:
     """Conjugate gradients preconditioned by smoothed aggregation, to near machine accuracy.
 
-    The columns of a right-hand side advance together, as one system.
-
-    Parameters
-    ----------
-    matrix, near_nullspace
-        See `factorise`.
-
-    Attributes
-    ----------
-    hierarchy : Multigrid
-    steps : int
-        Conjugate gradient steps of the last solve.
+    The columns of a right-hand side advance together; ``steps`` are those of the last solve.
     """
 
     backend = "amg"
 
     def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
-        from pdcorrect.fem.multigrid import Multigrid  # pyamg only where it is needed
-
         self._matrix = sp.csr_matrix(matrix)
-        self.hierarchy = Multigrid(self._matrix, near_nullspace)
+        self._cycle = Multigrid(self._matrix, near_nullspace)
         self.steps = 0
 
     def solve(self, b: Array) -> Array:
@@ -138,12 +121,9 @@ class MultigridSolver:
         if not np.isfinite(b).all():  # as the direct back ends do
             return np.full_like(b, np.nan)
         found = conjugate_gradients(
-            self._matrix.__matmul__,
-            b.reshape(len(b), -1),
-            self.hierarchy.cycle,
-            tolerance=_AMG_TOLERANCE,
-            max_steps=_AMG_STEPS,
-        )
+            self._matrix.__matmul__, b, self._cycle.solve,
+            tolerance=_AMG_TOLERANCE, max_steps=_AMG_STEPS,
+        )  # fmt: skip
         self.steps = found.steps
         if not found.convex:
             raise NotPositiveDefinite("multigrid-preconditioned CG met negative curvature")
@@ -151,22 +131,7 @@ class MultigridSolver:
             raise NotPositiveDefinite(
                 f"multigrid-preconditioned CG did not converge in {found.steps} steps"
             )
-        return found.x.reshape(b.shape)
-
-
-class MultigridCycle:
-    """One V-cycle in place of a solve: a fixed symmetric positive approximation of A^-1."""
-
-    backend = "amg"
-
-    def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
-        from pdcorrect.fem.multigrid import Multigrid
-
-        self._hierarchy = Multigrid(matrix, near_nullspace)
-
-    def solve(self, b: Array) -> Array:
-        b = np.asarray(b, dtype=np.float64)
-        return self._hierarchy.cycle(b.reshape(len(b), -1)).reshape(b.shape)
+        return found.x
 
 
 _DIRECT: dict[str, Callable[[sp.csc_matrix], Factor]] = {
@@ -188,16 +153,14 @@ def factorise(
     ----------
     matrix : (n, n) sparse
     backend : {"auto", "cholespy", "splu", "amg"}
-        "auto" takes what `choose_backend` does by the size: a direct factor
-        (cholespy if installed), or multigrid; so does "band", which is a choice
+        "auto" takes what `choose_backend` does; so does "band", which is a choice
         for tangents only (`BandOrder`).
     unknowns : int
         For each node: 1 for G, 3 for a tangent.
     near_nullspace : (n, k), optional
-        For multigrid: vectors that the matrix hardly resists.  The constant, which
-        is the default, is right for G; a tangent needs the `rigid_motions`.
+        See `Multigrid`.
     approximate : bool
-        Whether a fixed symmetric approximation of the inverse will do, as it does for
+        Whether a fixed symmetric approximation of the inverse will do, as for
         a preconditioner or a first Hessian: with multigrid, one V-cycle.
 
     Raises
@@ -209,7 +172,7 @@ def factorise(
     if backend in ("auto", "band"):
         backend = choose_backend(matrix.shape[0], unknowns)
     if backend == "amg":
-        return (MultigridCycle if approximate else MultigridSolver)(matrix, near_nullspace)
+        return (Multigrid if approximate else MultigridSolver)(matrix, near_nullspace)
     return _DIRECT[backend](sp.csc_matrix(matrix))
 
 
@@ -223,11 +186,9 @@ def check_backend(backend: str) -> None:
 def choose_backend(
     size: int, unknowns: int = 1, memory: float | None = None, bandwidth: int | None = None
 ) -> Backend:
-    """The back end for a matrix of ``size`` rows.
+    """The back end for a matrix of ``size`` rows and a ``memory``, bytes, by default the machine's.
 
-    ``memory`` (bytes) defaults to the machine's.  ``bandwidth``, where it is known, is the
-    half bandwidth of the best `BandOrder` (three unknowns a node); it then decides instead
-    of the size.
+    The half ``bandwidth`` of a `BandOrder` decides, where it is known, instead of the size.
     """
     memory = total_memory() if memory is None else memory
     needed = factor_bytes(size, unknowns)
@@ -242,12 +203,10 @@ def choose_backend(
 
 
 def factor_bytes(size: int, unknowns: int = 1) -> float:
-    """Expected bytes of a Cholesky factor of a three-dimensional mesh's matrix.
+    """Expected bytes of a Cholesky factor of a compact three-dimensional mesh's matrix.
 
-    A compact 3-D mesh with n nodes fills about 12 n^(4/3) entries of 12 bytes; a
-    matrix of three unknowns a node has nine times as many.  Within a factor of
-    three for blocks and beams of 700 to 18 000 nodes (``benchmarks``, case
-    factor_size).
+    12 n^(4/3) entries of 12 bytes for n nodes, nine times as many with three unknowns a node:
+    within a factor of three for 700 to 18 000 nodes (``benchmarks``, case factor_size).
     """
     return 12.0 * 12.0 * (size / unknowns) ** (4 / 3) * unknowns**2
 

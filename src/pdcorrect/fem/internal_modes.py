@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
+from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
 from pdcorrect.fem.kernels import CHUNK, PARALLEL, deformation, nodal_forces, stiffness, total
 
@@ -36,12 +37,12 @@ def relax(  # type: ignore[no-untyped-def]
     count, lanes = cells.shape[0], weights.shape[2]
     width = cells.shape[1] - nodes
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
-        k, density, T = np.empty(lanes), np.empty(lanes), np.empty((12, lanes))
+        F, U, V, B, S, s, v, k = scratch(lanes)
+        P, A, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
+        t, density = np.empty((3, lanes)), np.empty(lanes)
         forces, old, step = np.empty((width, 3)), np.empty((width, 3)), np.empty((width, 3))
-        K, A = np.empty((width, 3, width, 3)), np.empty((9, lanes))
+        K, flat = np.empty((width, 3, width, 3)), step.reshape(3 * width, 1)
+        M = K.reshape(3 * width, 3 * width)
         for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
             modes, here = cells[c, nodes:], gradients[c, nodes:]
             shear, volume = weights[c, 0], weights[c, 1]
@@ -71,13 +72,16 @@ def relax(  # type: ignore[no-untyped-def]
                 last = np.inf if tried == 1 or cut else _largest(step)
                 cut = False
                 if last <= _CHORD * near:
-                    _substitute(K, forces, step)
+                    step[:] = forces
+                    _substitute(M, flat)
                 if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):
                     for cautious in (last > near, True):
                         principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
                         stiffness(here, U, V, T, A, P, K)
-                        if _solve(K, forces, step) or cautious:
+                        if _factorise(M, 1e-12) or cautious:
                             break
+                    step[:] = forces
+                    _substitute(M, flat)
                 for m in range(width):
                     old[m] = u[modes[m]]
                     u[modes[m]] = old[m] + step[m]
@@ -94,20 +98,16 @@ def _largest(step):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _solve(K, forces, step):  # type: ignore[no-untyped-def]
-    """Step = K^-1 forces for the lower triangle (L, 3, L, 3) of K, by Cholesky's method.
+def _factorise(M, share):  # type: ignore[no-untyped-def]
+    """Cholesky's factor of M (n, n), in its lower triangle; whether M is positive definite.
 
-    Whether K, which its factor takes the place of, is positive definite; if not, pivots that are
-    zero to working precision or negative are raised.
+    Pivots below ``share`` of the largest diagonal entry are not positive and are raised to it.
     """
-    size = 3 * len(forces)
-    M = K.reshape(size, size)
-    least = 0.0
-    for i in range(size):
-        least = max(least, 1e-12 * M[i, i])
-    least += 1e-300
+    least = 1e-300
+    for i in range(len(M)):
+        least = max(least, share * M[i, i])
     positive = True
-    for i in range(size):
+    for i in range(len(M)):
         for j in range(i):
             for n in range(j):
                 M[i, j] -= M[i, n] * M[j, n]
@@ -116,24 +116,25 @@ def _solve(K, forces, step):  # type: ignore[no-untyped-def]
             M[i, i] -= M[i, n] * M[i, n]
         positive &= M[i, i] > least
         M[i, i] = np.sqrt(max(M[i, i], least))
-    _substitute(K, forces, step)
     return positive
 
 
 @njit(**OPTIONS)
-def _substitute(K, forces, step):  # type: ignore[no-untyped-def]
-    """Step (L, 3) by the factor that `_solve` left in K."""
-    size = 3 * len(forces)
-    M, x, f = K.reshape(size, size), step.reshape(size), forces.reshape(size)
+def _substitute(M, x):  # type: ignore[no-untyped-def]
+    """Overwrite x (n, m) by M^-1 x, for the factor of M that `_factorise` left."""
+    size, columns = x.shape
     for i in range(size):
-        x[i] = f[i]
         for n in range(i):
-            x[i] -= M[i, n] * x[n]
-        x[i] /= M[i, i]
+            for b in range(columns):
+                x[i, b] -= M[i, n] * x[n, b]
+        for b in range(columns):
+            x[i, b] /= M[i, i]
     for i in range(size - 1, -1, -1):
         for n in range(i + 1, size):
-            x[i] -= M[n, i] * x[n]
-        x[i] /= M[i, i]
+            for b in range(columns):
+                x[i, b] -= M[n, i] * x[n, b]
+        for b in range(columns):
+            x[i, b] /= M[i, i]
 
 
 @njit(**PARALLEL)
@@ -157,8 +158,9 @@ def _eliminate(blocks, nodes, shift, condensed, inverse, solved):  # type: ignor
                 largest = max(largest, K[i, i])
             for i in range(m):
                 K[i, i] += shift * largest
-            if not _cholesky_solve(K, right):
+            if not _factorise(K, 0.0):
                 failed[c] = 1
+            _substitute(K, right)
             inverse[c] = right[:, :m]
             solved[c] = right[:, m:]
             for i in range(n):
@@ -170,54 +172,14 @@ def _eliminate(blocks, nodes, shift, condensed, inverse, solved):  # type: ignor
     return failed.sum() == 0
 
 
-@njit(**OPTIONS)
-def _cholesky_solve(K, right):  # type: ignore[no-untyped-def]
-    """Overwrite ``right`` by K^-1 right; False where K is not positive definite."""
-    size = len(K)
-    for i in range(size):
-        for j in range(i):
-            for b in range(j):
-                K[i, j] -= K[i, b] * K[j, b]
-            K[i, j] /= K[j, j]
-            for b in range(right.shape[1]):
-                right[i, b] -= K[i, j] * right[j, b]
-        for b in range(i):
-            K[i, i] -= K[i, b] * K[i, b]
-        if not K[i, i] > 0.0:
-            return False
-        K[i, i] = np.sqrt(K[i, i])
-        for b in range(right.shape[1]):
-            right[i, b] /= K[i, i]
-    for i in range(size - 1, -1, -1):
-        for j in range(i + 1, size):
-            for b in range(right.shape[1]):
-                right[i, b] -= K[j, i] * right[j, b]
-        for b in range(right.shape[1]):
-            right[i, b] /= K[i, i]
-    return True
-
-
 class Condensed:
-    """Tangents of cells with their internal modes eliminated.
+    """Tangents (C, L, L, 3, 3) of nodes and modes, with the modes eliminated.
 
-    Parameters
-    ----------
-    blocks : (C, L, L, 3, 3)
-        Tangents of nodes and modes.
-    local : (C, L)
-        Numbers of nodes and modes in a configuration.
-    nodes : int
-        Nodes of a cell.
-    shift : float
-        Added to the diagonal of the modes' tangents, of its largest entry.
+    ``local`` (C, L) numbers both in a configuration, ``nodes`` is how many are nodes, and
+    ``shift`` is added to the diagonal of the modes' tangents, of its largest entry.
 
-    Attributes
-    ----------
-    blocks : (C, nodes, nodes, 3, 3)
-        K_uu - K_ub K_bb^-1 K_bu: the second derivative of the energy with the
-        modes in equilibrium.
-    size : int
-        Number of modes of all cells.
+    Its ``blocks`` (C, nodes, nodes, 3, 3), K_uu - K_ub K_bb^-1 K_bu, are the second derivative of
+    the energy with the modes in equilibrium; ``size`` is the number of modes of all cells.
 
     Raises
     ------
@@ -241,13 +203,9 @@ class Condensed:
     def reduced(self, r: Array) -> Array:
         """Right-hand side (N, 3) of the nodes for that of a configuration, (N + B, 3)."""
         count = len(r) - self._modes.size
-        out = r[:count].copy()
         modes = r[self._modes].reshape(len(self._modes), -1, 1)
         moved = (self._solved.transpose(0, 2, 1) @ modes).reshape(*self._nodes.shape, 3)
-        flat = self._nodes.ravel()
-        for i in range(3):
-            out[:, i] -= np.bincount(flat, moved[..., i].ravel(), minlength=count)
-        return out
+        return r[:count] - scatter(self._nodes, moved, count)
 
     def recovered(self, nodal: Array, r: Array) -> Array:
         """The whole solution (N + B, 3) for that of the nodes (N, 3) and right-hand side r."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit, prange
 
-from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
+from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
 
 # GNU OpenMP reads this when its threads start.  By default they spin while they wait, and a step
@@ -21,11 +21,7 @@ CHUNK = 16
 """Cells that one thread takes at a time."""
 
 _LANES = 32
-"""Quadrature points that are decomposed together.
-
-Divisions and square roots take long to answer, but several can be under way: 32 take half the
-time of four times 8 (``benchmarks``, case kernel).
-"""
+"""Quadrature points that are decomposed together: 32 take half the time of four times 8."""
 
 _WIDTH = 8
 """Lanes are filled up to a multiple of this, the numbers in the widest SIMD register."""
@@ -73,14 +69,7 @@ def total(a):  # type: ignore[no-untyped-def]
 
 @njit(**PARALLEL)
 def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
-    """out[n] = sum of values[slot] over the (cell, local node) slots of node n.
-
-    Parameters
-    ----------
-    start : (N + 1,), slots : (C K,)
-        Slots of each node, compressed rows.
-    values : (C K, 3), out : (N, 3)
-    """
+    """out[n] = sum of values[slot] over the slots of node n, see `Assembly`."""
     for n in prange(len(start) - 1):
         x, y, z = 0.0, 0.0, 0.0
         for i in range(start[n], start[n + 1]):
@@ -157,33 +146,18 @@ def first_volume_lane(first, points, w):  # type: ignore[no-untyped-def]
 def energy_and_forces(  # type: ignore[no-untyped-def]
     model, u, cells, gradients, weights, first, energy, by_cell, start, slots, out
 ):
-    """Elastic energy (C,), J, of each cell, and forces out (N, 3), N.
+    """Elastic energy (C,), J, of each cell, and forces out (N, 3), N, at displacements u (N, 3), m.
 
-    Parameters
-    ----------
-    model : int
-        See `energy_code`.
-    u : (N, 3)
-        Displacements, m.
-    cells : (C, K), gradients : (C, K, 3, Q)
-    weights : (C, 2, Q)
-        Weights of the two terms, mu and omega, times rest volume, J.
-    first : int
-        Points below it have no volume term, and no volume projection is computed
-        for them.
-    by_cell : (C, K, 3)
-        Scratch.
-    start, slots
-        See `gather_nodes`.
+    ``model`` is an `energy_code`; ``weights`` (C, 2, Q), J, are mu and omega times rest volume; for
+    points below ``first`` there is no volume term and no volume projection is computed; by_cell
+    (C, K, 3) is scratch.
     """
     count, points = cells.shape[0], weights.shape[2]
     size, lanes = block_shape(points)
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, P, B = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        U, V, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        s, v, t = np.empty((3, lanes)), np.empty((3, lanes)), np.empty((3, lanes))
-        k, w, one = np.empty(lanes), np.empty((2, lanes)), np.empty((9, points))
-        density, part = np.empty((1, lanes)), np.empty((1, points))
+        F, U, V, B, S, s, v, k = scratch(lanes)
+        P, t, w = np.empty((9, lanes)), np.empty((3, lanes)), np.empty((2, lanes))
+        density, part, one = np.empty((1, lanes)), np.empty((1, points)), np.empty((9, points))
         last = min(count, (chunk + 1) * CHUNK)
         for begin in range(chunk * CHUNK, last, size):
             end = min(last, begin + size)
@@ -231,10 +205,8 @@ def linearise_cells(  # type: ignore[no-untyped-def]
     count, points = cells.shape[0], weights.shape[2]
     size, lanes = block_shape(points)
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, B, S = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        U, V, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
-        s, v, k = np.empty((3, lanes)), np.empty((3, lanes)), np.empty(lanes)
-        w, one = np.empty((2, lanes)), np.empty((9, points))
+        F, U, V, B, S, s, v, k = scratch(lanes)
+        T, w, one = np.empty((12, lanes)), np.empty((2, lanes)), np.empty((9, points))
         last = min(count, (chunk + 1) * CHUNK)
         for begin in range(chunk * CHUNK, last, size):
             end = min(last, begin + size)
@@ -258,15 +230,15 @@ def apply_linearised(  # type: ignore[no-untyped-def]
         D, A = np.empty((9, lanes)), np.empty((9, lanes))
         for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
             deformation(x, cells[c], gradients[c], 0.0, D)
-            _transform(left[c], D, right[c], A, True)
+            transform(left[c], D, right[c], A, True)
             _tangent_product(tangent[c], A)
-            _transform(left[c], A, right[c], D, False)
+            transform(left[c], A, right[c], D, False)
             nodal_forces(D, gradients[c], 1.0, by_cell[c])
     gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
 
 
 @njit(**OPTIONS)
-def _transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
+def transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
     """Out = U^T A V (forward) or U A V^T, all (9, Q)."""
     for i in range(3):
         for j in range(3):
@@ -278,6 +250,20 @@ def _transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
                         right = V[3 * b + j, q] if forward else V[3 * j + b, q]
                         total += left * A[3 * a + b, q] * right
                 out[3 * i + j, q] = total
+
+
+@njit(inline="always", **OPTIONS)
+def unit_change(gradient, i, U, V, out):  # type: ignore[no-untyped-def]
+    """Out (9, Q) = U^T (e_i x grad N) V: the change of F by a shape function's component i."""
+    for a in range(3):
+        for b in range(3):
+            for q in range(out.shape[1]):
+                along = (
+                    V[b, q] * gradient[0, q]
+                    + V[3 + b, q] * gradient[1, q]
+                    + V[6 + b, q] * gradient[2, q]
+                )
+                out[3 * a + b, q] = U[3 * i + a, q] * along
 
 
 @njit(**OPTIONS)
@@ -322,17 +308,9 @@ def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
     lanes = T.shape[1]
     for k in range(gradients.shape[0]):
         for i in range(3):
-            for a in range(3):
-                for b in range(3):
-                    for q in range(lanes):
-                        along = (
-                            V[b, q] * gradients[k, 0, q]
-                            + V[3 + b, q] * gradients[k, 1, q]
-                            + V[6 + b, q] * gradients[k, 2, q]
-                        )
-                        A[3 * a + b, q] = U[3 * i + a, q] * along  # U^T (e_i x grad N_k) V
+            unit_change(gradients[k], i, U, V, A)
             _tangent_product(T, A)
-            _transform(U, A, V, P, False)
+            transform(U, A, V, P, False)
             for l in range(k + 1):
                 for j in range(3):
                     total = 0.0

@@ -19,14 +19,13 @@ another Poisson's ratio, or beside cells of much other modulus or density.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes
+from pdcorrect.fem.cell_correction import CellCorrection, cell_shapes, difference
 from pdcorrect.fem.clamps import Clamps
 from pdcorrect.fem.cube_symmetry import MANDEL, SCALAR_PATTERNS
 from pdcorrect.fem.elastic_body import ElasticBody
@@ -110,15 +109,7 @@ def root(matrix: Array) -> Array:
 
 
 class ElementWriter:
-    """What the network writes for the cells of one body, whatever its moduli.
-
-    Parameters
-    ----------
-    network : Network
-    body : ElasticBody
-        Of an element with 8 nodes.
-    clamps : Clamps
-    """
+    """What the network writes for the cells of one body, whatever its moduli."""
 
     def __init__(self, network: Network, body: ElasticBody, clamps: Clamps) -> None:
         self._network, self._body = network, body
@@ -146,8 +137,7 @@ class ElementWriter:
         matrices, masses = np.zeros((count, STRAINS, STRAINS)), np.zeros((count, 8, 8))
         if learned.any():
             S, R = (bounded(N) for N in self._answers(graph, learned))
-            stiff, heavy = self._roots(mu, omega)
-            stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+            stiff, heavy = self._roots(mu, omega, learned)
             matrices[learned] = stiff @ S @ stiff
             masses[learned] = np.swapaxes(heavy, 1, 2) @ R @ heavy
         back, cell = self._back, np.arange(count)[:, None, None]
@@ -166,9 +156,7 @@ class ElementWriter:
     ) -> tuple[Array, Array]:
         """Derivatives by mu and omega, each (C,), from those by K (C, 18, 18) and the masses.
 
-        Those that are None are zero.
-
-        What cells have of their own is differentiated by differences of fourth order, the
+        None is zero.  What cells have of their own is differentiated by differences, the
         network's answers by the chain rule.
         """
         young, poisson = effective_moduli(mu, omega)
@@ -181,8 +169,7 @@ class ElementWriter:
         S, R = bounded(N), bounded(H)
 
         def own(mu: Array, omega: Array) -> Array:
-            stiff, heavy = self._roots(mu, omega)
-            stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+            stiff, heavy = self._roots(mu, omega, learned)
             out = np.zeros(len(learned))
             out[learned] = np.einsum("cij,cij->c", G, stiff @ S @ stiff)
             out[learned] += np.einsum("cij,cij->c", J, np.swapaxes(heavy, 1, 2) @ R @ heavy)
@@ -190,11 +177,10 @@ class ElementWriter:
 
         step = _STEP * mu
         found = [
-            _difference(lambda t: own(mu + t * step, omega)) / step,
-            _difference(lambda t: own(mu, omega + t * step)) / step,
+            difference(lambda t: own(mu + t * step, omega)) / step,
+            difference(lambda t: own(mu, omega + t * step)) / step,
         ]
-        stiff, heavy = self._roots(mu, omega)
-        stiff, heavy = stiff[learned], heavy[learned] @ scalar_map()
+        stiff, heavy = self._roots(mu, omega, learned)
         original, own_cells = self._images.original, np.flatnonzero(learned)
         by_N, by_H = (np.zeros((len(original), *x.shape[1:])) for x in (N, H))
         by_N[own_cells] = _bounded_transposed(N, stiff @ G @ stiff)
@@ -268,8 +254,11 @@ class ElementWriter:
         N[inside, :6], N[inside, :, :6] = 0.0, 0.0
         return N, H
 
-    def _roots(self, mu: Array, omega: Array) -> tuple[Array, Array]:
-        """C^1/2 of stiffness (C, 18, 18) and of mass (C, 7, 7); like cells share the work."""
+    def _roots(self, mu: Array, omega: Array, learned: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """C^1/2 of stiffness (c, 18, 18), and of mass by a scalar's corner values (c, 7, 8).
+
+        Of the learned cells; like cells share the work.
+        """
         body, grid = self._body, self._grid
         values = np.column_stack([mu, omega, grid.order])
         if not body.quadrature.alike_gradients:
@@ -281,7 +270,8 @@ class ElementWriter:
         cells = blocks.transpose(0, 1, 3, 2, 4).reshape(-1, 24, 24)
         masses = body.space.cell_masses("averaged")[first][pairs]
         stiff = root(own_stiffness(cells, strain_map(self._shapes[first])))
-        return stiff[inverse.ravel()], root(own_mass(masses))[inverse.ravel()]
+        which = inverse.ravel()[learned]
+        return stiff[which], root(own_mass(masses))[which] @ scalar_map()
 
 
 def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.int64]) -> Array:
@@ -292,11 +282,6 @@ def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.i
     if not plain.space.internal:
         return blocks
     return Condensed(blocks, plain.space.local[few], plain.cells.shape[1]).blocks
-
-
-def _difference(function: Callable[[float], Array]) -> Array:
-    """Derivative at 0 by central differences of fourth order."""
-    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
 
 
 def _bounded_transposed(N: Array, slopes: Array) -> Array:

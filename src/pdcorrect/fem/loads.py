@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import SceneError
-from pdcorrect.fem.clamps import Selector, cofactor, tensor_cross, torsion_field, torsion_pull
-from pdcorrect.fem.operators import Space, scatter
-from pdcorrect.fem.quadrature import FaceQuadrature
+from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.clamps import Selector
+from pdcorrect.fem.operators import Space
 from pdcorrect.scene import (
     BodyForce,
     Force,
@@ -27,33 +27,27 @@ Array = NDArray[np.float64]
 
 
 class Amplitude:
-    """Piecewise linear factor over time, with jumps at the ends of a window.
-
-    Parameters
-    ----------
-    load : Load
-        Its ``window``, ``ramp`` and ``table`` are read.
-    """
+    """Piecewise linear factor over time, with jumps at the ends of a window."""
 
     def __init__(self, load: Load) -> None:
         if load.table is not None:
             self._times, self._values = np.array(load.table).T
-            self._outside = (self._values[0], self._values[-1])
+            self._ends = self._values[0], self._values[-1]
             return
         start, end = load.window or (0.0, np.inf)
         ramp = min(load.ramp, end - start)
-        self._times = np.array([start, start + ramp, end])
-        self._values = np.array([0.0 if ramp else 1.0, 1.0, 1.0])
-        if ramp and ramp < load.ramp:
-            self._values[1:] = ramp / load.ramp
-        self._outside = (0.0, 0.0)
+        self._times, self._values = np.array([start, start + ramp]), np.array([1.0, 1.0])
+        if ramp:
+            self._values[:] = 0.0, ramp / load.ramp
+        self._ends = 0.0, self._values[1] if np.isinf(end) else 0.0
+        if np.isfinite(end):
+            self._times = np.append(self._times, end)
+            self._values = np.append(self._values, self._values[1])
 
     @property
     def constant(self) -> bool:
         """Whether the amplitude is 1 at all times from zero on."""
-        return self._outside == (0.0, 0.0) and bool(
-            self._times[0] == self._times[1] == 0.0 and np.isinf(self._times[-1])
-        )
+        return self._ends == (0.0, 1.0) and not self._times.any()
 
     def mean(self, start: float, end: float) -> float:
         """Mean over [start, end] in seconds; the value where they are equal."""
@@ -68,14 +62,8 @@ class Amplitude:
         return float(values @ np.diff(ends) / (end - start))
 
     def _value(self, time: float) -> float:
-        if time < self._times[0]:
-            return float(self._outside[0])
-        if time > self._times[-1]:
-            return float(self._outside[1])
-        if np.isinf(self._times[-1]) and time >= self._times[-2]:
-            return float(self._values[-1])
-        finite = np.isfinite(self._times)
-        return float(np.interp(time, self._times[finite], self._values[finite]))
+        before, after = self._ends
+        return float(np.interp(time, self._times, self._values, before, after))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +107,7 @@ class NodalLoad:
 def assemble_loads(
     scene: Scene, space: Space, selector: Selector, nodal_mass: Array, free: NDArray[np.bool_]
 ) -> tuple[NodalLoad, ...]:
-    """All loads of a scene on one mesh.
-
-    Raises
-    ------
-    SceneError
-        If a region selects nothing, or a load acts on held components only.
-    """
+    """All loads of a scene on one mesh; each must act on a free component."""
     loads = []
     for i, load in enumerate(scene.loads):
         key = f"loads[{i}]"
@@ -196,102 +178,64 @@ def _traction(load: Traction, space: Space, selector: Selector, mass: Array, key
     return _fixed(scatter(space.cells[face.cells], values, len(space.positions)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Pressure:
-    """Nanson's formula: n da = cof(F) N dA."""
-
-    pressure: float
-    face: FaceQuadrature
-    nodes: NDArray[np.int64]
-
-    def sample(self, positions: Array) -> Array:
-        face = self.face
-        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
-        area = np.einsum("nqij,nqj->nqi", cofactor(F), face.normals)
-        values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -self.pressure * area)
-        return scatter(self.nodes, values, len(positions))
-
-    def pull(self, positions: Array, x: Array) -> Array:
-        face = self.face
-        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
-        at_points = -self.pressure * np.einsum(
-            "nq,nqk,nki->nqi", face.weights, face.values, x[self.nodes]
-        )
-        slope = tensor_cross(F, at_points[..., :, None] * face.normals[..., None, :])
-        values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
-        return scatter(self.nodes, values, len(positions))
-
-
 def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    """By Nanson's formula, n da = cof(F) N dA."""
     face = space.face_quadrature(selector.faces(load.region, key))
-    field = _Pressure(load.pressure, face, space.cells[face.cells])
-    return field.sample, field.pull
+    nodes = space.cells[face.cells]
+    areas = -load.pressure * face.weights[..., None] * face.normals
 
+    def deformation(positions: Array) -> Array:
+        return np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
 
-@dataclass(frozen=True, eq=False)
-class _TorsionField:
-    """The field at points, N/m3 or N."""
+    def sample(positions: Array) -> Array:
+        forces = np.einsum("nqij,nqj->nqi", cofactor(deformation(positions)), areas)
+        return scatter(nodes, np.einsum("nqk,nqi->nki", face.values, forces), len(positions))
 
-    load: Torsion
-    centre: Array
+    def pull(positions: Array, x: Array) -> Array:
+        at_points = np.einsum("nqk,nki->nqi", face.values, x[nodes])
+        slope = tensor_cross(deformation(positions), at_points[..., None] * areas[..., None, :])
+        values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
+        return scatter(nodes, values, len(positions))
 
-    def __call__(self, points: Array) -> Array:
-        about, load = points - self.centre, self.load
-        return load.strength * torsion_field(about, load.attraction, load.stretch)
-
-    def pull(self, points: Array, x: Array) -> Array:
-        about, load = points - self.centre, self.load
-        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
-
-
-@dataclass(frozen=True, eq=False)
-class _NodalTorsion:
-    """The field at some nodes."""
-
-    field: _TorsionField
-    nodes: NDArray[np.int64]
-
-    def sample(self, positions: Array) -> Array:
-        out = np.zeros_like(positions)
-        out[self.nodes] = self.field(positions[self.nodes])
-        return out
-
-    def pull(self, positions: Array, x: Array) -> Array:
-        out = np.zeros_like(positions)
-        out[self.nodes] = self.field.pull(positions[self.nodes], x[self.nodes])
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class _CellTorsion:
-    """The field integrated over cells, ``inside`` (C, 1, 1) being 1 there."""
-
-    field: _TorsionField
-    space: Space
-    inside: Array
-
-    def sample(self, positions: Array) -> Array:
-        at_rest = positions is self.space.positions
-        points = self.space.points if at_rest else self.space.interpolate(positions)
-        return self.space.body_load(self.field(points) * self.inside)
-
-    def pull(self, positions: Array, x: Array) -> Array:
-        space = self.space
-        forces = space.body_load_transposed(x) * self.inside
-        return space.interpolate_transposed(self.field.pull(space.interpolate(positions), forces))
+    return sample, pull
 
 
 def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
     rest = space.positions
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    field = _TorsionField(load, middle if load.centre is None else np.array(load.centre))
+    centre = middle if load.centre is None else np.array(load.centre)
+
+    def field(points: Array) -> Array:
+        return load.strength * torsion_field(points - centre, load.attraction, load.stretch)
+
+    def field_pull(points: Array, x: Array) -> Array:
+        return load.strength * torsion_pull(points - centre, load.attraction, load.stretch, x)
+
     if load.distribution == "nodal":
-        nodal = _NodalTorsion(field, selector.coarse_nodes(load.region, key))
-        return nodal.sample, nodal.pull
-    inside = np.zeros((len(space.cells), 1, 1))
-    inside[selector.cells(load.region, key)] = 1.0
-    spread = _CellTorsion(field, space, inside)
-    return spread.sample, spread.pull
+        nodes = selector.coarse_nodes(load.region, key)
+
+        def sample(positions: Array) -> Array:
+            out = np.zeros_like(positions)
+            out[nodes] = field(positions[nodes])
+            return out
+
+        def pull(positions: Array, x: Array) -> Array:
+            out = np.zeros_like(positions)
+            out[nodes] = field_pull(positions[nodes], x[nodes])
+            return out
+
+        return sample, pull
+    inside = _inside(space, selector.cells(load.region, key))
+
+    def spread(positions: Array) -> Array:
+        points = space.points if positions is rest else space.interpolate(positions)
+        return space.body_load(field(points) * inside)
+
+    def spread_pull(positions: Array, x: Array) -> Array:
+        forces = space.body_load_transposed(x) * inside
+        return space.interpolate_transposed(field_pull(space.interpolate(positions), forces))
+
+    return spread, spread_pull
 
 
 _SAMPLERS: dict[type, Callable[..., Sampler]] = {
@@ -304,7 +248,61 @@ _SAMPLERS: dict[type, Callable[..., Sampler]] = {
 }
 
 
-def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:
-    inside = np.zeros(len(space.cells))
+def _inside(space: Space, cells: NDArray[np.int64]) -> Array:
+    """1 in some cells, 0 in the others, (C, 1, 1)."""
+    inside = np.zeros((len(space.cells), 1, 1))
     inside[cells] = 1.0
-    return space.body_load(np.broadcast_to(density, space.points.shape) * inside[:, None, None])
+    return inside
+
+
+def _in_cells(space: Space, cells: NDArray[np.int64], density: Array) -> Array:
+    return space.body_load(np.broadcast_to(density, space.points.shape) * _inside(space, cells))
+
+
+_ON_AXIS = 1e-9
+"""Distance from the axis, of the body's extent, that is taken as zero."""
+
+
+def torsion_field(points: Array, attraction: float, stretch: float) -> Array:
+    """Unit rotational field of the thesis, eq. 6-1 to 6-3, at ``points`` (..., 3).
+
+    f = (stretch, -z - attraction y, y - attraction z) / |...|, and 0 where the
+    numerator vanishes (on the axis with no stretch) or is only a rounding error
+    of the coordinates.
+    """
+    f, inverse = _torsion_vectors(points, attraction, stretch)
+    return f * inverse
+
+
+def torsion_pull(points: Array, attraction: float, stretch: float, x: Array) -> Array:
+    """Derivatives of x . `torsion_field` by the points (..., 3); zero where the field is."""
+    f, inverse = _torsion_vectors(points, attraction, stretch)
+    f = f * inverse
+    rest = (x - f * (f * x).sum(axis=-1, keepdims=True)) * inverse  # d|f|^-1 f
+    out = np.zeros_like(points)
+    out[..., 1] = rest[..., 2] - attraction * rest[..., 1]
+    out[..., 2] = -rest[..., 1] - attraction * rest[..., 2]
+    return out
+
+
+def _torsion_vectors(points: Array, attraction: float, stretch: float) -> tuple[Array, Array]:
+    """The field before it is scaled, and 1 / its lengths (..., 1), 0 where it is only round-off."""
+    y, z = points[..., 1], points[..., 2]
+    f = np.stack([np.full_like(y, stretch), -z - attraction * y, y - attraction * z], axis=-1)
+    length = np.linalg.norm(f, axis=-1, keepdims=True)
+    rounding = _ON_AXIS * np.abs(points).max(initial=0.0)
+    return f, np.divide(1.0, length, out=np.zeros_like(length), where=length > rounding)
+
+
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
+def cofactor(F: Array) -> Array:
+    """Cofactor matrix det(F) F^-T of (..., 3, 3), also for singular F."""
+    return np.cross(F[..., _NEXT, :], F[..., _LAST, :])
+
+
+def tensor_cross(A: Array, B: Array) -> Array:
+    """Derivative of `cofactor` at A in the direction B, (..., 3, 3); symmetric in both."""
+    ahead = np.cross(A[..., _NEXT, :], B[..., _LAST, :])
+    return ahead + np.cross(B[..., _NEXT, :], A[..., _LAST, :])

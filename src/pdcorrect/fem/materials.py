@@ -75,13 +75,7 @@ class Materials:
         poisson: float | Array | None,
         density: float | Array | None,
     ) -> Materials:
-        """The same with other values, each a number or one a cell (C,).
-
-        Raises
-        ------
-        InputError
-            Naming the cell whose value is not acceptable.
-        """
+        """The same with other values, each a number or one a cell (C,)."""
         if (young is None) != (poisson is None):
             raise InputError("with_material: expected young and poisson together.")
         count, new = len(self.mu), self

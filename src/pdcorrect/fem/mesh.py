@@ -6,6 +6,7 @@ above, then the top face 4-5-6-7).
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pdcorrect.errors import MeshError
+from pdcorrect.errors import MeshError, PdcorrectWarning
 from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES, corner_jacobians
 from pdcorrect.fem.mesh_checks import (
     check_arrays,
@@ -22,6 +23,7 @@ from pdcorrect.fem.mesh_checks import (
     check_connections,
     check_repetitions,
     face_groups,
+    row_groups,
 )
 
 __all__ = [
@@ -89,19 +91,10 @@ def voxel_mesh(
     cell_size: float,
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> HexMesh:
-    """Mesh of the solid cells of a regular grid.
+    """Mesh of the ``solid`` (nx, ny, nz) cells of a regular grid of ``cell_size``, m.
 
-    Parameters
-    ----------
-    solid : (nx, ny, nz) bool
-    origin_index : tuple of int
-        Grid node that is placed at ``origin``.
-    cell_size : float
-        m.
-    origin : tuple of float
-        m.
-
-    Nodes are numbered by x, then y, then z (z fastest), unused ones left out.
+    Grid node ``origin_index`` is placed at ``origin``, m.  Nodes are numbered by x, then y, then z
+    (z fastest), unused ones left out.
     """
     index = np.argwhere(solid)  # (C, 3)
     grid = np.array(solid.shape) + 1
@@ -120,9 +113,8 @@ def voxel_mesh(
 def refine(mesh: HexMesh, k: int) -> HexMesh:
     """Cut each cell into k x k x k by its trilinear map.
 
-    Coincident new nodes of neighbouring cells are recognised by their exact
-    integer weights on the cells' corners, never by distance, so any conforming
-    hexahedral mesh refines exactly.
+    Coincident new nodes are recognised by their exact integer weights on the cells' corners,
+    never by distance, so any conforming mesh refines exactly.
     """
     if k == 1:
         return mesh
@@ -177,35 +169,15 @@ def _lattice(
     order = np.argsort(corner, axis=-1)
     corner = np.take_along_axis(corner, order, axis=-1).reshape(-1, 8)
     weight = np.take_along_axis(weight, order, axis=-1).reshape(-1, 8)
-    first, inverse = _distinct_rows(np.concatenate([corner + 1, weight], axis=1))
-    return corner[first], weight[first], inverse.reshape(count, -1)
-
-
-def _distinct_rows(rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Where each distinct row of natural numbers (m, even number) is first, and its number.
-
-    In lexicographic order, as `numpy.unique`, but by pairs of columns, which is faster.
-    """
-    base = np.int64(rows.max()) + 1
-    keys = [rows[:, i] * base + rows[:, i + 1] for i in range(0, rows.shape[1], 2)]
-    order = np.lexsort(keys[::-1])
-    new = np.ones(len(rows), dtype=bool)
-    new[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
-    inverse = np.empty(len(rows), dtype=np.int64)
-    inverse[order] = np.cumsum(new) - 1
-    return order[new], inverse
+    order, starts, counts = row_groups(np.concatenate([corner + 1, weight], axis=1))
+    point = np.empty(len(order), dtype=np.int64)
+    point[order] = np.repeat(np.arange(len(starts)), counts)
+    first = order[starts]
+    return corner[first], weight[first], point.reshape(count, -1)
 
 
 def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Faces that belong to one cell only.
-
-    Returns
-    -------
-    faces : (n, 4) int
-        Node numbers, counter-clockwise seen from outside.
-    owners : (n,) int
-        The cell behind each face.
-    """
+    """Faces (n, 4) that belong to one cell only, seen from outside, and those cells (n,)."""
     faces, order, starts, counts = face_groups(cells)
     outer = np.sort(order[starts[counts == 1]])
     return faces[outer], outer // 6
@@ -214,12 +186,12 @@ def boundary_faces(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray
 def coincident_nodes(
     points: NDArray[np.float64], targets: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.int64]:
-    """For each of ``targets`` (n, 3) the index of the point at the same place.
+    """For each of ``targets`` (n, 3) the index of the point within ``tolerance`` (m) of it.
 
     Raises
     ------
     MeshError
-        If a target has no point within ``tolerance`` (m).
+        If there is none.
     """
     distance, index = cKDTree(points).query(targets)
     if distance.max(initial=0.0) > tolerance:
@@ -229,3 +201,44 @@ def coincident_nodes(
             f"nearest is {distance[worst]:.3g} m away): expected a refinement of the same body."
         )
     return np.asarray(index, dtype=np.int64)
+
+
+_LOCKING = ("hex8", "hex8-mean")
+"""Elements without incompatible modes: alone through the thickness, their cells lock in bending."""
+
+
+def warn_of_thin_cells(element: str, mesh: HexMesh, free: NDArray[np.bool_]) -> None:
+    """Warn once if cells of an element without incompatible modes bend alone."""
+    if element not in _LOCKING:
+        return
+    count = int(bending_alone(mesh, free).sum())
+    if count:
+        warnings.warn(
+            f"element {element!r}: {count} of {len(mesh.cells)} cells are alone through the "
+            "thickness and much too stiff in bending: expected 'hex8-enhanced' or finer cells",
+            PdcorrectWarning,
+            stacklevel=3,
+        )
+
+
+def bending_alone(mesh: HexMesh, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which cells (C,) can bend and have no neighbour on either side along some axis of theirs.
+
+    To bend, a cell has neighbours along another axis, and on both of its faces across this one
+    corners that are ``free`` (N, 3) to move along it.
+    """
+    _, order, starts, counts = face_groups(mesh.cells)
+    outer = np.zeros(6 * len(mesh.cells), dtype=bool)
+    outer[order[starts[counts == 1]]] = True
+    sides = outer.reshape(-1, 3, 2)  # the faces on both ends of each axis
+    neighbours = 6 - outer.reshape(-1, 6).sum(axis=1)
+    alone = (sides.sum(axis=2) == 2) * (neighbours > 0)[:, None]  # (C, axis)
+    thin = np.flatnonzero(alone.any(axis=1))
+    corners = mesh.cells[thin]
+    axes = np.abs(np.einsum("cki,km->cmi", mesh.positions[corners], 2.0 * VTK_CORNERS - 1.0))
+    along = axes > 0.5 * axes.max(axis=2, keepdims=True)  # (c, axis, component)
+    may = np.einsum("cki,cmi->ckm", free[corners].astype(int), along.astype(int)) > 0
+    low, high = (((end == VTK_CORNERS) * may).any(axis=1) for end in (0, 1))
+    found = np.zeros(len(mesh.cells), dtype=bool)
+    found[thin] = (alone[thin] * low * high).any(axis=1)
+    return found

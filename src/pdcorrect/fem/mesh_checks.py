@@ -1,4 +1,4 @@
-"""What a hexahedral mesh must satisfy; every refusal names the place."""
+"""What a hexahedral mesh must satisfy; every refusal is a `MeshError` that names the place."""
 
 from __future__ import annotations
 
@@ -32,12 +32,7 @@ _MOST_CANDIDATES = 10**6
 
 
 def check_arrays(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
-    """Refuse wrong shapes, numbers that are not finite, wrong indices and unused nodes.
-
-    Raises
-    ------
-    MeshError
-    """
+    """Refuse wrong shapes, numbers that are not finite, wrong indices and unused nodes."""
     if positions.ndim != 2 or positions.shape[1] != 3 or cells.ndim != 2 or cells.shape[1] != 8:
         raise MeshError(
             f"nodes {positions.shape} and cells {cells.shape}: expected (N, 3) and (C, 8)."
@@ -65,12 +60,7 @@ def check_arrays(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> No
 
 
 def check_repetitions(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
-    """Refuse collapsed cells (a node twice) and cells that come twice.
-
-    Raises
-    ------
-    MeshError
-    """
+    """Refuse collapsed cells (a node twice) and cells that come twice."""
     ordered = np.sort(cells, axis=1)
     repeated = ordered[:, 1:] == ordered[:, :-1]
     collapsed = np.flatnonzero(repeated.any(axis=1))
@@ -79,17 +69,15 @@ def check_repetitions(positions: NDArray[np.float64], cells: NDArray[np.int64]) 
         node = ordered[cell, np.argmax(repeated[cell])]
         raise MeshError(
             f"cell {cell} around {_centre(positions, cells, cell)} contains node {node} more than "
-            f"once ({len(collapsed)} such cells): expected eight different nodes, for hexahedra "
-            "collapsed to wedges or pyramids are not supported. Mesh the place with hexahedra."
+            f"once ({len(collapsed)} such cells): expected eight different nodes."
         )
-    order, starts, counts = _groups(ordered)
+    order, starts, counts = row_groups(ordered)
     if counts.max() > 1:
         first = starts[np.argmax(counts > 1)]
         one, other = order[first : first + 2]
         raise MeshError(
             f"cells {one} and {other} around {_centre(positions, cells, one)} have the same eight "
-            f"nodes ({int((counts > 1).sum())} such places): expected every cell once. Remove the "
-            "copies."
+            f"nodes ({int((counts > 1).sum())} such places): expected every cell once."
         )
 
 
@@ -98,12 +86,7 @@ def check_cells(
     cells: NDArray[np.int64],
     points: NDArray[np.float64] = _CHECKED_POINTS,
 ) -> None:
-    """Refuse cells whose trilinear map is not orientation-preserving at ``points`` (P, 3).
-
-    Raises
-    ------
-    MeshError
-    """
+    """Refuse cells whose trilinear map is not orientation-preserving at ``points`` (P, 3)."""
     jacobian = jacobians(positions, cells, points)
     smallest = jacobian.min(axis=1)
     if smallest.min() > 0:
@@ -116,37 +99,20 @@ def check_cells(
         f"Jacobian {smallest[cell]:.3g} m3, at {where} of the unit cell): expected VTK node "
         "order and a convex cell."
     )
-    if 2 * bad > len(cells):
-        text += f" {bad} of the {len(cells)} cells are so: {_other_order(positions, cells, points)}"
-    elif bad > 1:
+    if bad > 1:
         text += f" {bad} of the {len(cells)} cells are so."
+    if 2 * bad > len(cells):
+        lexicographic = jacobians(positions, cells[:, _LEXICOGRAPHIC], points).min() > 0
+        text += (
+            f" Their nodes are in lexicographic order: take {str(_LEXICOGRAPHIC)[1:-1]}."
+            if lexicographic
+            else " Perhaps the mesh is a mirror image: swap nodes 0-1-2-3 with 4-5-6-7."
+        )
     raise MeshError(text)
 
 
-def _other_order(
-    positions: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
-) -> str:
-    """What to do about cells of which most are inverted."""
-    if jacobians(positions, cells[:, _LEXICOGRAPHIC], points).min() > 0:
-        return (
-            "the mesh uses another node order, the lexicographic one with x fastest. Take nodes "
-            f"{', '.join(map(str, _LEXICOGRAPHIC))} of every cell in this order."
-        )
-    return (
-        "the mesh seems to use another node order, most often the mirror image. Swap nodes "
-        "0-1-2-3 with 4-5-6-7 of every cell, or undo the reflection of the coordinates."
-    )
-
-
 def check_connections(positions: NDArray[np.float64], cells: NDArray[np.int64]) -> None:
-    """Refuse duplicate and hanging nodes, and cells that overlap at a face.
-
-    Only for cells that passed the other checks.
-
-    Raises
-    ------
-    MeshError
-    """
+    """Refuse duplicate and hanging nodes and overlapping cells, where the other checks passed."""
     shortest = shortest_edges(positions, cells)
     _check_duplicate_nodes(positions, TOLERANCE * float(shortest.min()))
     outer, faces = _check_faces(positions, cells)
@@ -156,28 +122,25 @@ def check_connections(positions: NDArray[np.float64], cells: NDArray[np.int64]) 
 def face_groups(
     cells: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Faces of all cells, those with the same four nodes brought together.
+    """Faces (6C, 4) of all cells, and those with the same four nodes brought together.
 
-    Returns
-    -------
-    faces : (6C, 4) int
-        Face ``f`` of cell ``c`` is row ``6 c + f``; seen from outside the cell.
-    order : (6C,) int
-        Rows group by group, ascending within each.
-    starts, counts : (n,) int
-        Where each group starts in ``order``, and how many rows it has.
+    Face ``f`` of cell ``c`` is row ``6 c + f``, seen from outside; the rest as of `row_groups`.
     """
     faces = cells[:, VTK_FACES].reshape(-1, 4)
-    return faces, *_groups(np.sort(faces, axis=1))
+    return faces, *row_groups(np.sort(faces, axis=1))
 
 
-def _groups(
+def row_groups(
     rows: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Equal rows (m, even number) brought together: order, starts and counts of groups."""
+    """Equal rows of natural numbers (m, even number) brought together, in lexicographic order.
+
+    Order, starts and counts of the groups; by pairs of columns, which is faster than
+    `numpy.unique`.
+    """
     base = np.int64(rows.max()) + 1
     keys = [rows[:, i] * base + rows[:, i + 1] for i in range(0, rows.shape[1], 2)]
-    order = np.lexsort(keys)
+    order = np.lexsort(keys[::-1])
     new = np.ones(len(rows), dtype=bool)
     new[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
     starts = np.flatnonzero(new)
@@ -195,9 +158,8 @@ def _check_duplicate_nodes(positions: NDArray[np.float64], tolerance: float) -> 
         raise MeshError(
             f"nodes {one} at {positions[one]} and {other} at {positions[other]} are at the same "
             f"place ({len(pairs)} such pairs), so that the cells there are not connected: "
-            "expected one node for each place. Merge them in the program that made the mesh (in "
-            "Gmsh: `Coherence Mesh;` or Mesh.RemoveDuplicateNodes), or leave a gap if a cut is "
-            "meant."
+            "expected one node for each place. Merge them (in Gmsh: `Coherence Mesh;`), or leave "
+            "a gap if a cut is meant."
         )
 
 
@@ -212,7 +174,7 @@ def _check_faces(
         raise MeshError(
             f"the face around {positions[faces[rows[0]]].mean(axis=0)} belongs to the "
             f"{counts[group]} cells {', '.join(str(row // 6) for row in rows)}: expected at most "
-            "two, one on each side. Remove the cells that overlap."
+            "two, one on each side."
         )
     inner = starts[counts == 2]
     one, other = order[inner], order[inner + 1]
@@ -224,7 +186,7 @@ def _check_faces(
         raise MeshError(
             f"cells {a // 6} and {b // 6} share the face around {positions[faces[a]].mean(axis=0)} "
             "but lie on the same side of it or join its nodes in different orders: expected one "
-            "cell on each side. Remove the cells that overlap."
+            "cell on each side."
         )
     outer = np.sort(order[starts[counts == 1]])
     return outer, faces[outer]
@@ -243,10 +205,7 @@ def _check_hanging_nodes(
     owners: NDArray[np.int64],
     tolerance: NDArray[np.float64],
 ) -> None:
-    """Refuse outer nodes on an outer face (n, 4) of a cell that does not contain them.
-
-    ``tolerance`` is the largest distance (n,) from each face, m.
-    """
+    """Refuse outer nodes within ``tolerance`` (n,), m, of outer faces (n, 4) of other cells."""
     nodes = np.unique(faces)
     tree = cKDTree(positions[nodes])
     corners = positions[faces]
@@ -270,16 +229,14 @@ def _check_hanging_nodes(
                 f"node {node[first]} at {positions[node[first]]} lies on a face or an edge of "
                 f"cell {cell} around {_centre(positions, cells, cell)} without being one of its "
                 f"corners (a hanging node; {len(np.unique(node[hanging]))} or more): expected "
-                "cells that meet face to face. Give both sides the same divisions, or leave a gap "
-                "if a cut is meant."
+                "cells that meet face to face, or a gap if a cut is meant."
             )
 
 
 def _distances(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,) of points (n, 3) from bilinear faces with corners (n, 4, 3), m.
+    """Distances (n,) of points (n, 3) from bilinear faces (n, 4, 3), m, or more, by Gauss-Newton.
 
-    By Gauss-Newton, which is exact for points on the face; elsewhere it is
-    never less than the distance.
+    Exact for points on the face.
     """
     a, b, c, d = np.moveaxis(corners, 1, 0)
     along, across, twist = b - a, d - a, a - b + c - d

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -138,8 +139,7 @@ def _abaqus_text(path: Path) -> io.StringIO:
     if node_lists > 1 or instances > 1:
         raise MeshError(
             f"{path} has {node_lists} lists *NODE and {instances} *INSTANCE: expected one list "
-            "and at most one instance, for their numbers may clash. Merge the parts to one (and "
-            "remove reference points), or export a flat file of the part."
+            "and at most one instance, for their numbers may clash. Export a flat file."
         )
     return io.StringIO("".join(lines))
 
@@ -148,19 +148,18 @@ def _other_cells(
     blocks: list[meshio.CellBlock], solids: list[meshio.CellBlock], points: NDArray[np.float64]
 ) -> str:
     """The message for a file with no solid cells or with solids that are not hexahedra."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for block in solids or blocks:
-        counts[block.type] = counts.get(block.type, 0) + len(block.data)
-    found = ", ".join(f"{number} of type {kind}" for kind, number in counts.items()) or "none"
-    text = f"holds these {'solid ' if solids else ''}cells: {found}"
+        counts[block.type] += len(block.data)
+    text = ", ".join(f"{number} of type {kind}" for kind, number in counts.items()) or "none"
     for block in solids:
         if block.type not in _HEXAHEDRA:
             place = points[np.unique(np.hstack(block.data[0]))].mean(axis=0)
             text += f" (the first {block.type} around {place} m)"
             break
     return (
-        f"{text}: expected hexahedra (types {', '.join(_HEXAHEDRA)}) as the only solid cells. "
-        "Mesh the whole body with hexahedra, for example by swept or mapped meshing."
+        f"holds these {'solid ' if solids else ''}cells: {text}: expected hexahedra (types "
+        f"{', '.join(_HEXAHEDRA)}) as the only solid cells."
     )
 
 
@@ -180,8 +179,7 @@ def _check_straight(path: Path, nodes: NDArray[np.float64], first: int) -> None:
         raise MeshError(
             f"{path}: cell {first + cell} around {nodes[cell, :8].mean(axis=0)} has its node "
             f"{8 + node} {away[cell, node]:.3g} m away from the place between its corners "
-            f"({len(curved)} such cells): expected straight-sided cells, for curved ones are not "
-            "supported. Write the mesh with eight-node hexahedra (in Gmsh: "
+            f"({len(curved)} such cells): expected straight-sided cells (in Gmsh: "
             "`Mesh.ElementOrder = 1`)."
         )
 

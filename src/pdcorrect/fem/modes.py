@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -45,17 +44,8 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     problem's own mass matrix; loads are dead.  A body without clamps has six modes of about
     0 Hz at rest.
 
-    Parameters
-    ----------
-    problem : Problem
-    count : int
-        How many.
-    positions : (N, 3), optional
-        Where to linearise, m: an equilibrium under load, say; at rest by default.
-
-    Returns
-    -------
-    Modes
+    ``positions`` (N, 3) are where to linearise, m: an equilibrium under load, say; at rest by
+    default.
 
     Raises
     ------
@@ -67,13 +57,23 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     """
     at = problem.positions if positions is None else positions
     free = np.flatnonzero(problem.free)
-    _check(count, len(free))
+    whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
+    if not whole or not 1 <= count < len(free):
+        raise InputError(
+            f"count = {count!r}: expected a whole number from 1 to {len(free) - 1}, fewer than the "
+            "free components."
+        )
     K = problem.stiffness(at)[free][:, free]
     M = sp.csr_matrix(sp.kron(problem.mass_matrix, sp.eye_array(3)))[free][:, free]
     shift = _SHIFT * float((K.diagonal() / M.diagonal()).max())
-    inverse = spla.LinearOperator(
-        K.shape, matvec=_inverse(K + shift * M, rigid_motions(at)[free]), dtype=np.float64
-    )
+    try:
+        factor = factorise(K + shift * M, unknowns=3, near_nullspace=rigid_motions(at)[free])
+    except NotPositiveDefinite as error:
+        raise ConvergenceError(
+            f"the tangent stiffness is not positive semi-definite ({error}): expected positions "
+            "in stable equilibrium, as of a quasi-static run, or none for the body at rest."
+        ) from None
+    inverse = spla.LinearOperator(K.shape, matvec=factor.solve, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=len(free))  # for the same digits every time
     try:
         values, vectors = spla.eigsh(K, count, M, sigma=-shift, OPinv=inverse, v0=start)
@@ -84,23 +84,3 @@ def modes(problem: Problem, count: int = 6, positions: Array | None = None) -> M
     shapes[:, free] = vectors[:, order].T
     frequencies = np.sqrt(np.maximum(values[order], 0.0)) / (2.0 * np.pi)
     return Modes(frequencies, shapes.reshape(count, -1, 3))
-
-
-def _inverse(matrix: sp.csr_matrix, motions: Array) -> Callable[[Array], Array]:
-    try:
-        return factorise(matrix, unknowns=3, near_nullspace=motions).solve
-    except NotPositiveDefinite as error:
-        raise ConvergenceError(
-            f"the tangent stiffness is not positive semi-definite ({error}): expected positions "
-            "in stable equilibrium. Give those of a quasi-static run, or none for the body at "
-            "rest."
-        ) from None
-
-
-def _check(count: int, size: int) -> None:
-    whole = isinstance(count, (int, np.integer)) and not isinstance(count, bool)
-    if not whole or not 1 <= count < size:
-        raise InputError(
-            f"count = {count!r}: expected a whole number from 1 to {size - 1}, fewer than the "
-            "free components."
-        )

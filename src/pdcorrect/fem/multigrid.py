@@ -26,18 +26,9 @@ class NotPositiveDefinite(ArithmeticError):
 
 @dataclass(eq=False)
 class Solution:
-    """Outcome of `conjugate_gradients`.
+    """The last iterate, whether the tolerance was met, and the number of products.
 
-    Attributes
-    ----------
-    x : array
-        The last iterate.
-    converged : bool
-        Whether the tolerance was met.
-    convex : bool
-        False where a direction of negative curvature ended the iteration.
-    steps : int
-        Products with the matrix.
+    ``convex`` is False where a direction of negative curvature ended the iteration.
     """
 
     x: Array
@@ -63,11 +54,8 @@ def conjugate_gradients(
     ----------
     product, precondition : callable
         x -> A x, and an approximation of b -> A^-1 b, on arrays of b's shape.
-    b : array
     tolerance : float
-        Of the residual in the preconditioner's norm, relative to its first
-        value.
-    max_steps : int
+        Of the residual in the preconditioner's norm, relative to its first value.
     start : array, optional
         First iterate; zero by default.
     residual_share : float
@@ -106,11 +94,7 @@ _COARSEST = 400
 """Unknowns at which a dense factor takes over."""
 
 _DEGREE = 2
-"""Of the Chebyshev smoother.
-
-Symmetric Gauss-Seidel takes fewer steps (16 instead of 22 for a beam of 7 857 nodes at
-Poisson's ratio 0.45), but each is slower and it advances one column at a time.
-"""
+"""Of the Chebyshev smoother; Gauss-Seidel takes fewer steps, but one column at a time."""
 
 _SMOOTHED = 8.0
 """Ratio of the largest eigenvalue of D^-1 A to the smallest one that the smoother damps."""
@@ -119,25 +103,30 @@ _LANCZOS_STEPS = 15
 _RADIUS_MARGIN = 1.1
 
 
-@dataclass(frozen=True, eq=False)
 class _Level:
     """A on one level, its scaled Chebyshev smoother, and the way up from the next level.
 
-    Attributes
-    ----------
-    matrix : (n, n) sparse
-    inverse_diagonal : (n, 1)
-    radius : float
-        The largest eigenvalue of D^-1 A, estimated with a margin.
-    prolongation : (n, m) sparse
-    restriction : (m, n) sparse
+    ``near_nullspace`` becomes the next level's.
     """
 
-    matrix: sp.csr_matrix
-    inverse_diagonal: Array
-    radius: float
-    prolongation: sp.csr_matrix
-    restriction: sp.csr_matrix
+    def __init__(self, matrix: sp.csr_matrix, near_nullspace: Array) -> None:
+        from pyamg.aggregation import fit_candidates, standard_aggregation
+
+        diagonal = matrix.diagonal()
+        if not (diagonal > 0).all():
+            raise NotPositiveDefinite("the matrix has diagonal entries that are not positive")
+        aggregates, _ = standard_aggregation(matrix)
+        tentative, coarse = fit_candidates(aggregates, near_nullspace)
+        tentative = sp.csc_matrix(tentative)
+        kept = np.flatnonzero(np.asarray(abs(tentative).sum(axis=0)))
+        tentative = tentative[:, kept].tocsr()  # small aggregates have fewer motions
+        self.near_nullspace: Array = coarse[kept]
+        self.matrix, self.inverse_diagonal = matrix, 1.0 / diagonal[:, None]
+        self.radius = _RADIUS_MARGIN * _largest_eigenvalue(matrix, diagonal)
+        scaling = sp.diags_array(1.0 / diagonal)
+        smoothing = (4.0 / 3.0 / self.radius) * (scaling @ (matrix @ tentative))
+        self.prolongation = sp.csr_matrix(tentative - smoothing)
+        self.restriction = sp.csr_matrix(self.prolongation.T)
 
     def smooth(self, r: Array) -> tuple[Array, Array]:
         """A polynomial in D^-1 A that damps rough errors, times D^-1 r; and what is left of r."""
@@ -156,20 +145,18 @@ class _Level:
 
 
 class Multigrid:
-    """A V-cycle for a symmetric positive definite matrix.
+    """A V-cycle for a symmetric positive definite matrix, in place of a factor.
 
-    Parameters
-    ----------
-    matrix : (n, n) sparse
-    near_nullspace : (n, k), optional
-        Vectors that the matrix hardly resists: the constant by default, which is right
-        for G; a tangent needs the rigid motions.
+    ``near_nullspace`` (n, k) are vectors that the matrix hardly resists: the constant by default,
+    which is right for G; a tangent needs the `rigid_motions`.
 
     Raises
     ------
     NotPositiveDefinite
         Where a level shows it; not every indefinite matrix is noticed.
     """
+
+    backend = "amg"
 
     def __init__(self, matrix: sp.spmatrix, near_nullspace: Array | None = None) -> None:
         matrix = sp.csr_matrix(matrix)
@@ -179,20 +166,21 @@ class Multigrid:
             near_nullspace = np.ones((matrix.shape[0], 1))
         self._levels: list[_Level] = []
         while matrix.shape[0] > _COARSEST:
-            level, near_nullspace = _level(matrix, near_nullspace)
+            level = _Level(matrix, near_nullspace)
             self._levels.append(level)
+            near_nullspace = level.near_nullspace
             matrix = sp.csr_matrix(level.restriction @ matrix @ level.prolongation)
             if matrix.shape[0] > 0.7 * level.matrix.shape[0]:
                 break  # no longer coarser
-        self.sizes = [level.matrix.shape[0] for level in self._levels] + [matrix.shape[0]]
         try:
             self._coarsest = la.cho_factor(matrix.toarray(), check_finite=False)
         except la.LinAlgError as error:
             raise NotPositiveDefinite(f"the coarsest level: {error}") from None
 
-    def cycle(self, b: Array) -> Array:
-        """Approximately A^-1 b, for b (n, m): linear in b, symmetric and positive."""
-        return self._cycle(0, b)
+    def solve(self, b: Array) -> Array:
+        """Approximately A^-1 b, for b (n,) or (n, m): linear in b, symmetric and positive."""
+        b = np.asarray(b, dtype=np.float64)
+        return self._cycle(0, b.reshape(len(b), -1)).reshape(b.shape)
 
     def _cycle(self, depth: int, b: Array) -> Array:
         if depth == len(self._levels):
@@ -202,28 +190,6 @@ class Multigrid:
         correction = level.prolongation @ self._cycle(depth + 1, level.restriction @ r)
         change, _ = level.smooth(r - level.matrix @ correction)
         return x + correction + change
-
-
-def _level(matrix: sp.csr_matrix, near_nullspace: Array) -> tuple[_Level, Array]:
-    """One level and the next one's near null-space."""
-    from pyamg.aggregation import fit_candidates, standard_aggregation
-
-    diagonal = matrix.diagonal()
-    if not (diagonal > 0).all():
-        raise NotPositiveDefinite("the matrix has diagonal entries that are not positive")
-    aggregates, _ = standard_aggregation(matrix)
-    tentative, coarse = fit_candidates(aggregates, near_nullspace)
-    tentative = sp.csc_matrix(tentative)
-    kept = np.flatnonzero(
-        np.asarray(abs(tentative).sum(axis=0))
-    )  # small aggregates have fewer motions
-    tentative, coarse = tentative[:, kept].tocsr(), coarse[kept]
-    scaling = sp.diags_array(1.0 / diagonal)
-    radius = _RADIUS_MARGIN * _largest_eigenvalue(matrix, diagonal)
-    smoothing = (4.0 / 3.0 / radius) * (scaling @ (matrix @ tentative))
-    prolongation = sp.csr_matrix(tentative - smoothing)
-    restriction = sp.csr_matrix(prolongation.T)
-    return _Level(matrix, 1.0 / diagonal[:, None], radius, prolongation, restriction), coarse
 
 
 def _largest_eigenvalue(matrix: sp.csr_matrix, diagonal: Array) -> float:
@@ -251,9 +217,6 @@ def rigid_motions(x: Array) -> Array:
     """Translations and linearised rotations of points x (N, 3): (3 N, 6), of similar size."""
     x = x - x.mean(axis=0)
     x = x / max(float(np.abs(x).max()), 1e-300)
-    out = np.zeros((len(x), 3, 6))
-    out[:, :, :3] = np.eye(3)
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        out[:, i, 3 + axis], out[:, j, 3 + axis] = -x[:, j], x[:, i]
-    return out.reshape(-1, 6)
+    translations = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    rotations = np.cross(np.eye(3)[:, None], x).transpose(1, 2, 0)
+    return np.concatenate([translations, rotations], axis=2).reshape(-1, 6)

@@ -32,14 +32,9 @@ _FLOOR = 0.01
 
 
 class CellGraph(NamedTuple):
-    """What the network sees.
+    """What the network sees: each cell's numbers (C, 37), and the neighbours (C, 27) about it.
 
-    Attributes
-    ----------
-    numbers : (C, 37)
-        Of each cell: of its neighbours, of its corners, of Poisson's ratio.
-    neighbours : (C, 27) int
-        Cells about each; C where there is none.
+    Where there is no neighbour, its number is C.
     """
 
     numbers: Array
@@ -47,16 +42,10 @@ class CellGraph(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Cells of a mesh on a grid along the axes.
+    """Cells of a mesh on a grid along the axes, and whether they are its cubes.
 
-    Attributes
-    ----------
-    cells, order : (C, 8)
-        Corners in the order of `VTK_CORNERS` along the axes, and their places in the mesh's.
-    place : (C, 3)
-        Of the cells on the grid.
-    regular : (C,) bool
-        Whether the cell is a cube of the grid.
+    Corners are in the order of `VTK_CORNERS` along the axes; ``order`` has their places in the
+    mesh's own (C, 8), ``place`` (C, 3) those of the cells on the grid.
     """
 
     cells: NDArray[np.int64]
@@ -91,11 +80,7 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
 def neighbours_of(cells: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray[np.int64]:
     """The (C, 27) cells about each that share nodes with it; C where there is none.
 
-    Parameters
-    ----------
-    cells : (C, 8)
-    place : (C, 3)
-        On the grid.
+    ``place`` (C, 3) is that of the cells (C, 8) on the grid.
     """
     count = len(cells)
     entries = np.ones(cells.size, dtype=np.int64), cells.ravel(), 8 * np.arange(count + 1)
@@ -109,18 +94,11 @@ def neighbours_of(cells: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray
 
 
 class Images(NamedTuple):
-    """A body of C cells with its mirror images at planes of symmetry, C' cells, its own first.
+    """A body with its mirror images at planes of symmetry, C' cells, its own C cells first.
 
-    Attributes
-    ----------
-    neighbours : (C', 27) int
-        See `neighbours_of`.
-    original : (C',) int
-        Cell that each is an image of.
-    held : (C', 8) bool
-        Corners that are held in all components, VTK order.
-    partly : (C,) bool
-        Cells with a corner held in some components that no plane of symmetry explains.
+    Of all cells the `neighbours_of` them, the ``original`` (C',) that each is an image of, and
+    which corners (C', 8) are held in all components; of its own those (C,) with corners ``partly``
+    held that no plane of symmetry explains.
     """
 
     neighbours: NDArray[np.int64]
@@ -134,12 +112,8 @@ def mirrored(grid: Grid, free: NDArray[np.bool_], still: NDArray[np.bool_]) -> I
 
     The outermost face of cells along an axis is a plane of symmetry where all its nodes are held
     along the axis, as by rollers that do not move, and not all of them in all components; one for
-    each axis.
-
-    Parameters
-    ----------
-    free, still : (N, 3)
-        Components that may move, and those that are held where they are.
+    each axis.  ``free`` and ``still`` (N, 3) are the components that may move, and those that are
+    held where they are.
     """
     cells, place, count = grid.cells, grid.place, len(free)
     planes = np.zeros((count, 3), dtype=bool)
@@ -169,14 +143,9 @@ def mirrored(grid: Grid, free: NDArray[np.bool_], still: NDArray[np.bool_]) -> I
 def cell_graph(
     neighbours: NDArray[np.int64], young: Array, poisson: Array, held: Array
 ) -> CellGraph:
-    """The graph of cells with these `neighbours_of` them.
+    """The graph of cells with these `neighbours_of` them, moduli (C,) and held corners.
 
-    Parameters
-    ----------
-    neighbours : (C, 27)
-    young, poisson : (C,)
-    held : (C, 8)
-        1 where a corner is held, VTK order.
+    ``held`` (C, 8) is 1 where a corner is held, VTK order.
     """
     other = np.append(young, 0.0)[neighbours]
     share = 2.0 * other / (young[:, None] + other)

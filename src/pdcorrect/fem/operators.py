@@ -18,6 +18,7 @@ from skfem.mapping import MappingIsoparametric
 from skfem.quadrature import get_quadrature
 
 from pdcorrect.errors import SceneError
+from pdcorrect.fem.assembly import scatter
 from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
 from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature, linear_shares, mean_shares
 
@@ -35,10 +36,9 @@ _VTK_NODES = np.concatenate(
 
 
 class _Element(NamedTuple):
-    """An element: scikit-fem's shape functions and what is added to them.
+    """scikit-fem's shape functions, two orders of quadrature, and what is added to them.
 
-    ``order`` and ``mass_order`` are the polynomial orders of the quadrature; ``volume`` is the
-    part of the deformation that the volume term sees.
+    ``volume`` is the part of the deformation that the volume term sees.
     """
 
     shape: type[Element]
@@ -217,9 +217,7 @@ class Space:
             np.multiply(load, v, out=product)
             product *= dx
             by_shape.append(product.sum(axis=2))  # (C, 3)
-        nodes = self._basis.element_dofs.ravel()
-        columns = [np.bincount(nodes, values) for values in np.concatenate(by_shape).T]
-        return np.stack(columns, axis=1)
+        return scatter(self._basis.element_dofs, np.stack(by_shape), len(self.positions))
 
     def body_load_transposed(self, nodal: Array) -> Array:
         """Derivatives of nodal . `body_load` by the force density, (C, Q, 3)."""
@@ -289,17 +287,3 @@ def mass_matrix(rule: str, space: Space, density: Array) -> sp.csr_matrix:
     if rule == "lumped":
         return diagonal
     raise SceneError(f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node.")
-
-
-def summed_cells(cells: NDArray[np.int64], blocks: Array, count: int) -> sp.csr_matrix:
-    """Matrices of the cells (C, K, K) summed into (count, count)."""
-    width = cells.shape[1]
-    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
-    return sp.csr_matrix(sp.coo_matrix((blocks.ravel(), (rows, columns)), shape=(count, count)))
-
-
-def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:
-    """Sum cell-wise nodal values (C, K, 3) into (count, 3)."""
-    flat = cells.ravel()
-    columns = [np.bincount(flat, values[..., i].ravel(), minlength=count) for i in range(3)]
-    return np.stack(columns, axis=1)

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
 from pdcorrect.errors import InputError, MeshError, PdcorrectWarning, SceneError
+from pdcorrect.fem.assembly import summed_cells
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
-from pdcorrect.fem.mesh import HexMesh, voxel_mesh
+from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
 from pdcorrect.fem.mesh import refine as refine_mesh
-from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix, summed_cells
-from pdcorrect.fem.thin_cells import warn_of_thin_cells
+from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
@@ -35,14 +35,12 @@ _LEAST_BYTES = 4000
 
 @dataclass(frozen=True, eq=False)
 class Problem(ElasticBody):
-    """A discretised scene: an elastic body with mass, clamps and loads.
+    """A discretised scene: an `ElasticBody` with mass, clamps and loads.
 
     Its arrays are read-only, so a factor made from it stays right.
 
     Attributes
     ----------
-    mesh, space, quadrature, materials, cell_size
-        See `ElasticBody`.
     scene : Scene
     refine : int
         Each coarse cell is cut into ``refine ** 3``.
@@ -50,10 +48,8 @@ class Problem(ElasticBody):
         kg, for each coordinate.
     clamps : Clamps
     loads : tuple of NodalLoad
-    material_changed : bool
-        Whether the moduli are no longer those of ``scene``.
-    density_changed : bool
-        Whether the density is not, as `with_total_mass` makes it.
+    material_changed, density_changed : bool
+        Whether the moduli, or the density, are no longer those of ``scene``.
     """
 
     scene: Scene
@@ -217,59 +213,15 @@ class Problem(ElasticBody):
         )
 
     def with_total_mass(self, mass: float) -> Problem:
-        """The same problem, its density scaled so that its nodes have this mass together, kg.
-
-        Raises
-        ------
-        InputError
-            If it is not a positive number.
-        """
+        """The same problem, its density scaled so that its nodes have this mass together, kg."""
         if isinstance(mass, bool) or not isinstance(mass, Real) or not 0.0 < mass < np.inf:
             raise InputError(f"total mass {mass} kg: expected a positive number.")
         return self.with_material(density=mass / self.mass.sum() * self.materials.density)
 
-    def with_correction(
-        self, matrices: Array | None = None, masses: Array | None = None
-    ) -> Problem:
-        """The same problem of element "hex8-learned" with other matrices in its cells.
-
-        Parameters
-        ----------
-        matrices : (C, 18, 18), optional
-            Of 1/2 z . K z, N/m, symmetric, see `pdcorrect.fem.turned_strains`.
-        masses : (C, 8, 8), optional
-            At density 1, m3, symmetric; rows that add up to zero keep the mass of each node.
-
-        Raises
-        ------
-        InputError
-            If the element is another one, or an array has another shape.
-        """
-        own = self.correction
-        if own is None:
-            raise InputError(f"element {self.element!r}: expected 'hex8-learned'.")
-        given = {"matrices": matrices, "masses": masses}
-        found = {k: np.asarray(v, dtype=float) for k, v in given.items() if v is not None}
-        for name, array in found.items():
-            if array.shape != getattr(own, name).shape:
-                raise InputError(
-                    f"{name} {array.shape}: expected {getattr(own, name).shape}, one a cell."
-                )
-        correction = replace(own, writer=None, **found)
-        density = self.materials.density[:, None, None]
-        more = summed_cells(self.cells, density * (correction.masses - own.masses), len(self.mass))
-        return replace(self, correction=correction, mass_matrix=self.mass_matrix + more)
-
     def with_loads(self, loads: Sequence[Load | Mapping[str, Any]]) -> Problem:
         """The same problem under other loads, each as in a scene's ``loads``.
 
-        Mesh, operators and masses are shared, and so are factors of steppers that look at
-        them: the loads only enter on the right-hand side.
-
-        Raises
-        ------
-        SceneError
-            If a load is malformed, selects nothing or acts on held components only.
+        Mesh, operators and masses are shared, and factors made from them stay right.
         """
         scene = self.scene.with_changes(loads=list(loads))
         selector = Selector(self.mesh, self.space.positions, self.cell_size)
@@ -415,19 +367,10 @@ def coarse_model(scene: Scene, base: str = "plain", refine: int = 4) -> Problem:
     scene : Scene
     base : {"plain", "best", "total-mass"}
         As the scene says; with element and masses of `pdcorrect.scene.trained_coarse`; or with
-        its density scaled so that it has the total mass of the scene refined.  The last is for
-        ``mass = "per-node"``, by which a mesh is the heavier the coarser it is; with the other
-        rules it changes nothing but for regions of another density that end inside of coarse
-        cells.
+        its density scaled so that it has the total mass of the scene refined, for
+        ``mass = "per-node"``, by which a mesh is the heavier the coarser it is.
     refine : int
         Of the mesh with that mass: 4 is what correctors were trained beside.
-
-    Raises
-    ------
-    InputError
-        If the name is unknown.
-    SceneError, MeshError
-        See `discretise`.
     """
     if base not in BASES:
         raise InputError(f"base {base!r}: expected one of {', '.join(BASES)}.")

@@ -11,11 +11,8 @@ is linear in the cell's own coordinates xi, incompatible modes included: its L2 
 1, xi_1, xi_2, xi_3, as in B-bar methods (Simo, Taylor and Pister 1985 project it on constants).
 Bending changes volume linearly in the cell, so it keeps its stiffness; the products xi_1 xi_2
 etc., which no mode could relieve near nu = 0.5, are left out.  Nine points stand for the linear
-part: the mean, and eight like the Gauss points about it.  In small strain any points with the
-right second moments give the same.  In large bending F turns along the cell, so det F grows with
-the distance from the mean in the direction of bending: eight points at equal distances see that
-as one change of volume, which costs little; six on the axes do not, and are too stiff.  Without
-weight at the mean a folded cell could look right to all others.
+part: the mean, without which a folded cell could look right, and eight like the Gauss points
+about it: in large bending six on the axes are too stiff.
 
 *Incompatible modes* (hex8-bubble): three more shape functions a cell, B_m =
 1 - (2 xi_m - 1)^2 on the unit cell, without mass and without load, which bend with the
@@ -32,7 +29,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
@@ -126,25 +122,6 @@ class Quadrature:
         modes = np.einsum("cmq,cmi->cmiq", scaled, inverse)
         return replace(self, lanes=np.concatenate([self.lanes, modes], axis=1))
 
-    def laplacian(self, coefficient: Array, local: NDArray[np.int64], size: int) -> sp.csr_matrix:
-        """Sum of coefficient grad u . grad v, (size, size), for coefficients (C, Q).
-
-        ``local`` (C, L) numbers the shape functions.
-        """
-        count, width = local.shape
-        rows = self.lanes.reshape(count, width, -1)  # (C, L, 3Q)
-        scaled = (self.lanes * coefficient[:, None, None, :]).reshape(count, width, -1)
-        blocks = rows @ scaled.transpose(0, 2, 1)
-        return sp.csr_matrix(
-            sp.coo_matrix(
-                (
-                    blocks.ravel(),
-                    (np.repeat(local, width, axis=1).ravel(), np.tile(local, width).ravel()),
-                ),
-                shape=(size, size),
-            )
-        )
-
 
 _MEAN_SHARE = 0.1
 """Of the volume weight, at the mean of the linear part.  From 0.1 on folded cells come back
@@ -163,13 +140,7 @@ def linear_shares(weights: Array, points: Array) -> Array:
     With phi_i the cell's coordinates xi_i less their mean and made orthonormal over the cell, the
     projection of G is mean G + sum_i phi_i C_i, C_i = mean of phi_i G.  Its points are
     mean G + a (+- C_1 +- C_2 +- C_3), a^2 = 1 / (1 - share of the mean), and mean G.
-
-    Parameters
-    ----------
-    weights : (C, Q)
-        Rest volumes, m3.
-    points : (Q, 3)
-        On the unit cell.
+    ``weights`` (C, Q) are rest volumes, m3; ``points`` (Q, 3) lie on the unit cell.
     """
     parts = weights / weights.sum(axis=1, keepdims=True)
     centred = points - np.einsum("cq,qi->ci", parts, points)[:, None]
@@ -183,18 +154,10 @@ def linear_shares(weights: Array, points: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FaceQuadrature:
-    """Values and gradients on boundary faces, with what surface loads need.
+    """Values (n, Qf, K) and gradients (n, Qf, K, 3), 1/m, on boundary faces of these cells (n,).
 
-    Attributes
-    ----------
-    cells : (n,)
-        Owner of each face.
-    values : (n, Qf, K), gradients : (n, Qf, K, 3)
-        Shape functions of the owner's nodes, 1 and 1/m.
-    weights : (n, Qf)
-        Rest area, m2.
-    normals : (n, Qf, 3)
-        Outward unit normals at rest.
+    Of the cells' shape functions; ``weights`` (n, Qf) are rest areas, m2, ``normals`` (n, Qf, 3)
+    outward unit normals at rest.
     """
 
     cells: NDArray[np.int64]

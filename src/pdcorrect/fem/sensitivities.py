@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError
-from pdcorrect.fem import kernels
+from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.cell_correction import difference
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.energies import elasticity
 from pdcorrect.fem.hyperelasticity import model_name
@@ -29,19 +30,14 @@ def weight_slopes(body: ElasticBody, configuration: Array, x: Array) -> tuple[Ar
     Of the element alone, without what a learned one adds.  ``configuration`` y and x are
     (N + B, 3).
     """
-    quadrature, assembly = body.quadrature, body.assembly
+    quadrature, local = body.quadrature, body.space.local
     u = configuration - body.extended(body.positions)
     out = []
     for term, volumes in enumerate((quadrature.weights, quadrature.volume_weights)):
         weights = np.zeros((len(volumes), 2, volumes.shape[1]))
         weights[:, term] = volumes
-        energy, by_cell = np.empty(len(volumes)), np.empty((*assembly.cells.shape, 3))
-        kernels.energy_and_forces(
-            body.materials.model, u, assembly.cells, quadrature.lanes, weights,
-            quadrature.first_volume, energy, by_cell, assembly.start, assembly.slots,
-            np.empty_like(u),
-        )  # fmt: skip
-        out.append(-np.einsum("cki,cki->c", by_cell, x[assembly.cells]))
+        _, by_cell, _ = body.element_forces(u, weights)
+        out.append(-np.einsum("cki,cki->c", by_cell, x[local]))
     return out[0], out[1]
 
 
@@ -69,35 +65,26 @@ def tangent_slopes(
         C = elasticity(F, shear, volume, project=True, energy=energy)
         return np.einsum("cqij,cqijkl,cqkl->cq", along, C, across, optimize=True)
 
+    def along_way(step: Array) -> Array:
+        return difference(lambda t: contracted(F + t * step)) / _STEP
+
     slope = np.empty_like(F)
     for i in range(3):
         for j in range(3):
             step = np.zeros((3, 3))
             step[i, j] = _STEP
-            slope[..., i, j] = _difference(lambda t, e=step: contracted(F + t * e)) / _STEP
+            slope[..., i, j] = along_way(step)
     change = _STEP * body.materials.young
-    by_mu = _difference(lambda t: contracted(F, mu + t * change, omega)).sum(axis=1) / change
-    by_omega = _difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
+    by_mu = difference(lambda t: contracted(F, mu + t * change, omega)).sum(axis=1) / change
+    by_omega = difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
     by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
-    flat = cells.ravel()
-    by_shape = [np.bincount(flat, by_cell[..., i].ravel(), minlength=len(x)) for i in range(3)]
-    return np.stack(by_shape, axis=1), by_mu, by_omega
-
-
-def _difference(function) -> Array:  # type: ignore[no-untyped-def]
-    """Derivative at 0 of a function of t by central differences of fourth order, t = 1, 2."""
-    return (8.0 * (function(1.0) - function(-1.0)) - (function(2.0) - function(-2.0))) / 12.0
+    return scatter(cells, by_cell, len(x)), by_mu, by_omega
 
 
 class Following:
-    """Internal modes that follow the nodes, in equilibrium, at a configuration y.
+    """Internal modes that follow the nodes, in equilibrium, at a configuration (N + B, 3).
 
-    Parameters
-    ----------
-    body : ElasticBody
-    configuration : (N + B, 3)
-    project : bool
-        Whether their tangent is the projected one.
+    With ``project`` by their projected tangent.
     """
 
     def __init__(self, body: ElasticBody, configuration: Array, project: bool = False) -> None:

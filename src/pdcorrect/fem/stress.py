@@ -83,17 +83,7 @@ class Stress:
 
 
 def stress(problem: Problem, positions: Array) -> Stress:
-    """Stress of a body.
-
-    Parameters
-    ----------
-    problem : Problem
-    positions : (N, 3)
-        Of the nodes, m.  Internal modes are brought into equilibrium with them.
-
-    Returns
-    -------
-    Stress
+    """Stress of a body with its nodes at positions (N, 3), m, internal modes in equilibrium.
 
     Raises
     ------

@@ -37,7 +37,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
+from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.kernels import CHUNK, PARALLEL
 from pdcorrect.fem.kernels import gather_nodes as gather_nodes
 
@@ -72,14 +72,6 @@ def _product(A, B, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         for j in range(3):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j]
-
-
-@njit(**OPTIONS)
-def _back(R, A, out):  # type: ignore[no-untyped-def]
-    """R^T A."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = R[0, i] * A[0, j] + R[1, i] * A[1, j] + R[2, i] * A[2, j]
 
 
 @njit(**OPTIONS)
@@ -127,13 +119,14 @@ def _spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _frames(v, sizes, begin, end, F, U, s, V, B, W):  # type: ignore[no-untyped-def]
-    """Signed SVDs of a F for cells begin ... end - 1, one a lane; v (cells, 7, 3)."""
+def _frames(u, cells, shapes, sizes, v, F, U, s, V, B, W):  # type: ignore[no-untyped-def]
+    """Amplitudes v (cells, 7, 3), and signed SVDs of a F, one cell a lane."""
     for l in range(F.shape[1]):
-        c = min(begin + l, end - 1) - begin
+        c = min(l, len(cells) - 1)
+        _amplitudes(u, cells[c], shapes[c], v[l])
         for i in range(3):
             for j in range(3):
-                F[3 * i + j, l] = v[c, j, i] + (sizes[begin + c] if i == j else 0.0)
+                F[3 * i + j, l] = v[l, j, i] + (sizes[c] if i == j else 0.0)
     signed_svd_lanes(F, U, s, V, B, W)
 
 
@@ -215,8 +208,8 @@ def _to_stretch(z, y, A, fades):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _unpack(U, s, V, l, size, R, S, Y):  # type: ignore[no-untyped-def]
-    """R, S and (tr S - S)^-1 of lane l."""
+def _strains(v, U, s, V, l, size, R, S, Y, G, z):  # type: ignore[no-untyped-def]
+    """R, S, (tr S - S)^-1 and z of lane l; the rest as `_measures`, G being its A."""
     floor = KINK * size
     for i in range(3):
         for j in range(3):
@@ -227,16 +220,13 @@ def _unpack(U, s, V, l, size, R, S, Y):  # type: ignore[no-untyped-def]
                 t += both * s[a, l]
                 y += both / max(s[(a + 1) % 3, l] + s[(a + 2) % 3, l], floor)
             R[i, j], S[i, j], Y[i, j] = r, t, y
-
-
-@njit(**OPTIONS)
-def _strains(v, R, S, size, z):  # type: ignore[no-untyped-def]
     for n in range(6):
         i, j = _ROWS[n], _COLUMNS[n]
         z[n] = S[i, j] - size if i == j else S[i, j] / _ROOT
     for m in range(4):
         for i in range(3):
             z[6 + 3 * m + i] = R[0, i] * v[3 + m, 0] + R[1, i] * v[3 + m, 1] + R[2, i] * v[3 + m, 2]
+    return _measures(S, size, G, z)
 
 
 @njit(**OPTIONS)
@@ -252,12 +242,19 @@ def _turning(z, y, S, Y, T, A, t, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
+def _less_cross(T, w, out):  # type: ignore[no-untyped-def]
+    """T - [w]."""
+    out[:] = T
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[j, k] += w[i]
+        out[k, j] -= w[i]
+
+
+@njit(**OPTIONS)
 def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
     """Out (7, 3): R (T - [w]) transposed, R y_m; A is scratch."""
-    A[0, 0], A[1, 1], A[2, 2] = T[0, 0], T[1, 1], T[2, 2]
-    A[0, 1], A[1, 0] = T[0, 1] + w[2], T[1, 0] - w[2]
-    A[0, 2], A[2, 0] = T[0, 2] - w[1], T[2, 0] + w[1]
-    A[1, 2], A[2, 1] = T[1, 2] + w[0], T[2, 1] - w[0]
+    _less_cross(T, w, A)
     for i in range(3):
         for j in range(3):
             out[j, i] = R[i, 0] * A[0, j] + R[i, 1] * A[1, j] + R[i, 2] * A[2, j]
@@ -340,14 +337,7 @@ def _change(  # type: ignore[no-untyped-def]
             t[i] -= trace * w[i] - (B[i, 0] * w[0] + B[i, 1] * w[1] + B[i, 2] * w[2])
     _times(Y, t, dw)
     if factor != 0.0:  # R turns: [turn] (T - [w]) and turn x y_m
-        for j in range(3):
-            D[0, j], D[1, j], D[2, j] = T[0, j], T[1, j], T[2, j]
-        D[0, 1] += w[2]
-        D[1, 0] -= w[2]
-        D[0, 2] -= w[1]
-        D[2, 0] += w[1]
-        D[1, 2] += w[0]
-        D[2, 1] -= w[0]
+        _less_cross(T, w, D)
         for j in range(3):
             dT[0, j] += turn[1] * D[2, j] - turn[2] * D[1, j]
             dT[1, j] += turn[2] * D[0, j] - turn[0] * D[2, j]
@@ -361,38 +351,22 @@ def _change(  # type: ignore[no-untyped-def]
 def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell):  # type: ignore[no-untyped-def]
     """1/2 z . K z - shift . z of each cell, (C,), and its forces -d/du, (C, 8, 3).
 
-    Parameters
-    ----------
-    u : (N, 3)
-        Displacements, m.
-    cells : (C, 8)
-    shapes : (C, 7, 8)
-        a b_k and g_mk.
-    sizes : (C,)
-        a, m.
-    matrices : (C, 18, 18)
-        K, N/m.
-    shift : (C or 0, 18)
-        N; none where empty.
+    For displacements u (N, 3), m; shapes (C, 7, 8), a b_k and g_mk; sizes (C,), a, m; matrices
+    (C, 18, 18), K, N/m; shift (C, 18), N, or empty.
     """
     count = cells.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
-        s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
+        F, U, V, N, W, s, _, _ = scratch(CHUNK)
         v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        T, A, out = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
-        G = np.empty((3, 3))
-        t, w = np.empty(3), np.empty(3)
-        for c in range(begin, end):
-            _amplitudes(u, cells[c], shapes[c], v[c - begin])
-        _frames(v, sizes, begin, end, F, U, s, V, B, W)
+        T, A, G = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        out, t, w = np.empty((7, 3)), np.empty(3), np.empty(3)
+        here = slice(begin, end)
+        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
         for c in range(begin, end):
             l = c - begin
-            _unpack(U, s, V, l, sizes[c], R, S, Y)
-            _strains(v[l], R, S, sizes[c], z)
-            fades = _measures(S, sizes[c], G, z)
+            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, z)
             total = 0.0
             for n in range(18):
                 row = 0.0
@@ -415,18 +389,14 @@ def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
     count = cells.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
-        s, B, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
-        v = np.empty((CHUNK, 7, 3))
+        F, U, V, N, W, s, _, _ = scratch(CHUNK)
+        v, G = np.empty((CHUNK, 7, 3)), np.empty((3, 3))
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        G = np.empty((3, 3))
+        here = slice(begin, end)
+        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
         for c in range(begin, end):
-            _amplitudes(u, cells[c], shapes[c], v[c - begin])
-        _frames(v, sizes, begin, end, F, U, s, V, B, W)
-        for c in range(begin, end):
-            _unpack(U, s, V, c - begin, sizes[c], R, S, Y)
-            _strains(v[c - begin], R, S, sizes[c], out[c])
-            fades = _measures(S, sizes[c], G, out[c])
+            l = c - begin
+            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, out[c])
             for n in range(18):
                 out[c, n] *= fades[0] * fades[5]
 
@@ -441,8 +411,7 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
     factor = 0.0 if project else 1.0
     for chunk in prange((count + CHUNK - 1) // CHUNK):
         begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V = np.empty((9, CHUNK)), np.empty((9, CHUNK)), np.empty((9, CHUNK))
-        s, W9, W = np.empty((3, CHUNK)), np.empty((9, CHUNK)), np.empty((6, CHUNK))
+        F, U, V, N, W, s, _, _ = scratch(CHUNK)
         v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
         R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         T, A, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -450,14 +419,11 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
         t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
         dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
         raw, G = np.empty(18), np.empty((3, 3))
-        for c in range(begin, end):
-            _amplitudes(u, cells[c], shapes[c], v[c - begin])
-        _frames(v, sizes, begin, end, F, U, s, V, W9, W)
+        here = slice(begin, end)
+        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
         for c in range(begin, end):
             l = c - begin
-            _unpack(U, s, V, l, sizes[c], R, S, Y)
-            _strains(v[l], R, S, sizes[c], z)
-            fades = _measures(S, sizes[c], G, z)
+            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, z)
             for n in range(18):
                 row = 0.0
                 for m in range(18):

@@ -8,8 +8,7 @@ key, the value, and what was expected.  `docs/scene.md` lists all keys.
 from __future__ import annotations
 
 from pdcorrect.scene.bodies import Beam, Body, Cross, MeshFile, Voxels, Weight
-from pdcorrect.scene.clamps import Clamp, Motion
-from pdcorrect.scene.initial import Initial
+from pdcorrect.scene.clamps import Clamp, Initial, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.regions import Region

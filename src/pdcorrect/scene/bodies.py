@@ -1,15 +1,35 @@
-"""Bodies: voxel shapes and mesh files."""
+"""Bodies: voxel shapes and mesh files.
+
+A voxel shape tells which cells of a regular grid are solid, and the index of the grid cell whose
+lowest corner lies at ``origin``, so that a shape may extend to lower coordinates.
+"""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal, Union
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import Cells, Count, Positive, PositiveCount, Strict, Vector
-from pdcorrect.scene import voxels
+from pdcorrect.errors import SceneError
+
+_MOST_CELLS = 10**8
+
+Occupancy = tuple[NDArray[np.bool_], tuple[int, int, int]]
+
+
+def _grid(cells: tuple[int, int, int]) -> NDArray[np.bool_]:
+    """Empty grid, if it is of a size that can be meant."""
+    if math.prod(cells) > _MOST_CELLS:
+        raise SceneError(
+            f"body: a grid of {cells[0]} x {cells[1]} x {cells[2]} cells: expected at most "
+            f"{_MOST_CELLS:.0e} in all."
+        )
+    return np.zeros(cells, dtype=bool)
 
 
 class _VoxelBody(Strict):
@@ -23,13 +43,25 @@ class Beam(_VoxelBody):
     shape: Literal["beam"]
     cells: Cells
 
-    def occupancy(self) -> voxels.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
-        return voxels.beam(self.cells)
+    def occupancy(self) -> Occupancy:
+        """Solid cells (nx, ny, nz) and the index of the cell at the origin."""
+        return _grid(self.cells) | True, (0, 0, 0)
 
 
 class Cross(_VoxelBody):
-    """Beam along x with two or four perpendicular branches (thesis fig. 6.1)."""
+    """Beam along x with symmetric perpendicular branches (thesis fig. 6.1).
+
+    Attributes
+    ----------
+    cells
+        Of the central beam along x, y, z; its corner is the origin.
+    arms
+        2: branches along +z and -z; 4: along +y and -y as well.
+    arm_start, arm_width
+        The branches cover the cells ``arm_start <= i < arm_start + arm_width`` along x.
+    arm_length
+        Cells by which each branch sticks out of the beam.
+    """
 
     shape: Literal["cross"]
     cells: Cells
@@ -38,13 +70,48 @@ class Cross(_VoxelBody):
     arm_width: PositiveCount = 2
     arm_length: PositiveCount
 
-    def occupancy(self) -> voxels.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
-        return voxels.cross(self.cells, self.arms, self.arm_start, self.arm_width, self.arm_length)
+    def occupancy(self) -> Occupancy:
+        """Solid cells (nx, ny, nz) and the index of the cell at the origin."""
+        nx, ny, nz = self.cells
+        end, length = self.arm_start + self.arm_width, self.arm_length
+        if end > nx:
+            raise SceneError(
+                f"body.arm_start + body.arm_width = {end}: expected at most the {nx} cells of the "
+                "beam along x. Move the arms or lengthen the beam."
+            )
+        side = length if self.arms == 4 else 0
+        solid = _grid((nx, ny + 2 * side, nz + 2 * length))
+        beam_y, beam_z = slice(side, side + ny), slice(length, length + nz)
+        arm_x = slice(self.arm_start, end)
+        solid[:, beam_y, beam_z] = True
+        solid[arm_x, beam_y, :] = True
+        if self.arms == 4:
+            solid[arm_x, :, beam_z] = True
+        return solid, (0, side, length)
 
 
 class Weight(_VoxelBody):
-    """Support beams, a pendulum, and its inflated part (thesis fig. 6.2)."""
+    """One or two support beams and a pendulum with an inflation (thesis fig. 6.2).
+
+    The first support lies along x with a corner at the origin.  A second one, if any, crosses it
+    along y, centred on it, at the place of the pendulum.  The pendulum hangs below (towards -z)
+    and carries the inflated part.
+
+    Attributes
+    ----------
+    support_cells
+        Of the first support along x, y, z.
+    second_support_length
+        Cells of the second support along y; 0 leaves it out.
+    pendulum_start
+        First cell of the pendulum, and of the second support, along x.
+    pendulum_cells
+        Of the pendulum along x, y and downwards.
+    weight_start
+        Cells between the support and the inflated part.
+    weight_cells
+        Of the inflated part along x, y and downwards, centred on the pendulum.
+    """
 
     shape: Literal["weight"]
     support_cells: Cells
@@ -54,16 +121,59 @@ class Weight(_VoxelBody):
     weight_start: Count
     weight_cells: Cells
 
-    def occupancy(self) -> voxels.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
-        return voxels.weight(
-            self.support_cells,
-            self.second_support_length,
-            self.pendulum_start,
-            self.pendulum_cells,
-            self.weight_start,
-            self.weight_cells,
-        )
+    def occupancy(self) -> Occupancy:
+        """Solid cells (nx, ny, nz) and the index of the cell at the origin."""
+        self._check()
+        (sx, sy, sz), (px, py, pz) = self.support_cells, self.pendulum_cells
+        wx, wy, wz = self.weight_cells
+        start, second = self.pendulum_start, self.second_support_length
+        half_x = (wx - px) // 2
+        left, right = max(0, half_x - start), max(0, start + px + half_x - sx)
+        width = max(sy, py, wy, second)
+        solid = _grid((left + sx + right, width, sz + pz))
+
+        def centred(size: int) -> slice:
+            first = (width - size) // 2
+            return slice(first, first + size)
+
+        x0 = left + start
+        solid[left : left + sx, centred(sy), pz:] = True
+        if second:
+            solid[x0 : x0 + px, centred(second), pz:] = True
+        solid[x0 : x0 + px, centred(py), :pz] = True
+        top = pz - self.weight_start
+        solid[x0 - half_x : x0 + px + half_x, centred(wy), top - wz : top] = True
+        return solid, (left, (width - sy) // 2, pz)
+
+    def _check(self) -> None:
+        support, pendulum, inflated = self.support_cells, self.pendulum_cells, self.weight_cells
+        end = self.pendulum_start + pendulum[0]
+        if end > support[0]:
+            raise SceneError(
+                f"body.pendulum_start + body.pendulum_cells[0] = {end}: expected at most the "
+                f"{support[0]} cells of the support along x."
+            )
+        end = self.weight_start + inflated[2]
+        if end > pendulum[2]:
+            raise SceneError(
+                f"body.weight_start + body.weight_cells[2] = {end}: expected at most the "
+                f"{pendulum[2]} cells of the pendulum downwards."
+            )
+        for axis, name in enumerate("xy"):
+            excess = inflated[axis] - pendulum[axis]
+            if excess < 0 or excess % 2:
+                raise SceneError(
+                    f"body.weight_cells[{axis}] = {inflated[axis]}: expected the pendulum's "
+                    f"{pendulum[axis]} cells along {name} plus an even number, so that the "
+                    "inflated part is centred."
+                )
+        second, wide = self.second_support_length, support[1]
+        for name, size in (("pendulum_cells[1]", pendulum[1]), ("second_support_length", second)):
+            if size and (size - wide) % 2:
+                raise SceneError(
+                    f"body.{name} = {size}: expected the support's {wide} cells along y plus or "
+                    "minus an even number, so that it is centred."
+                )
 
 
 class Voxels(_VoxelBody):
@@ -80,9 +190,12 @@ class Voxels(_VoxelBody):
             raise ValueError("expected all planes and rows of occupancy to have the same length")
         return self
 
-    def occupancy(self) -> voxels.Occupancy:
-        """Solid cells and the index of the cell at the origin, see `pdcorrect.scene.voxels`."""
-        return voxels.voxels(np.array(self.occupancy_list))
+    def occupancy(self) -> Occupancy:
+        """Solid cells (nx, ny, nz), the corner at the origin."""
+        solid = np.array(self.occupancy_list, dtype=bool)
+        if not solid.any():
+            raise SceneError("body.occupancy has no solid cells: expected at least one 1.")
+        return solid, (0, 0, 0)
 
 
 class MeshFile(Strict):

@@ -1,13 +1,18 @@
-"""Clamps: held, rolling or moving."""
+"""How the body is held and how it starts: clamps and initial velocities."""
 
 from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pdcorrect._config import Axis, Number, Strict, Vector
 from pdcorrect.scene.regions import Region
+
+Array = NDArray[np.float64]
+_STILL: Vector = (0.0, 0.0, 0.0)
 
 
 class Motion(Strict):
@@ -55,3 +60,30 @@ class Clamp(Strict):
     region: Region
     components: tuple[Axis, ...] = Field(default=("x", "y", "z"), min_length=1)
     motion: Motion | None = None
+
+
+class Initial(Strict):
+    """Velocities at time zero: v + w x (X - c) + G (X - c) at the rest position X.
+
+    Attributes
+    ----------
+    velocity
+        v, m/s.
+    angular_velocity
+        w, rad/s.
+    velocity_gradient
+        G, rows of the derivatives of v_x, v_y, v_z by x, y, z, 1/s.
+    centre
+        c, m; the centre of mass by default.
+    """
+
+    velocity: Vector = _STILL
+    angular_velocity: Vector = _STILL
+    velocity_gradient: tuple[Vector, Vector, Vector] = (_STILL, _STILL, _STILL)
+    centre: Vector | None = None
+
+    def velocities(self, points: Array, centre_of_mass: Array) -> Array:
+        """The field at rest positions (n, 3), m, as (n, 3), m/s."""
+        arms = points - (centre_of_mass if self.centre is None else np.array(self.centre))
+        spin = np.cross(np.array(self.angular_velocity), arms)
+        return np.array(self.velocity) + spin + arms @ np.array(self.velocity_gradient).T

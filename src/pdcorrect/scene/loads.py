@@ -27,12 +27,11 @@ class _Load(Strict):
 
     @model_validator(mode="after")
     def _amplitude(self) -> _Load:
-        if self.window is not None and self.window[0] >= self.window[1]:
-            told = as_toml(self.window)
-            raise ValueError(f"expected window = [start, end] with start < end, got {told}")
-        if self.window is not None and self.window[1] <= 0:
-            told = as_toml(self.window)
-            raise ValueError(f"expected a window that ends after time 0, got {told}")
+        if self.window is not None and not max(self.window[0], 0.0) < self.window[1]:
+            raise ValueError(
+                "expected window = [start, end] with start < end and an end after time 0, got "
+                f"{as_toml(self.window)}"
+            )
         if self.table is not None:
             if self.window is not None or self.ramp:
                 raise ValueError("expected either table, or window and ramp, not both")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -11,8 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from pdcorrect._config import NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.scene.bodies import Body, MeshFile
-from pdcorrect.scene.clamps import Clamp
-from pdcorrect.scene.initial import Initial
+from pdcorrect.scene.clamps import Clamp, Initial
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
 
@@ -193,13 +192,9 @@ class Scene(TomlConfig):
         return scene
 
     def with_changes(self, **sections: Any) -> Scene:
-        """The same scene with some sections' keys replaced.
+        """The same scene with some sections' keys replaced, as ``material={"poisson": 0.3}``.
 
         Another element leaves ``solver.weights`` out.
-
-        Examples
-        --------
-        ``scene.with_changes(material={"poisson": 0.3}, time={"frames": 5})``
         """
         data = self.model_dump(mode="python", exclude_none=True, exclude_unset=True, by_alias=True)
         for section, change in sections.items():
@@ -213,22 +208,12 @@ class Scene(TomlConfig):
 
 
 def check_scene(scene: object) -> None:
-    """Refuse what is no scene, with the call that makes one of it.
-
-    Raises
-    ------
-    InputError
-    """
-    if isinstance(scene, Scene):
-        return
-    call = "Scene.load(path)"
-    if isinstance(scene, dict):
-        call = "Scene(**scene)"
-    elif isinstance(scene, str) and ("\n" in scene or "=" in scene):
-        call = "Scene.from_toml(scene)"
-    elif isinstance(scene, (str, PurePath)):
-        call = f"Scene.load({str(scene)!r})"
-    raise InputError(f"scene is a {type(scene).__name__}: expected a Scene, as of {call}.")
+    """Refuse what is no scene, with the calls that make one."""
+    if not isinstance(scene, Scene):
+        raise InputError(
+            f"scene is a {type(scene).__name__}: expected a Scene, as of Scene.load(path), "
+            "Scene.from_toml(text) or Scene(**sections)."
+        )
 
 
 def best_coarse(scene: Scene) -> Scene:
@@ -237,44 +222,13 @@ def best_coarse(scene: Scene) -> Scene:
     Element "hex8-enhanced" and averaged mass: of the elements with 8 nodes the one that bends
     as beam theory says, however many cells a body is thick (`validation/cantilever`).  What is
     left of the plain coarse mesh's error is in `validation/best_coarse`.
-
-    Loads stay as they are.  "consistent" ones are already integrated with the shape
-    functions; "nodal" ones are concentrated forces, so to spread them would be another
-    problem.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Scene
-
-    Examples
-    --------
-    >>> scene = Scene(
-    ...     body={"shape": "beam", "cells": [4, 2, 2], "cell_size": 0.1},
-    ...     material={"young": 1e5, "poisson": 0.3, "density": 1e3},
-    ...     time={"step": 0.01, "frames": 10},
-    ... )
-    >>> best_coarse(scene).solver.element
-    'hex8-enhanced'
     """
     check_scene(scene)
     return scene.with_changes(solver={"element": "hex8-enhanced", "mass": "averaged"})
 
 
 def learned_coarse(scene: Scene) -> Scene:
-    """The scene on its coarse mesh with the learned element, see `pdcorrect.fem.learned`.
-
-    Parameters
-    ----------
-    scene : Scene
-
-    Returns
-    -------
-    Scene
-    """
+    """The scene on its coarse mesh with the learned element, see `pdcorrect.fem.learned`."""
     check_scene(scene)
     return scene.with_changes(solver={"element": "hex8-learned", "mass": "averaged"})
 
@@ -282,9 +236,8 @@ def learned_coarse(scene: Scene) -> Scene:
 def trained_coarse(scene: Scene) -> Scene:
     """The scene with the element and mass that correctors of the base "best" were trained on.
 
-    Data sets of the setting "exact" have them in their runs "best" and "reference".  Element
-    "hex8-bubble-mean" and averaged mass; "hex8-bubble" for a body that is one cell thick
-    somewhere, where the other bends too easily; of bodies from mesh files that is not looked for.
+    Element "hex8-bubble-mean" and averaged mass; "hex8-bubble" for a voxel body that is one cell
+    thick somewhere, where the other bends too easily.
     """
     check_scene(scene)
     element = "hex8-bubble" if _one_cell_thick(scene.body) else "hex8-bubble-mean"

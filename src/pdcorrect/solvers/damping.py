@@ -76,11 +76,11 @@ class Viscous:
             self.written = WrittenViscous(problem, factors, self.places, self.rate)
 
     def change(self, stretches: Stretches) -> Array:
-        """S(y) - S', (C, 6, Q)."""
+        """S(y) - S', (C, 9, Q)."""
         return np.asarray(stretches.tensor - self._before)
 
     def stress(self, stretches: Stretches) -> Array:
-        """R C : (S(y) - S') times the points' volumes, (C, 6, Q), J."""
+        """R C : (S(y) - S') times the points' volumes, (C, 9, Q), J."""
         return self.rate * small_strain_stress(self._problem, self.change(stretches))
 
     def loss(self, y: Array, h: float) -> float:

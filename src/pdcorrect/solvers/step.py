@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.assembly import Linearisation
+from pdcorrect.fem.elastic_body import Linearisation
 from pdcorrect.fem.factorisation import (
     Backend,
     Factor,
