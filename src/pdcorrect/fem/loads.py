@@ -12,6 +12,7 @@ from pdcorrect.errors import SceneError
 from pdcorrect.fem.assembly import scatter
 from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.operators import Space
+from pdcorrect.fem.quadrature import FaceQuadrature
 from pdcorrect.scene import (
     BodyForce,
     Force,
@@ -178,64 +179,100 @@ def _traction(load: Traction, space: Space, selector: Selector, mass: Array, key
     return _fixed(scatter(space.cells[face.cells], values, len(space.positions)))
 
 
-def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
-    """By Nanson's formula, n da = cof(F) N dA."""
-    face = space.face_quadrature(selector.faces(load.region, key))
-    nodes = space.cells[face.cells]
-    areas = -load.pressure * face.weights[..., None] * face.normals
+@dataclass(frozen=True, eq=False)
+class _Pressure:
+    """Nanson's formula: n da = cof(F) N dA."""
 
-    def deformation(positions: Array) -> Array:
-        return np.einsum("nki,nqkj->nqij", positions[nodes], face.gradients)
+    pressure: float
+    face: FaceQuadrature
+    nodes: NDArray[np.int64]
 
-    def sample(positions: Array) -> Array:
-        forces = np.einsum("nqij,nqj->nqi", cofactor(deformation(positions)), areas)
-        return scatter(nodes, np.einsum("nqk,nqi->nki", face.values, forces), len(positions))
+    def sample(self, positions: Array) -> Array:
+        face = self.face
+        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
+        area = np.einsum("nqij,nqj->nqi", cofactor(F), face.normals)
+        values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -self.pressure * area)
+        return scatter(self.nodes, values, len(positions))
 
-    def pull(positions: Array, x: Array) -> Array:
-        at_points = np.einsum("nqk,nki->nqi", face.values, x[nodes])
-        slope = tensor_cross(deformation(positions), at_points[..., None] * areas[..., None, :])
+    def pull(self, positions: Array, x: Array) -> Array:
+        face = self.face
+        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
+        at_points = -self.pressure * np.einsum(
+            "nq,nqk,nki->nqi", face.weights, face.values, x[self.nodes]
+        )
+        slope = tensor_cross(F, at_points[..., :, None] * face.normals[..., None, :])
         values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
-        return scatter(nodes, values, len(positions))
+        return scatter(self.nodes, values, len(positions))
 
-    return sample, pull
+
+def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
+    face = space.face_quadrature(selector.faces(load.region, key))
+    field = _Pressure(load.pressure, face, space.cells[face.cells])
+    return field.sample, field.pull
+
+
+@dataclass(frozen=True, eq=False)
+class _TorsionField:
+    """The field at points, N/m3 or N."""
+
+    load: Torsion
+    centre: Array
+
+    def __call__(self, points: Array) -> Array:
+        about, load = points - self.centre, self.load
+        return load.strength * torsion_field(about, load.attraction, load.stretch)
+
+    def pull(self, points: Array, x: Array) -> Array:
+        about, load = points - self.centre, self.load
+        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
+
+
+@dataclass(frozen=True, eq=False)
+class _NodalTorsion:
+    """The field at some nodes."""
+
+    field: _TorsionField
+    nodes: NDArray[np.int64]
+
+    def sample(self, positions: Array) -> Array:
+        out = np.zeros_like(positions)
+        out[self.nodes] = self.field(positions[self.nodes])
+        return out
+
+    def pull(self, positions: Array, x: Array) -> Array:
+        out = np.zeros_like(positions)
+        out[self.nodes] = self.field.pull(positions[self.nodes], x[self.nodes])
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class _CellTorsion:
+    """The field integrated over cells, ``inside`` (C, 1, 1) being 1 there."""
+
+    field: _TorsionField
+    space: Space
+    inside: Array
+
+    def sample(self, positions: Array) -> Array:
+        at_rest = positions is self.space.positions
+        points = self.space.points if at_rest else self.space.interpolate(positions)
+        return self.space.body_load(self.field(points) * self.inside)
+
+    def pull(self, positions: Array, x: Array) -> Array:
+        space = self.space
+        forces = space.body_load_transposed(x) * self.inside
+        return space.interpolate_transposed(self.field.pull(space.interpolate(positions), forces))
 
 
 def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
     rest = space.positions
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    centre = middle if load.centre is None else np.array(load.centre)
-
-    def field(points: Array) -> Array:
-        return load.strength * torsion_field(points - centre, load.attraction, load.stretch)
-
-    def field_pull(points: Array, x: Array) -> Array:
-        return load.strength * torsion_pull(points - centre, load.attraction, load.stretch, x)
-
+    field = _TorsionField(load, middle if load.centre is None else np.array(load.centre))
     if load.distribution == "nodal":
-        nodes = selector.coarse_nodes(load.region, key)
-
-        def sample(positions: Array) -> Array:
-            out = np.zeros_like(positions)
-            out[nodes] = field(positions[nodes])
-            return out
-
-        def pull(positions: Array, x: Array) -> Array:
-            out = np.zeros_like(positions)
-            out[nodes] = field_pull(positions[nodes], x[nodes])
-            return out
-
-        return sample, pull
-    inside = _inside(space, selector.cells(load.region, key))
-
-    def spread(positions: Array) -> Array:
-        points = space.points if positions is rest else space.interpolate(positions)
-        return space.body_load(field(points) * inside)
-
-    def spread_pull(positions: Array, x: Array) -> Array:
-        forces = space.body_load_transposed(x) * inside
-        return space.interpolate_transposed(field_pull(space.interpolate(positions), forces))
-
-    return spread, spread_pull
+        nodal = _NodalTorsion(field, selector.coarse_nodes(load.region, key))
+        return nodal.sample, nodal.pull
+    spread = _CellTorsion(field, space, _inside(space, selector.cells(load.region, key)))
+    return spread.sample, spread.pull
 
 
 _SAMPLERS: dict[type, Callable[..., Sampler]] = {
