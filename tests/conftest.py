@@ -26,7 +26,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # kernels of one thread each, as the ot
 
 LONG = (
     "test_faults", "test_pages", "test_resume", "test_steppers", "test_tiny_again",
-    "test_torch_layer", "test_training_together", "test_training_unrolled", "test_validation",
+    "test_torch_layer", "test_training_unrolled", "test_validation",
 )  # fmt: skip
 """Files of long tests, late in the alphabet: first, so that no process ends far behind."""
 

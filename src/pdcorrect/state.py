@@ -45,8 +45,8 @@ class State:
     memory : mapping of str to (N, 3) float64
         What the next step depends on besides, by name: for a time integrator accelerations and
         forces, or positions and velocities of an earlier frame; for a `HybridStepper` the
-        correction before, and for how many steps its gate is shut.  It belongs to these positions
-        and velocities, and to one mesh, element and material: leave it out when you change them.
+        correction before.  It belongs to these positions and velocities, and to one mesh, element
+        and material: leave it out when you change them.
     """
 
     positions: Array
