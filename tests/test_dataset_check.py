@@ -283,6 +283,16 @@ def body_of(shard, other):
     return dataclasses.replace(shard, attributes=other.attributes)
 
 
+def test_equal_bodies_are_found(dataset):
+    second = dataset / "training/mesh-0001.h5"
+    twin = renumbered(read_shard(dataset / FIRST))
+    changed(second, lambda s: body_of(twin, s))
+    assert FIRST in one(dataset, "training/mesh-0001.h5")
+    softer = dataclasses.replace(twin, young=0.5 * twin.young)
+    changed(second, lambda s: body_of(softer, s))
+    assert not any(FIRST in message for _, message in findings(dataset))
+
+
 def test_equal_simulations_of_two_files_are_found(dataset):
     second = dataset / "training/mesh-0001.h5"
     twin = read_shard(dataset / FIRST)

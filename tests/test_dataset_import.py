@@ -15,6 +15,7 @@ from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.shard_reader import read_shard
 from pdcorrect.errors import FileFormatError, InputError, MeshError
+from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.scene import trained_coarse
 from pdcorrect.solvers.rollout import restrict
 
@@ -160,6 +161,20 @@ def test_wrong_arrays_are_refused_with_the_place(changes, words):
     assert "\n" not in str(caught.value)
 
 
+def test_a_reference_with_one_corner_folded_is_refused():
+    shard = samples.shard(steps=(4,))
+    cell, points = shard.cells[-1], shard.points
+    corner = (np.bincount(shard.cells.ravel())[cell] == 1).argmax()  # of this cell alone
+    inwards = points[cell].mean(axis=0) - points[cell[corner]]
+    folded = with_entry(REFERENCE, (2, cell[corner]), points[cell[corner]] + 1.6 * inwards)
+    (found,) = jacobians(folded[2], cell[None], gauss_points(2))
+    (centre,) = jacobians(folded[2], cell[None], np.full((1, 3), 0.5))
+    assert (found < 0).sum() == 1
+    assert centre > 0
+    with pytest.raises(InputError, match=f"reference: cell {len(shard.cells) - 1} .* row 2"):
+        shard_from_arrays(**arguments(motions=motion_with(reference=folded)))
+
+
 def test_wrong_meshes_are_refused():
     cells = arguments()["cells"].copy()
     cells[2] = cells[2][[4, 5, 6, 7, 0, 1, 2, 3]]
@@ -226,6 +241,52 @@ def scene_arguments(**changes):
         "free": problem.free, "young": materials.young, "poisson": materials.poisson,
         "density": materials.density, "time_step": 0.01, "scene": scene,
     }  # fmt: skip
+
+
+def test_follower_loads_of_the_scene_are_those_where_a_step_ends():
+    pressure = {
+        "kind": "pressure", "pressure": 2e3, "follower": True,
+        "region": {"plane": "z", "at": "max"},
+    }  # fmt: skip
+    given = scene_arguments(loads=[pressure])
+    (found,) = shard_from_arrays(**given, best=True).simulations
+    x = given["motions"].reference
+    state = pc.State(x[2], (x[2] - x[1]) / 0.01, 0.02)
+    plain, best = (
+        pc.ProjectiveDynamics(pc.discretise(scene))
+        for scene in (given["scene"], trained_coarse(given["scene"]))
+    )
+    for name, stepper in (("plain", plain), ("best", best)):
+        expected = stepper(state).state.positions
+        np.testing.assert_array_equal(found.runs[name].predictions[2], expected)
+    np.testing.assert_array_equal(found.runs["best"].positions, pc.rollout(best).positions)
+    loads = plain.problem.external_forces(0.02, 0.03, x[2])
+    np.testing.assert_array_equal(found.forces[2], loads)
+
+
+def test_a_mass_may_be_another_than_the_scene_s():
+    given = scene_arguments()
+    mass = 2.0 * pc.discretise(given["scene"]).mass
+    np.testing.assert_array_equal(shard_from_arrays(**given, mass=mass).mass, mass)
+
+
+def test_steps_of_the_coarse_model_may_invert_cells():
+    time = {"step": 1e-5, "frames": 2, "integrator": "backward-euler"}
+    scene = beam(cells=(2, 1, 1), poisson=0.0, clamps=[], loads=[], time=time)
+    problem = pc.discretise(scene)
+    rest = problem.positions
+    flat = rest * [1.0, 1.0, 0.4]  # and on in the same way
+    given = {
+        "points": rest, "cells": problem.cells, "free": problem.free, "young": 1e6,
+        "poisson": 0.0, "density": 1e3, "time_step": 1e-5,
+    }  # fmt: skip
+    motion = ImportedMotion(np.stack([rest, flat, flat]))
+    (found,) = shard_from_arrays(**given, motions=motion, scene=scene).simulations
+    predictions = found.runs["plain"].predictions
+    assert problem.volume_ratios(predictions[1]).max() < 0
+    again = replace(motion, predictions=predictions)
+    (same,) = shard_from_arrays(**given, motions=again).simulations
+    np.testing.assert_array_equal(same.runs["plain"].predictions, predictions)
 
 
 MOVING = {"times": [0.0, 1.0], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]]}

@@ -66,7 +66,7 @@ def test_work_counts_the_refined_nodes_of_all_steps_and_a_cpu_takes_meshes_in_or
     assert generate._units(SHARED, plans, Workers(2)) == [[plan] for plan in plans]
 
 
-def test_a_worker_sees_its_own_gpu_alone(monkeypatch):
+def test_a_worker_sees_its_own_gpu_alone_or_takes_it_by_number_if_cuda_has_begun(monkeypatch):
     torch = pytest.importorskip("torch")
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
 
@@ -75,12 +75,17 @@ def test_a_worker_sees_its_own_gpu_alone(monkeypatch):
         return len(named.split(",")) if named else 4
 
     monkeypatch.setattr(torch.cuda, "device_count", count)
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: False)
     for _ in range(2):  # the next unit finds what the first one set
         assert workers._own_gpu(6) == "cuda"
         assert os.environ["CUDA_VISIBLE_DEVICES"] == "2"
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
     assert workers._own_gpu(3) == "cuda"
     assert os.environ["CUDA_VISIBLE_DEVICES"] == "7"
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
+    assert workers._own_gpu(6) == "cuda:2"
+    assert "CUDA_VISIBLE_DEVICES" not in os.environ
 
 
 def one_problem(frames):

@@ -92,6 +92,8 @@ def test_readers_leave_out_files_by_name(several):
         (kept,) = {header.path for header in found.headers}
         assert {recording.path for recording in recordings} == {kept}
         assert kept != several / f"{name}.h5"
+        every = TrajectoryDataset(several, split, without=[f"{several.name}/{name}"])
+        assert len(every.headers) == 2  # no file's name
         with pytest.raises(InputError, match=split):
             TrajectoryDataset(several, split, without=[name, f"{split}/{kept.stem}"])
 

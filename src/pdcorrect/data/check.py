@@ -35,12 +35,17 @@ _OTHERS = (CONFIG, MANIFEST, "README.md")
 Severity = Literal["error", "warning"]
 
 
-def mesh_digest(shard: Shard) -> str:
-    """Equal for equal meshes, whatever the numbering of nodes and cells and the place in space."""
+def body_digests(shard: Shard) -> tuple[str, str]:
+    """Equal for equal meshes, and for equal meshes with equal materials.
+
+    Neither the numbering of nodes and cells nor the place in space matters.
+    """
     points = (shard.points - shard.points.min(axis=0)) / cell_size(shard)
     centres = points[shard.cells].mean(axis=1)
-    rounded = (np.round(values, _DIGITS) + 0.0 for values in (points, centres))  # no minus zero
-    return "".join(_digest(rows[np.lexsort(rows.T)]) for rows in rounded)
+    points, centres = (np.round(x, _DIGITS) + 0.0 for x in (points, centres))  # no minus zero
+    cells = np.column_stack([centres, shard.young, shard.poisson, shard.density])
+    nodes, shape, body = (_digest(x[np.lexsort(x.T)]) for x in (points, centres, cells))
+    return nodes + shape, nodes + body
 
 
 def load_digest(simulation: Simulation) -> str:
@@ -133,6 +138,7 @@ class _Check:
     plans: dict[Path, MeshPlan] | None = None  # of the files that should be there
     hashes: dict[str, Any] | None = None  # of the files' contents, by the manifest
     meshes: dict[str, Path] = field(default_factory=dict)  # first file with a mesh, by digest
+    bodies: dict[str, Path] = field(default_factory=dict)  # and with a material, too
     forces: dict[str, str] = field(default_factory=dict)  # where forces on a mesh came first
     origins: dict[str, dict[str, Path]] = field(default_factory=dict)  # by code, and by device
 
@@ -231,9 +237,9 @@ class _Check:
             known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
-        """Meshes and loads that came before."""
-        shape = mesh_digest(shard)
-        first = self.meshes.setdefault(shape, path)
+        """Meshes, materials and loads that came before."""
+        shape, body = body_digests(shard)
+        first, twin = self.meshes.setdefault(shape, path), self.bodies.setdefault(body, path)
         if first.parent != path.parent:
             told = f"its mesh is that of {self._short(first)}"
             if self.plans is None:
@@ -244,6 +250,8 @@ class _Check:
                 self.note(path, told, "warning")
             else:
                 self.note(path, f"leakage: {told}, in another split")
+        elif twin != path:
+            self.note(path, f"its mesh and material are those of {self._short(twin)}")
         for k, simulation in enumerate(shard.simulations):
             here = f"simulation {k:04d} of {self._short(path)}"
             before = self.forces.setdefault(shape + load_digest(simulation), here)

@@ -81,6 +81,7 @@ class OneByOne:
     ----------
     solver : {"pd", "newton"}
         "pd" without fallbacks and with at most `MOST_ITERATIONS`, unless it may ``recover``.
+        Then, too, cells may be inverted.
     tolerance : float
         Of the coarse cell size.
     adds_up : bool
@@ -92,6 +93,7 @@ class OneByOne:
         self, solver: SolverName, tolerance: float, adds_up: bool = False, *, recover: bool = False
     ) -> None:
         self._solver, self._tolerance, self._adds_up = solver, tolerance, adds_up
+        self._recover = recover
         self._options: dict[str, Any] = (
             {} if recover else {"max_iterations": MOST_ITERATIONS, "recover": False}
         )
@@ -116,7 +118,7 @@ class OneByOne:
         for problem, states in zip(problems, starts, strict=True):
             began = time.perf_counter()
             stepper = self._stepper(steppers, problem, divisor)
-            frames, failure = _frames(stepper, problem, states, divisor)
+            frames, failure = _frames(stepper, problem, states, divisor, self._recover)
             columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
             positions, velocities, iterations, errors, ratios = columns
             seconds = time.perf_counter() - began
@@ -124,17 +126,20 @@ class OneByOne:
         return out
 
     def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:
-        """One stepper, without loads, for all problems on the same mesh."""
-        key = id(problem.space)
+        """One stepper, without loads, for all problems on the same mesh.
+
+        Follower loads depend on where a step ends: it takes their own problem's stepper.
+        """
+        own = problem.has_followers
+        key = id(problem if own else problem.space)
         if key not in known:
-            unloaded, step = problem.with_loads([]), problem.time_step / divisor
+            stepped = problem if own else problem.with_loads([])
+            step = problem.time_step / divisor
             tolerance = self._tolerance / (divisor**2 if self._adds_up else 1)
             if self._solver == "newton":
-                known[key] = Newton(unloaded, tolerance, time_step=step)
+                known[key] = Newton(stepped, tolerance, time_step=step)
             else:
-                known[key] = ProjectiveDynamics(
-                    unloaded, tolerance, time_step=step, **self._options
-                )
+                known[key] = ProjectiveDynamics(stepped, tolerance, time_step=step, **self._options)
         return known[key]
 
 
@@ -146,21 +151,30 @@ def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Arr
 
 
 def _frames(
-    stepper: ImplicitStepper, problem: Problem, starts: Sequence[State | None], divisor: int
+    stepper: ImplicitStepper,
+    problem: Problem,
+    starts: Sequence[State | None],
+    divisor: int,
+    inverted: bool,
 ) -> tuple[list[tuple[Any, ...]], str]:
-    """The columns of `Steps` frame by frame, up to the first failure, and that one."""
+    """The columns of `Steps` frame by frame, up to the first failure, and that one.
+
+    Cells may be ``inverted``, or that is a failure.
+    """
     frames: list[tuple[Any, ...]] = []
     nodes, state, failure = problem.mesh.coarse_nodes, problem.initial_state(), ""
     for start in starts:
         state = state if start is None else start
         iterations, error, ratio = 0, 0.0, np.inf
         for _ in range(divisor):
-            result: StepResult = stepper(state, step_forces(stepper, problem, state))
+            loaded = stepper.problem is problem
+            forces = None if loaded else step_forces(stepper, problem, state)
+            result: StepResult = stepper(state, forces)
             state = result.state
             iterations += result.iterations
             error = max(error, result.error_estimate)
             ratio = min(ratio, result.stats["smallest_volume_ratio"])
-            failure = failure or failure_of(result.status, ratio)
+            failure = failure or failure_of(result.status, np.inf if inverted else ratio)
         frames.append((state.positions[nodes], state.velocities[nodes], iterations, error, ratio))
         if failure:
             return frames, f"step {len(frames)}: {failure}"

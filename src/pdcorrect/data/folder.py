@@ -75,8 +75,7 @@ def splits_of(folder: str | Path) -> list[str]:
 def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -> list[Path]:
     """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
 
-    A name may begin with that of the folder, ``FOLDER/training/mesh-0042``; then it means no
-    file of others.  Names of other files do not matter.
+    Names of other files do not matter.
 
     Raises
     ------
@@ -89,17 +88,10 @@ def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -
         few = " (it has round(validation_share * training.meshes) meshes, which may be none)"
         hint = few if split == VALIDATION else ""
         raise InputError(f"{folder}: no split {split!r}{hint}: expected one of {names}.")
-    kept = [path for path in paths if not _names(path).intersection(without)]
+    kept = [path for path in paths if f"{split}/{path.stem}" not in without]
     if not kept:
         raise InputError(f"{folder}, {split}: all {len(paths)} files are left out: expected fewer.")
     return kept
-
-
-def _names(path: Path) -> set[str]:
-    """What a file may be called, without and with its data set's folder."""
-    split = path.parent
-    name = f"{split.name}/{path.stem}"
-    return {name, f"{split.parent.resolve().name}/{name}"}
 
 
 Damage = dict[Path, str]

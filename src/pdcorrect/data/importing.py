@@ -16,7 +16,7 @@ from pdcorrect.data.schema import BEST, INTEGRATOR, PLAIN, REFERENCE, Array, Run
 from pdcorrect.data.simulate import unlike_arrays
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities
-from pdcorrect.fem.hexahedron import shortest_edges
+from pdcorrect.fem.hexahedron import gauss_points, jacobians, shortest_edges
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import Problem, discretise
@@ -108,9 +108,10 @@ def shard_from_arrays(
     MeshError
         If the mesh has a cell that is inverted, collapsed or not connected.
     InputError
-        If an array has a wrong type or shape or is not finite, `file_faults` finds what the
-        check of a data set would find, the scene is another, or ``best`` is wanted without a
-        scene or of one that is its own best coarse model.
+        If an array has a wrong type or shape or is not finite, a cell of the reference is
+        inverted, `file_faults` finds what the check of a data set would find, the scene is
+        another, or ``best`` is wanted without a scene or of one that is its own best coarse
+        model.
     """
     mesh = HexMesh.create(
         _array("points", points, (None, 3)), _array("cells", cells, (None, 8), np.int64)
@@ -207,8 +208,9 @@ def shard_of(
         **arrays,
         simulations=(),
     )  # fmt: skip
-    if problems and (unlike := unlike_arrays(problems[0], shard)):
-        raise InputError(f"the scene: its {unlike[0]} is not the one given: expected equal values.")
+    for name in unlike_arrays(problems[0], shard) if problems else ():
+        if name != "mass":  # which may be another
+            raise InputError(f"the scene: its {name} is not the one given: expected equal values.")
     given = [_given(f"simulation {k}", motion, shard) for k, motion in enumerate(motions)]
     _refuse_faults(shard, given)  # before steps are taken from them
     if problems:
@@ -222,10 +224,13 @@ def shard_of(
 
 
 def _refuse_faults(shard: Shard, given: Sequence[Mapping[str, Array]]) -> Shard:
-    """The shard with its simulations, in which the check of a data set would find nothing."""
+    """The shard with its simulations, in which the check of a data set would find nothing.
+
+    Besides inverted cells of coarse models.
+    """
     step = float(shard.attributes["time_step"])
     shard = replace(shard, simulations=tuple(_simulation(each, step) for each in given))
-    for message in file_faults(shard):
+    for message in file_faults(shard, inverted=True):
         raise InputError(f"{message}.")
     return shard
 
@@ -242,6 +247,13 @@ def _given(where: str, motion: ImportedMotion, shard: Shard) -> dict[str, Array]
         values = getattr(motion, name)
         if values is not None:
             found[name] = _array(f"{where}, {name}", values, (rows, nodes, 3))
+    for frame, x in enumerate(reference):
+        volumes = jacobians(x, shard.cells, gauss_points(2)).min(axis=1)
+        if volumes.min() <= 0:
+            raise InputError(
+                f"{where}, reference: cell {volumes.argmin()} is inverted in row {frame} of its "
+                "positions: expected det F > 0."
+            )
     shortest = shortest_edges(shard.points, shard.cells).min()
     near = _AT_REST * shortest + _ROUNDING * np.abs(shard.points).max()
     for name in found.keys() - {"forces"}:

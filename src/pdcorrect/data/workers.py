@@ -251,11 +251,17 @@ def visible_gpus() -> list[str]:
 
 
 def _own_gpu(worker: int) -> str:
-    """The device of a worker, by its number, beside which its process sees no other.
+    """The device of a worker, by its number.
 
-    Kernels that are compiled for the first GPU are then found in the caches by all workers.
+    Where CUDA has not started yet its process sees no other: kernels that are compiled for the
+    first GPU are then found in the caches by all workers.
     """
+    import torch
+
     gpus = visible_gpus()
     if len(gpus) > 1:
-        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[worker % len(gpus)]
+        own = worker % len(gpus)
+        if torch.cuda.is_initialized():  # type: ignore[no-untyped-call]
+            return f"cuda:{own}"
+        os.environ["CUDA_VISIBLE_DEVICES"] = gpus[own]
     return "cuda"
