@@ -279,6 +279,6 @@ def test_the_export_of_an_incomplete_data_set_warns(program, tmp_path):
     (root / "training/mesh-0001.h5").unlink()
     status, _, err = program("dataset", "export", root, tmp_path / "part")
     assert status == 0
-    assert "incomplete" in err
+    assert "lacks 1 files" in err
     status, _, err = program("dataset", "export", root, tmp_path / "one", "--split", "evaluation")
     assert (status, err) == (0, "")

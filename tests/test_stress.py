@@ -207,7 +207,7 @@ def test_weights_may_differ_by_matrix(rng):
     for function in (energies.energy_density, energies.first_piola, energies.elasticity):
         found = function(F, mu, omega)
         assert found[2, 3] == pytest.approx(function(F[2, 3], mu[2, 0], omega[3]), rel=1e-12)
-    with pytest.raises(InputError, match=r"mu has shape \(3,\)"):
+    with pytest.raises(InputError, match=r"mu \(3,\)"):
         energies.first_piola(F, np.ones(3), 1.0)
 
 

@@ -63,21 +63,11 @@ def test_the_program_names_files_of_another_kind_and_folders(program, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("given", "call"),
-    [
-        ("beam.toml", "Scene.load('beam.toml')"),
-        (Path("beam.toml"), "Scene.load('beam.toml')"),
-        ("name = 'x'", "Scene.from_toml(scene)"),
-        ({"body": {}}, "Scene(**scene)"),
-        (3, "Scene.load(path)"),
-    ],
-)
+@pytest.mark.parametrize("given", ["beam.toml", Path("beam.toml"), "name = 'x'", {"body": {}}, 3])
 @pytest.mark.parametrize("takes", [pc.discretise, pc.best_coarse, pc.compare, pc.hybrid_of])
-def test_what_is_no_scene_is_refused_with_the_call_that_makes_one(takes, given, call):
+def test_what_is_no_scene_is_refused(takes, given):
     more = ("tiny",) if takes is pc.hybrid_of else ()
-    told = f"^scene is a {type(given).__name__}: .*{re.escape(call)}"
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=f"^scene is a {type(given).__name__}: "):
         takes(given, *more)
 
 
