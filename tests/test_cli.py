@@ -187,6 +187,7 @@ def test_help_names_every_command_and_each_has_its_own(program):
         status, own, _ = program(command, "--help")
         assert status == 0
         assert f"pdcorrect {command}" in own
+        assert ("same command" in own) <= (command != "train")  # which goes on by --resume
 
 
 def test_outputs_that_cannot_be_written_are_named_before_the_work(

@@ -1,5 +1,6 @@
 """A run that was stopped anywhere and continued equals one that never stopped."""
 
+import contextlib
 import dataclasses
 import os
 import random
@@ -50,7 +51,7 @@ def assert_same_file(path, expected):
     assert list(found) == list(wanted)
     for name, value in wanted.items():
         assert found[name] == value, name
-    assert not list(path.parent.glob(f"{path.name}.part*"))
+    assert not list(path.parent.glob(f"{path.name}*part*"))
 
 
 # --- the file --------------------------------------------------------------------------
@@ -193,28 +194,46 @@ def test_a_failure_while_reopening_loses_nothing(run, whole, tmp_path, monkeypat
     assert_same_file(path, whole)
 
 
-def test_what_a_killed_reopening_leaves_behind_is_removed_and_no_beginning_is_half(
-    run, whole, tmp_path, monkeypatch
-):
+def test_what_killed_writers_leave_behind_is_removed(run, whole, tmp_path, monkeypatch):
+    """Killed before a file takes its place: at the beginning, at more datasets, at reopening."""
     path = tmp_path / "run.h5"
-    for end in (len(whole.read_bytes()), -10):
-        path.write_bytes(whole.read_bytes()[:end])
-        for name in ("run.h5.part", "run.h5.part.part"):
-            (tmp_path / name).write_bytes(b"half")
-        finish(path, run)
-        assert_same_file(path, whole)
+    real = Path.replace
 
-    path = tmp_path / "run.h5"
+    def replaced(self, target):
+        if not next(left):
+            raise Terminated
+        return real(self, target)
 
+    kills = 0
+    for act in (write, lambda *_: finish(path, run)):
+        for reached in range(20):
+            left = count(reached, -1)
+            with monkeypatch.context() as patch:
+                patch.setattr(Path, "replace", replaced)
+                patch.setattr(Path, "unlink", lambda *_, **__: None)  # the process is no more
+                with contextlib.suppress(Terminated):
+                    act(path, run)
+                    break
+            kills += 1
+            assert list(tmp_path.glob("run.h5*part*"))
+            if path.exists():
+                finish(path, run)
+            else:
+                write(path, run)
+            assert_same_file(path, whole)
+            path.unlink() if act is write else path.write_bytes(whole.read_bytes()[:-10])
+    assert kills >= 5
+
+
+def test_no_beginning_is_half(run, tmp_path, monkeypatch):
     def half(self, data):
         with self.open("wb") as file:
             file.write(data[: len(data) // 2])
         raise Terminated
 
     monkeypatch.setattr(Path, "write_bytes", half)
-    path.unlink()
     with pytest.raises(Terminated):
-        write(path, run)
+        write(tmp_path / "run.h5", run)
     assert not list(tmp_path.iterdir())
 
 
@@ -358,9 +377,12 @@ def test_a_run_in_three_parts_equals_one_at_once(program, scene_file, tmp_path, 
         assert len(load_trajectory(path)) == frames
     assert_same_file(path, expected)
     assert f"in {load_trajectory(path).stats['seconds'].sum():.2f} s" in out  # of all parts
-    status, out, _ = program(*resume, "--frames", 5)  # nothing to do
+    before = path.stat()
+    status, out, _ = program(*resume, "--frames", 5)
     assert status == 0
-    assert_same_file(path, expected)
+    assert "nothing to do" in out
+    assert os.path.samestat(path.stat(), before)
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
     if solver == "pd" and "bdf2" not in scene_file.read_text(encoding="utf-8"):
         scene_file.write_text(small(time={"frames": 15}).to_toml(), encoding="utf-8")
         program("simulate", scene_file, "-o", expected, "--overwrite")

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import tracemalloc
 from pathlib import Path
 
 import h5py
@@ -17,6 +18,7 @@ import pytest
 from motion import assert_same, remembering, trajectory
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
+from pdcorrect.io.trajectory_reader import written_by
 from pdcorrect.state import State, Status, StepResult
 
 TESTS = Path(__file__).parent
@@ -409,12 +411,32 @@ def test_flipped_bytes_give_the_right_data_or_a_refusal(run, saved, tmp_path):
     assert refused > 300
 
 
+def test_an_unfinished_file_is_not_held_in_memory_as_well(tmp_path):
+    run = trajectory(frames=60)
+    large = {
+        name: np.tile(getattr(run, name), (100, 1))
+        for name in ("points", "positions", "velocities")
+    }
+    path = tmp_path / "run.h5"
+    save_trajectory(path, dataclasses.replace(run, **large))
+    size = path.stat().st_size
+    os.truncate(path, size - 10)
+    peaks = []
+    for read in (written_by, lambda path: load_trajectory(path, salvage=True)):
+        tracemalloc.start()
+        read(path)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[0] < 0.1 * size
+    assert peaks[1] < 1.2 * size
+
+
 @pytest.mark.parametrize("size", [3, 48, 5000])
 @pytest.mark.parametrize("head", [b"", b"\x89HDF\r\n\x1a\n", b"\x89HDF\r\n\x1a\n\x00\x00\x00\x00"])
 def test_noise_and_folders_are_refused(tmp_path, size, head):
     path = tmp_path / "noise.h5"
     path.write_bytes(head + random.Random(size).randbytes(size))
-    with pytest.raises(FileFormatError, match=r"noise\.h5"):
+    with pytest.raises(FileFormatError, match=r"noise\.h5: " + "not an HDF5 file" * (not head)):
         load_trajectory(path)
     for path in (tmp_path, tmp_path / "none.h5"):
         with pytest.raises(FileFormatError, match=path.name):

@@ -43,10 +43,10 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, whoever else writes it at the time."""
+def write_bytes(path: Path, data: bytes, part: Path | None = None) -> None:
+    """Write a file whole or not at all, by default whoever else writes it at the time."""
     try:
-        with replacing(path, part_of_process(path)) as part:
+        with replacing(path, part_of_process(path) if part is None else part) as part:
             part.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error}).") from None

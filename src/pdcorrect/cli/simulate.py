@@ -66,9 +66,9 @@ def simulate(
         common.say(told.format(**origin))
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
-    log = _run(stepper, count, output, earlier, overwrite)
     before = 0 if earlier is None else len(earlier)
     if before < count:
+        log = _run(stepper, count, output, earlier, overwrite)
         _summary(log.arrays(), stepper, before)
         common.say(f"wrote {output}")
     if vtu:
@@ -135,7 +135,7 @@ def _run(
         writer = TrajectoryWriter.resume(output, earlier)
     with writer, common.progress_bar(problem.scene.name, count, done) as advance:
         try:
-            for result, elapsed in march(stepper, max(0, count - done), state=state):
+            for result, elapsed in march(stepper, count - done, state=state):
                 writer.append(result, elapsed)
                 log.add(result, elapsed)
                 advance()

@@ -25,7 +25,10 @@ def train(
     output: common.OutputFolder,
     device: common.Device = "cpu",
     resume: Annotated[bool, typer.Option(help="Go on from the folder's checkpoint.")] = False,
-    seconds: common.Seconds = None,
+    seconds: Annotated[
+        Optional[float],
+        typer.Option(help="Stop after about so many seconds; --resume goes on.", min=0),
+    ] = None,
     incomplete: common.Incomplete = False,
     evaluate: Annotated[
         Optional[str], typer.Option(help="Split on which the best model is judged at the end.")

@@ -125,7 +125,8 @@ class TrajectoryWriter:
                     )
                 self._add(_entries(initial, {}))
                 self._write(_entries(initial, {}))
-            write_bytes(self.path, memory.getvalue())
+            # under one name, which resume finds if this process is killed
+            write_bytes(self.path, memory.getvalue(), part_of(self.path))
 
     @classmethod
     def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
@@ -264,7 +265,7 @@ class TrajectoryWriter:
                 with io.BytesIO(self.path.read_bytes()) as memory:
                     with h5py.File(memory, "r+", libver=_LIBRARY) as self._file:
                         self._add(new)
-                    write_bytes(self.path, memory.getvalue())
+                    write_bytes(self.path, memory.getvalue(), part_of(self.path))
             self._reserved = 0
             self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
             self._file.swmr_mode = True

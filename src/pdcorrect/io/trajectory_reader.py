@@ -78,8 +78,10 @@ def _opened(path: Path) -> Iterator[tuple[Any, _Extent]]:
     extent = _extent(path)
     try:
         unfinished = extent.truncated or extent.in_writing
-        source = io.BytesIO(_closed(path.read_bytes(), extent)) if unfinished else path
-        with h5py.File(source, "r", locking=False) as file:
+        with (
+            _Closed(path, extent) if unfinished else contextlib.nullcontext(path) as source,
+            h5py.File(source, "r", locking=False) as file,
+        ):
             yield file, extent
     except FileFormatError as error:
         raise FileFormatError(f"{path}: {error}.") from None
@@ -94,7 +96,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, _Extent]]:
 _SUPERBLOCK = struct.Struct("<9sBxB16xQ8xI")
 """HDF5's first bytes, version 3: signature, size of offsets, flags, end of file, checksum."""
 _WORD = 0xFFFFFFFF
-_SIGNATURE = b"\x89HDF\r\n\x1a\n\x03"
+_SIGNATURE = b"\x89HDF\r\n\x1a\n\x03"  # with the version
 
 
 def _extent(path: Path) -> _Extent:
@@ -103,6 +105,8 @@ def _extent(path: Path) -> _Extent:
             head, size = file.read(_SUPERBLOCK.size), os.fstat(file.fileno()).st_size
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from None
+    if not _SIGNATURE.startswith(head[:8]):
+        raise FileFormatError(f"{path}: not an HDF5 file: expected a trajectory of pdcorrect.")
     if len(head) < _SUPERBLOCK.size:
         raise FileFormatError(f"{path}: truncated: no frame is left in {size} bytes.")
     signature, offsets, flags, end, checksum = _SUPERBLOCK.unpack(head)
@@ -118,19 +122,34 @@ def file_end(path: Path) -> int:
     return _extent(path).end
 
 
-def _closed(data: bytes, extent: _Extent) -> bytes:
-    """A file's content as if its writer had closed it, filled up to its whole length.
+class _Closed(io.FileIO):
+    """A file read as if its writer had closed it, filled up to its whole length.
 
     HDF5 refuses it as it is, and its reading mode for files in writing waits for ever where
     something is damaged.  Every index and chunk of a trajectory has a checksum, so what is filled
     in is noticed and never taken for data; zeros would be, whose checksum is zero.
     """
-    end = max(extent.size, extent.end)
-    head = bytearray(data[: _SUPERBLOCK.size])
-    struct.pack_into("<B", head, 11, 0)
-    struct.pack_into("<Q", head, 28, end)
-    struct.pack_into("<I", head, 44, _lookup3(bytes(head[:44])))
-    return (bytes(head) + data[len(head) :]).ljust(end, b"\1")
+
+    def __init__(self, path: Path, extent: _Extent) -> None:
+        super().__init__(path)
+        self._end = max(extent.size, extent.end)
+        self._head = bytearray(self.read(_SUPERBLOCK.size))
+        struct.pack_into("<B", self._head, 11, 0)
+        struct.pack_into("<Q", self._head, 28, self._end)
+        struct.pack_into("<I", self._head, 44, _lookup3(bytes(self._head[:44])))
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Move to a byte; the end is that of the whole length."""
+        return super().seek(offset + self._end * (whence == io.SEEK_END))
+
+    def readinto(self, buffer: Any) -> int:
+        """Fill the whole buffer."""
+        start, view = self.tell(), memoryview(buffer)
+        count = super().readinto(view)
+        view[count:] = b"\1" * (len(view) - count)
+        head = self._head[start : start + len(view)]
+        view[: len(head)] = head
+        return len(view)
 
 
 def _lookup3(data: bytes) -> int:
@@ -209,7 +228,8 @@ def _stats_fault(trajectory: Trajectory, steps: int) -> str | None:
 def _read(file: Any, extent: _Extent, salvage: bool) -> Trajectory:
     _check_format(file)
     remembered = list(file["memory"]) if "memory" in file else []
-    names = ("positions", "velocities", "times", *(f"memory/{name}" for name in remembered))
+    # times first: a frame that a writer adds meanwhile is in the others before
+    names = ("times", "positions", "velocities", *(f"memory/{name}" for name in remembered))
     for name in (*names, "mesh/points", "mesh/cells"):
         if name not in file:
             raise FileFormatError(f"{name!r} is missing")
