@@ -152,7 +152,8 @@ def relative_drift(values: ArrayLike) -> float:
 class EnergyBalance:
     """Energies of each frame, and work and damping loss since frame 0, (T+1,) each, J.
 
-    The work is that of the loads and of moving clamps on the body.
+    The work is that of the loads, of moving clamps and of moving obstacles on the body;
+    ``contact`` is the energy of the obstacles' barriers.
     """
 
     kinetic: Array
@@ -160,11 +161,14 @@ class EnergyBalance:
     external_work: Array
     clamp_work: Array
     damping_loss: Array
+    contact: Array | float = 0.0
+    obstacle_work: Array | float = 0.0
+    friction_loss: Array | float = 0.0
 
     @property
     def total(self) -> Array:
-        """Kinetic and elastic energy, (T+1,), J."""
-        return self.kinetic + self.elastic
+        """Kinetic and elastic energy, and that of contact, (T+1,), J."""
+        return self.kinetic + self.elastic + self.contact
 
     @property
     def dissipation(self) -> Array:
@@ -173,7 +177,8 @@ class EnergyBalance:
         Zero for an exact solution.  It also holds what steps that are not solved
         exactly and work integrated by one point a step leave over.
         """
-        put_in = self.external_work + self.clamp_work - self.damping_loss
+        put_in = self.external_work + self.clamp_work + self.obstacle_work
+        put_in = put_in - self.damping_loss - self.friction_loss
         return self.total[0] + put_in - self.total
 
 
@@ -205,6 +210,10 @@ def energy_balance(run: Trajectory, problem: Problem | None = None) -> EnergyBal
     start = _initial_energies(run, run.problem if problem is None else problem)
     steps = {name: np.asarray(run.stats.get(name, ()), dtype=np.float64) for name in _ENERGIES}
     sums = {name: np.concatenate([[0.0], np.cumsum(steps[name])]) for name in _ENERGIES[2:]}
+    if "contact_energy" in run.stats:
+        for name in ("obstacle_work", "friction_loss"):
+            sums[name] = np.concatenate([[0.0], np.cumsum(run.stats[name])])
+        sums["contact"] = np.concatenate([[0.0], run.stats["contact_energy"]])
     return EnergyBalance(
         *(np.concatenate([[e], steps[name]]) for e, name in zip(start, _ENERGIES[:2], strict=True)),
         **sums,

@@ -174,9 +174,12 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
         f"{stats['iterations'].max()}; frames: {ends}"
     )
-    others = {"clamp_work": "work of the clamps", "damping_loss": "lost to damping"}
+    others = {
+        "clamp_work": "work of the clamps", "obstacle_work": "work of the obstacles",
+        "damping_loss": "lost to damping", "friction_loss": "lost to friction",
+    }  # fmt: skip
     work = {"external_work": "work of the loads"}
-    work |= {name: text for name, text in others.items() if stats[name].any()}
+    work |= {name: text for name, text in others.items() if name in stats and stats[name].any()}
     common.say(
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
         f"{stats['kinetic_energy'][-1]:.4g} J; over the run "

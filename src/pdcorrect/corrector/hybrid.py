@@ -116,6 +116,11 @@ class HybridStepper:
         substeps = self.problem.scene.time.substeps
         if substeps > 1:
             raise InputError(f"time.substeps = {substeps}: expected 1, frames are corrected whole.")
+        if self.problem.contact is not None:
+            raise InputError(
+                "the scene has obstacles, which a correction would enter: expected none. Leave the "
+                "model out."
+            )
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate)

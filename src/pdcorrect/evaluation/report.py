@@ -338,9 +338,11 @@ def refused_corrections(reasons: Iterable[float]) -> str:
 def gained_energy(stats: Mapping[str, Any]) -> str:
     """Whether a run has more energy than was put in since its first step; empty if not."""
     stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
-    put_in = np.cumsum(
-        np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
-    )
+    put_in = np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
+    if "contact_energy" in stats:
+        stored = stored + stats["contact_energy"]
+        put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
+    put_in = np.cumsum(put_in)
     gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
     if not gained > _GAINED * stored.max():
         return ""

@@ -150,6 +150,10 @@ class Course:
         self._axis, self._centre = motion.axis, np.array(motion.centre)
         self._ways = () if motion.displacement is None else tuple(np.array(motion.displacement).T)
 
+    def frame(self, time: float) -> tuple[Array, Array]:
+        """R (3, 3) and b (3,) of x = R X + b at a time (s)."""
+        return self(np.eye(3), time).T - (at := self(np.zeros((1, 3)), time)[0])[:, None], at
+
     def __call__(self, points: Array, time: float) -> Array:
         """``points`` (n, 3) rotated and displaced as prescribed for a time (s)."""
         out = points

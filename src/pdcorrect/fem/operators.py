@@ -151,6 +151,11 @@ class Space:
             self.local = np.concatenate([self.cells, modes], axis=1)
         freeze(self.positions, self.cells, self.local)
 
+    def shape_functions(self, points: Array) -> Array:
+        """Of a cell's nodes (n, K) at points (n, 3) of the unit cell."""
+        values = [self._element.lbasis(points.T, k)[0] for k in self._to_vtk]
+        return np.stack([np.broadcast_to(v, len(points)) for v in values], axis=1)
+
     def quadrature(self) -> Quadrature:
         """Gradients and volumes at the quadrature points."""
         local = [self._basis.basis[k][0].grad for k in self._to_vtk]  # K x (3, C, Q)

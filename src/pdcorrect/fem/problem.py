@@ -19,6 +19,7 @@ from pdcorrect.fem.assembly import summed_cells
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
+from pdcorrect.fem.contact import Contact, surface_points
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
@@ -48,6 +49,8 @@ class Problem(ElasticBody):
         kg, for each coordinate.
     clamps : Clamps
     loads : tuple of NodalLoad
+    contact : Contact or None
+        Of the surface with the scene's obstacles.
     material_changed, density_changed : bool
         Whether the moduli, or the density, are no longer those of ``scene``.
     """
@@ -57,6 +60,7 @@ class Problem(ElasticBody):
     mass_matrix: sp.csr_matrix
     clamps: Clamps
     loads: tuple[NodalLoad, ...]
+    contact: Contact | None = None
     material_changed: bool = False
     density_changed: bool = False
 
@@ -290,11 +294,16 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
             space.cells, materials.density[:, None, None] * correction.masses, matrix.shape[0]
         )
     loads = assemble_loads(scene, space, selector, lumped(matrix), clamps.free)
+    contact = None
+    if scene.obstacles:
+        points = surface_points(body.mesh, space, clamps.free)
+        young = max([scene.material.young, *(part.young or 0.0 for part in scene.materials)])
+        contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
     freeze(clamps.free, matrix.indices, matrix.indptr)
     freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
-        loads, correction=correction,
+        loads, contact, correction=correction,
     )  # fmt: skip
 
 

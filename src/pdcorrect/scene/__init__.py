@@ -11,6 +11,7 @@ from pdcorrect.scene.bodies import Beam, Body, Cross, MeshFile, Voxels, Weight
 from pdcorrect.scene.clamps import Clamp, Initial, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
+from pdcorrect.scene.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
 from pdcorrect.scene.regions import Region
 from pdcorrect.scene.scene import (
     Damping,
@@ -27,8 +28,10 @@ __all__ = [
     "Beam",
     "Body",
     "BodyForce",
+    "Box",
     "Clamp",
     "Cross",
+    "Cylinder",
     "Damping",
     "EffectiveModuli",
     "Force",
@@ -39,10 +42,13 @@ __all__ = [
     "MaterialRegion",
     "MeshFile",
     "Motion",
+    "Obstacle",
+    "Plane",
     "Pressure",
     "Region",
     "Scene",
     "Solver",
+    "Sphere",
     "Time",
     "Torsion",
     "Traction",

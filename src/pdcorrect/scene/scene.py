@@ -14,6 +14,7 @@ from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp, Initial
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
+from pdcorrect.scene.obstacles import Obstacle
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
@@ -149,6 +150,7 @@ class Scene(TomlConfig):
     damping: Damping = Damping()
     clamps: tuple[Clamp, ...] = ()
     loads: tuple[Load, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
     solver: Solver = Solver()
 
     source: ClassVar[str] = "scene"

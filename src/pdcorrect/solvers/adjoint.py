@@ -82,7 +82,7 @@ def adjoint(
     Gradients
         ``positions``, ``velocities``, ``forces``, ``memory`` and ``clamped_positions``
         like the arrays; ``young``, ``poisson``, ``mu``, ``lam`` and ``density`` one a
-        cell; ``time_step`` a number.
+        cell; ``time_step`` a number; ``friction`` and ``obstacle_positions`` one an obstacle.
 
     Raises
     ------

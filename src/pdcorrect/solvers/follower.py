@@ -43,7 +43,7 @@ class Anderson:
 
 
 def settle(objective: StepObjective, minimise: Callable[[Array], Minimum]) -> Minimum:
-    """Minimise with loads that follow the body, as they are at the minimum.
+    """Minimise with loads that follow the body, and friction, as they are at the minimum.
 
     ``minimise``, from a configuration on, takes no iteration where the remaining distance is
     within the tolerance.
@@ -54,8 +54,11 @@ def settle(objective: StepObjective, minimise: Callable[[Array], Minimum]) -> Mi
     for _ in range(MOST):
         if not found.status.ok:
             break
-        y = accelerate(y.ravel(), found.positions.ravel()).reshape(y.shape)
-        objective.follow(y)
+        p = found.positions
+        way = accelerate(y.ravel(), p.ravel()).reshape(y.shape) - p
+        y = p + objective.longest_step(p, way) * way
+        if not objective.follow(y):
+            break
         again = minimise(y)
         found = again.after(found)
         if again.iterations == 0:

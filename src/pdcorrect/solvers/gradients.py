@@ -29,6 +29,7 @@ from pdcorrect.solvers.adjoint_terms import (
     follower_slope,
     gravity_slope,
 )
+from pdcorrect.solvers.contact import ContactTerm
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.integrators import Integrator
 from pdcorrect.solvers.schemes import Linear
@@ -39,8 +40,12 @@ Array = NDArray[np.float64]
 
 Term = TypeVar("Term", bound=DampingTerm)
 
-_STEP = 1e-3
-"""Of the time step, for differences of fourth order at fixed y."""
+_STEP, _SLIDING_STEP = 1e-3, 1e-5
+"""Of the time step, for differences of fourth order at fixed y.
+
+The second with friction or moving obstacles: in a small part of a step these may go farther than
+points creep, or than a gap is wide.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +115,8 @@ class Gradients:
         if kept.any():
             by_y = by_y + self._scheme.inertia * self._problem.mass_times(kept)
             by_y -= self._by_sampled("y", y, kept)
-        loads = (lambda x: self._by_sampled("y", y, x)) if self._problem.has_followers else None
+            by_y -= self._objective.stage.gain * self._by_contact(y, kept)[0]
+        loads = (lambda x: self._by_lagged(y, x)) if self._objective.follows else None
         self._H = AdjointOperator(self._objective.hessian_operator(y), loads)
         g = self._problem.extended(by_y) * self._objective.free
         found = step.solve(self._H, y, g, step.solver, step.tolerance)
@@ -174,7 +180,8 @@ class Gradients:
         that do not change in time the sum over all steps is the derivative by the length
         that they share.  By differences of fourth order of the step's equation at fixed y.
         """
-        h, e = self._step.time_step, _STEP * self._step.time_step
+        contact, h = self._objective.contact, self._step.time_step
+        e = h * (_SLIDING_STEP if contact and (contact.has_friction or contact.moves) else _STEP)
         f = self._lagrangian
         return (8.0 * (f(h + e) - f(h - e)) - (f(h + 2 * e) - f(h - 2 * e))) / (12.0 * e)
 
@@ -250,6 +257,25 @@ class Gradients:
             )
         return self._problem.correction
 
+    # --- by obstacles ---------------------------------------------------------------------
+
+    @property
+    def friction(self) -> Array:
+        """By each obstacle's coefficient of friction, (obstacles,); 0 where there is none."""
+        return self._contact.friction_slopes(self._y, self._nodal)
+
+    @property
+    def obstacle_positions(self) -> Array:
+        """By a translation of each obstacle, (obstacles, 3), 1/m."""
+        ends, starts = self._contact.slopes(self._y, self._nodal)
+        return -(ends + starts).sum(axis=1)
+
+    @property
+    def _contact(self) -> ContactTerm:
+        if self._objective.contact is None:
+            raise InputError("the scene has no obstacles: expected one or more.")
+        return self._objective.contact
+
     # --- by damping ---------------------------------------------------------------------
 
     @property
@@ -302,6 +328,21 @@ class Gradients:
 
     # --- internals --------------------------------------------------------------------------
 
+    def _by_lagged(self, y: Array, x: Array) -> Array:
+        """Derivatives of x . (loads and friction) by the y that these are held as at."""
+        out, contact = self._by_sampled("y", y, x), self._objective.contact
+        if contact is None:
+            return out
+        return out + self._objective.stage.gain * contact.lagged_slopes(y, x)
+
+    def _by_contact(self, y: Array, x: Array) -> tuple[Array, Array]:
+        """Derivatives of x . (contact forces) by positions after and before the step, (N, 3)."""
+        contact = self._objective.contact
+        if contact is None:
+            return np.zeros_like(x), np.zeros_like(x)
+        end, start = (contact.nodal(part.sum(axis=0), len(x)) for part in contact.slopes(y, x))
+        return end, start
+
     def _by_sampled(self, name: str, y: Array, x: Array) -> Array:
         """Derivatives of x . (loads in the equation) by y or positions that they are sampled at."""
         stage, share = self._objective.stage, self._scheme.sampled.coefficients.get(name, 0.0)
@@ -327,6 +368,9 @@ class Gradients:
             self._pull(scheme.target, scheme.clamped_target, by_target)
         scheme.past_forces.transpose(x, self._sums)
         Linear(positions=1.0).transpose(self._by_sampled("positions", self._y, x), self._sums)
+        by_end, by_start = self._by_contact(self._y, x)
+        share = scheme.positions.coefficients.get("positions", 0.0)
+        Linear(positions=1.0).transpose(share * by_end + by_start, self._sums)
         if self._rayleigh:
             origin = scheme.origin, scheme.clamped_origin
             at = scheme.foreseen or scheme.start, scheme.clamped
@@ -371,7 +415,7 @@ class Gradients:
         y = np.where(objective.free, self._y, self._problem.extended(stage.start))
         objective.follow(y)
         _, residual = objective.balance(y)
-        end = stage.finish(y[:count], objective.forces[:count])
+        end = stage.finish(y[:count], objective.given_forces(y))
         value = np.vdot(self._after["positions"], end.positions)
         value += np.vdot(self._after["velocities"], end.velocities)
         for name in self._scheme.memory:

@@ -19,6 +19,7 @@ from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler
 from pdcorrect.solvers.integrators import integrator as make_integrator
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
+from pdcorrect.solvers.reactions import contact_forces
 from pdcorrect.solvers.schemes import WHOLE_MEMORY
 from pdcorrect.solvers.step import (
     GlobalSolver,
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 
 _FALLBACK_ITERATIONS = 60
 _SUBSTEP_LEVELS = 4
+_OF_DISTANCE = 2e-5
+"""Of an obstacle's distance: largest tolerance, as contact forces change fast within it."""
 _LARGEST = 1e30
 
 
@@ -58,6 +61,7 @@ class _Outcome:
     clamp_work: float
     damping_loss: float
     modes: Array | None
+    contact: dict[str, float]
 
 
 class ImplicitStepper:
@@ -108,7 +112,10 @@ class ImplicitStepper:
         self.integrator = time.integrator if integrator is None else integrator
         viscous = problem.scene.damping.viscosity > 0.0
         self.integrate = make_integrator(self.integrator, time.spectral_radius, viscous)
-        self._options = MinimiserOptions(self.tolerance * problem.cell_size)
+        within = self.tolerance * problem.cell_size
+        if problem.contact is not None:
+            within = min(within, _OF_DISTANCE * min(problem.contact.distances))
+        self._options = MinimiserOptions(within)
         self._backend = backend
         self._recover = recover
         self._solvers: dict[tuple[float, ...], GlobalSolver] = {}
@@ -254,7 +261,7 @@ class ImplicitStepper:
         objective = self.objective(state, forces, h, integrate)
         stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
-        if self.problem.has_followers:
+        if objective.follows:
             options = replace(options, tolerance=0.5 * options.tolerance)
             again = replace(options, unmoved=1.0)
             minimum = settle(
@@ -313,6 +320,8 @@ class ImplicitStepper:
         part = end.time - before.time
         loads = self.problem.external_forces(before.time, end.time, end.positions)
         accelerations = (end.velocities - before.velocities) / part * self.problem.free
+        if self.problem.contact is not None:
+            loads = loads + contact_forces(self.problem, end, before).sum(axis=0)
         internal = self.problem.mass_times(accelerations) - loads
         known = {
             "accelerations": accelerations,
@@ -339,6 +348,7 @@ class ImplicitStepper:
             "clamp_work": outcome.clamp_work,
             "damping_loss": outcome.damping_loss,
             "smallest_volume_ratio": float(ratios.min()),
+            **outcome.contact,
         }
         status = minimum.status
         if not status.ok:  # what it remembers would be out of balance
@@ -356,7 +366,7 @@ def _outcome(
     problem: Problem, state: State, objective: StepObjective, minimum: Minimum, h: float
 ) -> _Outcome:
     y, nodes = minimum.positions, len(state.positions)
-    stage, forces = objective.stage, objective.forces[:nodes]
+    stage, forces = objective.stage, objective.given_forces(y)
     reaction = np.zeros_like(forces)
     if problem.clamps.moving:
         reaction = objective.balance(y)[1][:nodes] * ~problem.free
@@ -373,6 +383,7 @@ def _outcome(
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, moved, h),
         modes=end[nodes:] if problem.space.internal else None,
+        contact={} if objective.contact is None else objective.contact.report(y),
     )
 
 
@@ -392,7 +403,13 @@ def _joined(parts: list[_Outcome], end: State) -> _Outcome:
         clamp_work=sum(part.clamp_work for part in parts),
         damping_loss=sum(part.damping_loss for part in parts),
         modes=last.modes,
-    )
+        contact=last.contact and {
+            **last.contact,
+            "smallest_gap": min(part.contact["smallest_gap"] for part in parts),
+            "obstacle_work": sum(part.contact["obstacle_work"] for part in parts),
+            "friction_loss": sum(part.contact["friction_loss"] for part in parts),
+        },
+    )  # fmt: skip
 
 
 @cache

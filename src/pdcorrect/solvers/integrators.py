@@ -38,6 +38,10 @@ class StepEquation:
     ----------
     sampled : callable
         y -> where loads that follow the body are sampled, (N, 3).
+    end : float
+        Time after the step, s.
+    moved : callable
+        y -> positions after the step, (N, 3).
     finish : callable
         y and all forces (N, 3) of the equation, of moving clamps too -> the state after.
     """
@@ -51,6 +55,8 @@ class StepEquation:
     loads_over: tuple[float, float]
     finish: Callable[[Array, Array], State]
     sampled: Callable[[Array], Array]
+    end: float
+    moved: Callable[[Array], Array]
     past_forces: Array | float = 0.0
     load_factor: float = 1.0
     strain_rate: float = 0.0
@@ -133,6 +139,8 @@ class Integrator:
             (first, last),
             finish,
             lambda y: np.asarray(scheme.sampled({**known, "y": y})),
+            state.time + h,
+            lambda y: np.asarray(scheme.positions({**known, "y": y})),
             scheme.past_forces(known),
             scheme.load_factor,
             scheme.strain_rate,

@@ -58,6 +58,9 @@ class Objective(Protocol):
     def hessian_operator(self, p: Array) -> Callable[[Array], Array]:
         """The second derivative at p, as a product."""
 
+    def longest_step(self, p: Array, direction: Array) -> float:
+        """Share of a direction, at most 1, along which the function is finite."""
+
 
 @dataclass(frozen=True)
 class MinimiserOptions:
@@ -260,6 +263,7 @@ def line_search(
     slope = float(np.vdot(gradient, direction))
     step, tried = 1.0, 0
     if slope < 0.0:
+        step = objective.longest_step(p, direction)
         noise = _ROUND_OFF * objective.scale
         while tried < BACKTRACKS:
             tried += 1

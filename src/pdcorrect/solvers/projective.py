@@ -27,6 +27,8 @@ FirstHessian = Literal["auto", "G", "G-scaled", "rest", "lagged"]
 
 _PATIENCE = 40
 """Iterations with one true Hessian before it is renewed within the step."""
+_CONTACT_PATIENCE = 8
+"""The same where the surface touches an obstacle."""
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
@@ -169,13 +171,18 @@ class ProjectiveDynamics(ImplicitStepper):
         options: MinimiserOptions,
     ) -> Minimum:
         """L-BFGS; a Hessian that has not led to the minimum after a while is renewed on the way."""
-        limit, most = min(_PATIENCE, options.max_iterations), options.max_iterations
-        first = start is objective.start
-        solver = hessian.solver(objective) if first else hessian.at(objective, start)
+        most = options.max_iterations
+        if objective.contact is not None and objective.contact.near(start):
+            patience, solver = _CONTACT_PATIENCE, hessian.renew(objective, start)
+        else:
+            first = start is objective.start
+            patience = _PATIENCE
+            solver = hessian.solver(objective) if first else hessian.at(objective, start)
+        limit = min(patience, most)
         found = minimise(objective, start, solver, replace(options, max_iterations=limit))
         while found.status is Status.ITERATION_LIMIT and found.iterations < most:
             solver = hessian.renew(objective, found.positions)
-            limit = min(_PATIENCE, most - found.iterations)
+            limit = min(patience, most - found.iterations)
             again = replace(options, max_iterations=limit)
             found = minimise(objective, found.positions, solver, again).after(found)
         return found
@@ -189,6 +196,8 @@ def _check_method(problem: Problem, method: str, first_hessian: str) -> None:
         raise InputError(f"first_hessian = {first_hessian!r}: expected {', '.join(names)}.")
     if method == "local-global" and first_hessian not in ("auto", "G"):
         raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
+    if method == "local-global" and problem.contact is not None:
+        raise InputError("method = 'local-global' with obstacles: expected method = 'lbfgs'.")
     if method == "local-global" and problem.materials.model != COROTATED:
         raise InputError(
             f"method = 'local-global' with energy = {problem.scene.material.energy!r}: "

@@ -1,15 +1,16 @@
-"""Forces that clamps exert on the body."""
+"""Forces that clamps and obstacles exert on the body."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, small_strain_stress
+from pdcorrect.solvers.contact import Sliding
 from pdcorrect.solvers.step import check_input, nodal_array
 from pdcorrect.state import State
 
@@ -60,6 +61,52 @@ def reactions(
     return out
 
 
+def contact_forces(problem: Problem, state: State, before: State | None = None) -> Array:
+    """Forces of a scene's obstacles on the body.
+
+    Parameters
+    ----------
+    problem : Problem
+    state : State
+    before : State, optional
+        One step earlier: friction is that of the motion since then, as in the step itself.
+        Otherwise it is that of the velocities, which ring where nodes stick.
+
+    Returns
+    -------
+    (obstacles, N, 3)
+        On each node, N; those on all nodes add up to an obstacle's whole force.
+
+    Raises
+    ------
+    InputError
+        If the scene has no obstacles, or shapes are wrong.
+    """
+    contact = problem.contact
+    if contact is None:
+        raise InputError("the scene has no obstacles: expected one or more.")
+    check_input(problem, state, None)
+    x, h = contact.at(state.positions), 1.0
+    if before is not None:
+        check_input(problem, before, None)
+        h = state.time - before.time
+        if not h > 0.0:
+            raise InputError(f"before.time = {before.time:g}: expected less than {state.time:g} s.")
+    out = np.zeros((len(contact.obstacles), *state.positions.shape))
+    for i, part in enumerate(contact.touching(x, state.time)):
+        forces = np.zeros_like(x)
+        forces[part.points] = part.force[:, None] * part.normals
+        obstacle = contact.obstacles[i]
+        if before is None:
+            carried = x + obstacle.velocities(x, state.time) - contact.at(state.velocities)
+        else:
+            carried = obstacle.carried(contact.at(before.positions), before.time, state.time)
+        sliding = Sliding(contact.frictions[i], part, carried, contact.slips[i] * h)
+        forces[part.points] += sliding.forces(sliding.motions(x))
+        out[i] = contact.spread(forces, len(state.positions))
+    return out
+
+
 def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Array:
     """f_int + f_ext - C v at a state, (N, 3), N, without the clamps' forces.
 
@@ -70,6 +117,8 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
     out += problem.external_forces(state.time, None, state.positions)
     if forces is not None:
         out += forces
+    if problem.contact is not None:
+        out += contact_forces(problem, state).sum(axis=0)
     if damping.mass:
         out -= damping.mass * problem.mass_times(state.velocities)
     if damping.stiffness:

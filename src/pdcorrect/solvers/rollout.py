@@ -65,7 +65,7 @@ def march(
                     f"{result.iterations} iterations (largest out-of-balance force "
                     f"{result.residual:.3g} N, estimated distance from the solution "
                     f"{result.error_estimate:.3g} m). Use a smaller time step, weaker loads or a "
-                    "finer mesh.",
+                    f"finer mesh{_BLOCKED if problem.contact is not None else ''}.",
                     result=result,
                 )
             current = result.state
@@ -73,8 +73,11 @@ def march(
         yield _of_frame(results), time.perf_counter() - started
 
 
-_SUMMED = ("evaluations", "external_work", "clamp_work", "damping_loss")
-_LEAST = ("smallest_volume_ratio",)
+_BLOCKED = ", and look whether an obstacle meets nodes that are held, or another obstacle"
+_SUMMED = (
+    "evaluations", "external_work", "clamp_work", "damping_loss", "obstacle_work", "friction_loss",
+)  # fmt: skip
+_LEAST = ("smallest_volume_ratio", "smallest_gap")
 
 
 def _of_frame(results: list[StepResult]) -> StepResult:

@@ -26,6 +26,7 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.contact import ContactTangent, ContactTerm
 from pdcorrect.solvers.damping import Rayleigh, Viscous, ViscousTangent
 from pdcorrect.solvers.integrators import StepEquation
 from pdcorrect.solvers.schemes import Scheme
@@ -75,11 +76,34 @@ class StepObjective:
         has_rayleigh = stage.rate and (damping.mass or damping.stiffness)
         self.rayleigh = Rayleigh(problem, stage) if has_rayleigh else None
         self.viscous = Viscous(problem, stage) if stage.strains else None
+        self.contact = None
+        if problem.contact is not None:
+            self.contact = ContactTerm(problem.contact, stage, state)
+            start = self.contact.feasible(stage.start, problem.free)
+            self.start = problem.relaxed(start, steps=_MODE_STEPS)
 
-    def follow(self, y: Array) -> None:
-        """Sample the loads that follow the body at a configuration."""
+    @property
+    def follows(self) -> bool:
+        """Whether forces without a potential are held as at one configuration."""
+        sliding = self.contact is not None and self.contact.has_friction
+        return self.problem.has_followers or sliding
+
+    def follow(self, y: Array) -> bool:
+        """Sample the loads that follow the body, and friction, at a configuration.
+
+        Whether there are any.
+        """
+        slides = self.contact is not None and self.contact.follow(y)
         if self.problem.has_followers:
             self.forces = self._forces(y[: len(self.problem.positions)])
+        return self.problem.has_followers or slides
+
+    def given_forces(self, y: Array) -> Array:
+        """All forces (N, 3) of the equation at y but the body's own, N."""
+        nodes = len(self.problem.positions)
+        if self.contact is None:
+            return self.forces[:nodes]
+        return self.forces[:nodes] - self.contact.value_and_gradient(y)[1][:nodes]
 
     def _forces(self, y: Array) -> Array:
         stage = self.stage
@@ -106,9 +130,9 @@ class StepObjective:
         value = energy + kinetic - work
         gradient -= elastic
         gradient -= self.forces
-        for damping in (self.rayleigh, self.viscous):
-            if damping is not None:
-                loss, force = damping.value_and_gradient(y)
+        for term in (self.rayleigh, self.viscous, self.contact):
+            if term is not None:
+                loss, force = term.value_and_gradient(y)
                 value, self.scale = value + loss, self.scale + loss
                 gradient += force
         return float(value), gradient
@@ -121,7 +145,7 @@ class StepObjective:
         does not depend on the accuracy of the rest.
         """
         nodes, factor = len(self.problem.positions), self.factors[0]
-        if not factor:
+        if not factor or self.contact is not None:
             return y, gradient
         mass = self.problem.mass
         shift = -gradient[:nodes].sum(axis=0) / (factor * mass.sum())
@@ -157,7 +181,12 @@ class StepObjective:
     def hessian_operator(self, y: Array, project: bool = False) -> HessianOperator:
         """The second derivative without assembling; ``project`` as in `cell_hessians`."""
         viscous = None if self.viscous is None else self.viscous.tangent(y, project)
-        return HessianOperator(self, self.problem.linearise(y, project), viscous)
+        contact = None if self.contact is None else self.contact.tangent(y, project)
+        return HessianOperator(self, self.problem.linearise(y, project), viscous, contact)
+
+    def longest_step(self, y: Array, direction: Array) -> float:
+        """See `ContactTerm.longest_step`."""
+        return 1.0 if self.contact is None else self.contact.longest_step(y, direction)
 
 
 def hessian_factors(problem: Problem, stage: StepEquation | Scheme) -> tuple[float, float]:
@@ -174,6 +203,7 @@ class HessianOperator:
     objective: StepObjective
     tangent: Linearisation
     viscous: ViscousTangent | None = None
+    contact: ContactTangent | None = None
 
     def __call__(self, x: Array) -> Array:
         out = self.product(x)
@@ -190,6 +220,8 @@ class HessianOperator:
             out += objective.rayleigh.stiffness * objective.rayleigh.tangent.apply(x)
         if self.viscous is not None:
             out += self.viscous.apply(x)
+        if self.contact is not None:
+            out += self.contact.apply(x)
         return out
 
     def blocks(self) -> Array:
@@ -198,7 +230,11 @@ class HessianOperator:
         rayleigh = self.objective.rayleigh
         if rayleigh is not None and rayleigh.stiffness:
             out += rayleigh.stiffness * rayleigh.tangent.blocks()
-        return out if self.viscous is None else out + self.viscous.blocks()
+        if self.viscous is not None:
+            out += self.viscous.blocks()
+        if self.contact is not None:
+            self.contact.add_to(out)
+        return out
 
 
 def global_backend(problem: Problem) -> Backend:
