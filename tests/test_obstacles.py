@@ -303,6 +303,32 @@ def test_a_moving_plate_does_not_pass_through_a_body():
     assert run.positions[-1][:, 2].min() > 0.24
 
 
+def test_a_run_goes_on_bit_for_bit_from_a_file(tmp_path):
+    lift = {"times": [0, 1], "displacement": [[0, 0, 0], [0.3, 0, 0.2]], "rotation": [0, 20]}
+    scene = block([{**FLOOR, "friction": 0.4, "motion": lift}], cells=(2, 1, 1))
+    whole = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)), frames=10)
+    assert (whole.stats["smallest_gap"] < 5e-4).sum() > 5  # it hops in between
+    part = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)), frames=6)
+    pc.save_trajectory(tmp_path / "run.h5", part)
+    half, again = pc.load_trajectory(tmp_path / "run.h5"), pc.Scene.from_toml(scene.to_toml())
+    assert again == scene
+    rest = pc.rollout(pc.ProjectiveDynamics(pc.discretise(again)), 4, state=half.state(-1))
+    np.testing.assert_array_equal(rest.positions[1:], whole.positions[7:])
+    np.testing.assert_array_equal(rest.velocities[1:], whole.velocities[7:])
+
+
+@pytest.mark.parametrize("element", ["hex8", "hex27"])
+def test_held_points_take_no_part(element):
+    clamps = [{"region": {"plane": "z", "at": "max"}}]
+    free, held = (
+        pc.discretise(block(clamps=c), element=element, mass="lumped").contact.points
+        for c in ([], clamps)
+    )
+    assert free.areas.sum() - held.areas.sum() == pytest.approx(
+        0.1 * 0.1 + 4 * 0.1 * 0.025 / 3, rel=1e-9
+    )  # the face, and a sixth of the height of the cells beside it
+
+
 def test_a_body_that_falls_past_an_obstacle_moves_as_without_it():
     far = [{"shape": "sphere", "centre": [1.0, 1.0, 1.0], "radius": 0.1, "friction": 0.5}]
     with_it, without = (

@@ -28,6 +28,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
 from pdcorrect.fem.obstacles import RigidObstacle
 from pdcorrect.fem.operators import Space
@@ -44,6 +45,8 @@ _TOUCH = 1e-6
 """Of the coarse cell size: how far a body at rest may reach into an obstacle that it touches."""
 _MARGIN = 0.9
 """Of the way to an obstacle that an iterate may go."""
+_ROUNDING = 1e-12
+"""Of shape functions that are zero at a point."""
 _LINE = np.array([0.0, 0.5, 1.0])
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
@@ -91,26 +94,24 @@ def surface_points(mesh: HexMesh, space: Space, free: NDArray[np.bool_]) -> Surf
     places = mesh.positions[faces]  # (f, 4, 3)
     normals = np.cross(*(np.einsum("pk,fki->fpi", slope, places) for slope in along))
     areas = np.linalg.norm(normals, axis=2) * np.outer(_SIMPSON, _SIMPSON).ravel()
-    unit = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1],
-                     [0, 1, 1]], dtype=float)  # fmt: skip
     number = (mesh.cells[owners][:, None, :] == faces[:, :, None]).argmax(axis=2)  # (f, 4)
-    at = np.einsum("pk,fki->fpi", corners, unit[number]).reshape(-1, 3)
+    at = np.einsum("pk,fki->fpi", corners, VTK_CORNERS[number]).reshape(-1, 3)
     cells, local = np.repeat(owners, 9), space.shape_functions(at)
-    local[np.abs(local) < 1e-12] = 0.0
+    local[np.abs(local) < _ROUNDING] = 0.0
+    nodes = np.where(local != 0.0, space.cells[cells], -1)  # the same for a point of several faces
+    _, first, which = np.unique(
+        np.sort(nodes, axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    total = np.bincount(which.ravel(), weights=areas.ravel()).astype(np.float64)
+    movable = np.asarray(free.any(axis=1))
+    loose = (movable[nodes[first]] & (nodes[first] >= 0)).any(axis=1)
+    first = first[loose]
+    cells, local = cells[first], local[first]
     rows = np.repeat(np.arange(len(cells)), local.shape[1])
     entries = (local.ravel(), (rows, space.cells[cells].ravel()))
-    every = sp.csr_matrix(entries, shape=(len(cells), len(space.positions)))
-    every.eliminate_zeros()
-    every.sort_indices()
-    nodes = np.full((len(cells), int(np.diff(every.indptr).max())), -1)
-    column = np.arange(len(every.indices)) - np.repeat(every.indptr[:-1], np.diff(every.indptr))
-    nodes[np.repeat(np.arange(len(cells)), np.diff(every.indptr)), column] = every.indices
-    held = ~free.any(axis=1)
-    _, first, which = np.unique(nodes, axis=0, return_index=True, return_inverse=True)
-    total = np.bincount(which.ravel(), areas.ravel())
-    loose = every[first] @ (~held).astype(float) > 0.0
-    first = first[loose]
-    return SurfacePoints(every[first], total[loose], cells[first], local[first])
+    operator = sp.csr_matrix(entries, shape=(len(cells), len(space.positions)))
+    operator.eliminate_zeros()
+    return SurfacePoints(operator, total[loose], cells, local)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +148,27 @@ _NOTHING = Touching(
 class Contact:
     """A body's surface and all obstacles of its scene.
 
+    Parameters
+    ----------
+    declared : sequence of Obstacle
+    points : SurfacePoints
+    rest : (N, 3)
+        Rest positions, m.
+    cell_size : float
+        Coarse cell size, m, the unit of default distances and slip velocities.
+    stiffness : float
+        Pa, of obstacles that have none of their own.
+
     Attributes
     ----------
-    points : SurfacePoints
-    obstacles : tuple of RigidObstacle
+    obstacles : list of RigidObstacle
+    distances, stiffnesses, slips, frictions : list of float
+        m, Pa, m/s and coefficient, one an obstacle.
+
+    Raises
+    ------
+    SceneError
+        If an obstacle reaches into the body at time 0, or is too thin to be moved in.
     """
 
     def __init__(
@@ -166,7 +184,7 @@ class Contact:
         self.stiffnesses = [o.stiffness or stiffness for o in declared]
         self.slips = [o.slip or _SLIP * cell_size for o in declared]
         self.frictions = [o.friction for o in declared]
-        self.obstacles = []
+        self.obstacles: list[RigidObstacle] = []
         at, spacing = points.operator @ rest, float(np.sqrt(points.areas.mean()))
         for i, (one, distance) in enumerate(zip(declared, self.distances, strict=True)):
             gaps = RigidObstacle(one).gaps(at, 0.0)

@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 _REST = np.eye(3), np.zeros(3)
 _SHORT = 1e-6
-"""S."""
+"""Time over which velocities are means, s."""
 
 
 class _Coordinate(Protocol):
@@ -139,9 +139,10 @@ class RigidObstacle:
         """R (3, 3) and b (3,) of x = R X + b at a time (s)."""
         if self._course is None:
             return _REST
-        if self._last is None or self._last[0] != time:
-            self._last = time, self._course.frame(time)
-        return self._last[1]
+        last = self._last
+        if last is None or last[0] != time:
+            self._last = last = time, self._course.frame(time)
+        return last[1]
 
     def gaps(self, x: Array, time: float) -> Array:
         """Distances of points (n, 3) from the surface, (n,), m; negative inside."""

@@ -36,7 +36,7 @@ class Sliding:
 
     @property
     def most(self) -> Array:
-        """N, (m,)."""
+        """The largest friction at each point, (m,), N."""
         return self.friction * self.touching.force
 
     def motions(self, x: Array) -> Array:
@@ -44,14 +44,14 @@ class Sliding:
         return np.asarray(x[self.points] - self.carried[self.points])
 
     def value(self, u: Array) -> float:
-        """J, of motions (m, 3) beyond the obstacle's."""
+        """The potential, J, of motions (m, 3) beyond the obstacle's."""
         size, e = self._length(u), self.slip
         inner = np.minimum(size, e)
         f = inner**2 / e * (1.0 - inner / (3.0 * e)) + np.maximum(size - e, 0.0)
         return float(self.most @ f)
 
     def forces(self, u: Array) -> Array:
-        """(m, 3), N."""
+        """Of friction on the points, (m, 3), N."""
         size = self._length(u)
         return -(self.most * self._over_length(size))[:, None] * self._tangent(u)
 
@@ -134,9 +134,10 @@ class ContactTerm:
                 break
             for obstacle in self._contact.obstacles:
                 carried = obstacle.carried(before, self._start, self._end)
-                way = np.abs(carried - before).max() * reach
-                near = obstacle.gaps(before, self._start) <= way if way else np.zeros(1, bool)
-                first = np.where(free & near[:, None], carried, first)
+                way = np.abs(carried - before).max()
+                if way > 0.0:
+                    near = obstacle.gaps(before, self._start) <= reach * way
+                    first = np.where(free & near[:, None], carried, first)
         way = wanted - first
         share = self._contact.longest_step(
             self._contact.at(first), self._contact.at(way), self._end
@@ -242,12 +243,9 @@ class ContactTerm:
         return self._stage.load_factor * out
 
     def _matrices(self, x: Array, project: bool) -> list[tuple[NDArray[np.int64], Array]]:
-        parts = []
-        for part in self._contact.touching(x, self._end):
-            parts.append((part.points, part.matrices(project)))
-        for sliding in self._sliding:
-            parts.append((sliding.points, sliding.matrices(sliding.motions(x))))
-        return parts
+        touching = self._contact.touching(x, self._end)
+        parts = [(part.points, part.matrices(project)) for part in touching]
+        return parts + [(part.points, part.matrices(part.motions(x))) for part in self._sliding]
 
     def longest_step(self, y: Array, direction: Array) -> float:
         """Largest share of a direction, at most 1, that crosses no obstacle."""
