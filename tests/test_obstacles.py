@@ -381,6 +381,11 @@ def test_what_obstacles_exclude_is_refused():
         pc.ProjectiveDynamics(problem, method="local-global")
     with pytest.raises(InputError, match="before"):
         pc.contact_forces(problem, state, state)
+    inside = pc.State(state.positions - np.array([0, 0, 0.01]), state.velocities)
+    with pytest.raises(InputError, match=r"obstacles\[0\]"):
+        pc.contact_forces(problem, inside)
+    result = pc.Newton(problem)(inside)
+    assert result.status is pc.Status.NOT_FINITE
 
 
 def test_derivatives_by_obstacles_need_obstacles():

@@ -80,7 +80,7 @@ def contact_forces(problem: Problem, state: State, before: State | None = None) 
     Raises
     ------
     InputError
-        If the scene has no obstacles, or shapes are wrong.
+        If the scene has no obstacles, shapes are wrong, or a point is inside an obstacle.
     """
     contact = problem.contact
     if contact is None:
@@ -94,6 +94,8 @@ def contact_forces(problem: Problem, state: State, before: State | None = None) 
             raise InputError(f"before.time = {before.time:g}: expected less than {state.time:g} s.")
     out = np.zeros((len(contact.obstacles), *state.positions.shape))
     for i, part in enumerate(contact.touching(x, state.time)):
+        if not np.isfinite(part.value):
+            raise InputError(f"the body reaches into obstacles[{i}]: expected positions outside.")
         forces = np.zeros_like(x)
         forces[part.points] = part.force[:, None] * part.normals
         obstacle = contact.obstacles[i]
