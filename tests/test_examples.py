@@ -30,14 +30,14 @@ def test_example_scenes_run_with_both_solvers(path):
     assert pc.metrics.largest_displacement(pd) > 0.02 * problem.cell_size
 
 
-def run_script(name, folder):
+def run_script(name, folder, **options):
     """The summary of a script in examples/, which draws one figure of its name."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     try:
         spec.loader.exec_module(module)
-        summary = module.main(folder)
+        summary = module.main(folder, **options)
     finally:
         del sys.modules[name]
     assert [path.name for path in folder.iterdir()] == [f"{name}.png"]
@@ -55,6 +55,11 @@ def test_the_target_is_reached(tmp_path):
     distances = run_script("reach_target", tmp_path)
     assert set(distances) == {"initial velocity", "six actuators"}
     assert max(distances.values()) < 1e-3
+
+
+def test_a_stride_gets_longer(tmp_path):
+    ways = run_script("crawl", tmp_path, iterations=1)
+    assert ways["optimised"] > ways["start"] + 1e-3
 
 
 def test_the_network_learns_to_reach_targets(tmp_path):

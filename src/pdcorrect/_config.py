@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from pdcorrect.errors import InputError
 
@@ -26,6 +26,15 @@ Positive = Annotated[float, Field(strict=True, gt=0, le=1e30)]
 NonNegative = Annotated[float, Field(strict=True, ge=0, le=1e30)]
 Poisson = Annotated[float, Field(strict=True, ge=0, lt=0.5)]
 Vector = tuple[Number, Number, Number]
+
+
+def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+    if not sum(x * x for x in vector) > 0.0:
+        raise ValueError("expected a direction, not the zero vector")
+    return vector
+
+
+Direction = Annotated[Vector, AfterValidator(_not_zero)]
 Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
 
 _DEEPEST_NESTING = 100

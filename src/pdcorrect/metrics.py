@@ -152,7 +152,8 @@ def relative_drift(values: ArrayLike) -> float:
 class EnergyBalance:
     """Energies of each frame, and work and damping loss since frame 0, (T+1,) each, J.
 
-    The work is that of the loads, of moving clamps and of moving obstacles on the body;
+    The work is that of the loads, of moving clamps, of moving obstacles on the body, and of
+    actuators that change their activation; ``elastic`` includes the actuators' fibres,
     ``contact`` is the energy of the obstacles' barriers.
     """
 
@@ -164,6 +165,7 @@ class EnergyBalance:
     contact: Array | float = 0.0
     obstacle_work: Array | float = 0.0
     friction_loss: Array | float = 0.0
+    actuator_work: Array | float = 0.0
 
     @property
     def total(self) -> Array:
@@ -177,7 +179,7 @@ class EnergyBalance:
         Zero for an exact solution.  It also holds what steps that are not solved
         exactly and work integrated by one point a step leave over.
         """
-        put_in = self.external_work + self.clamp_work + self.obstacle_work
+        put_in = self.external_work + self.clamp_work + self.obstacle_work + self.actuator_work
         put_in = put_in - self.damping_loss - self.friction_loss
         return self.total[0] + put_in - self.total
 
@@ -210,9 +212,10 @@ def energy_balance(run: Trajectory, problem: Problem | None = None) -> EnergyBal
     start = _initial_energies(run, run.problem if problem is None else problem)
     steps = {name: np.asarray(run.stats.get(name, ()), dtype=np.float64) for name in _ENERGIES}
     sums = {name: np.concatenate([[0.0], np.cumsum(steps[name])]) for name in _ENERGIES[2:]}
-    if "contact_energy" in run.stats:
-        for name in ("obstacle_work", "friction_loss"):
+    for name in ("obstacle_work", "friction_loss", "actuator_work"):
+        if name in run.stats:
             sums[name] = np.concatenate([[0.0], np.cumsum(run.stats[name])])
+    if "contact_energy" in run.stats:
         sums["contact"] = np.concatenate([[0.0], run.stats["contact_energy"]])
     return EnergyBalance(
         *(np.concatenate([[e], steps[name]]) for e, name in zip(start, _ENERGIES[:2], strict=True)),
@@ -229,10 +232,14 @@ def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, 
     positions, velocities = run.positions[0], run.velocities[0]
     if problem is not None:
         kinetic = 0.5 * float(np.vdot(velocities, problem.mass_times(velocities)))
-        return kinetic, problem.energy(positions)
-    if velocities.any() or (positions != run.points).any():
+        elastic = problem.energy(positions)
+        if problem.fibres is not None:
+            elastic += problem.fibres.energy(positions - problem.positions, run.times[0])
+        return kinetic, elastic
+    moves = velocities.any() or (positions != run.points).any()
+    if moves or "actuator_work" in run.stats:
         raise InputError(
-            "the run has no problem and does not start at rest, so the energies of frame 0 are "
-            "unknown: expected energy_balance(run, problem)."
+            "the run has no problem, and moves at its start or has actuators, so the energies of "
+            "frame 0 are unknown: expected energy_balance(run, problem)."
         )
     return 0.0, 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -116,3 +116,19 @@ class StepResult:
             f"StepResult({self.status.value}, {self.iterations} iterations, estimated error "
             f"{self.error_estimate:.2g} m, {self.state!r})"
         )
+
+
+_SUMMED = frozenset({
+    "evaluations", "external_work", "clamp_work", "damping_loss", "obstacle_work",
+    "friction_loss", "actuator_work",
+})  # fmt: skip
+_LEAST = frozenset({"smallest_volume_ratio", "smallest_gap"})
+
+
+def joined_stats(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Statistics of what was made in parts: sums, least values, and else the last part's."""
+    out = {}
+    for name, last in parts[-1].items():
+        values = [part[name] for part in parts if name in part]
+        out[name] = sum(values) if name in _SUMMED else min(values) if name in _LEAST else last
+    return out

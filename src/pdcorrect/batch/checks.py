@@ -46,11 +46,12 @@ def check_problems(
     if (integrator or first.time.integrator) == "generalised-alpha":
         names.append("time.spectral_radius")
     for i, problem in enumerate(problems):
-        if problem.contact is not None:
-            raise InputError(
-                f"scene {scene_name(problems, i)} has obstacles, which batches do not know: "
-                "expected none. Step it by ProjectiveDynamics or Newton."
-            )
+        for found, what in ((problem.contact, "obstacles"), (problem.fibres, "actuators")):
+            if found is not None:
+                raise InputError(
+                    f"scene {scene_name(problems, i)} has {what}, which batches do not know: "
+                    "expected none. Step it by ProjectiveDynamics or Newton."
+                )
         for name in names:
             mine, theirs = (attrgetter(name)(scene) for scene in (problem.scene, first))
             if mine != theirs:

@@ -176,7 +176,8 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     )
     others = {
         "clamp_work": "work of the clamps", "obstacle_work": "work of the obstacles",
-        "damping_loss": "lost to damping", "friction_loss": "lost to friction",
+        "actuator_work": "work of the actuators", "damping_loss": "lost to damping",
+        "friction_loss": "lost to friction",
     }  # fmt: skip
     work = {"external_work": "work of the loads"}
     work |= {name: text for name, text in others.items() if name in stats and stats[name].any()}

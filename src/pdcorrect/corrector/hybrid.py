@@ -116,11 +116,12 @@ class HybridStepper:
         substeps = self.problem.scene.time.substeps
         if substeps > 1:
             raise InputError(f"time.substeps = {substeps}: expected 1, frames are corrected whole.")
-        if self.problem.contact is not None:
-            raise InputError(
-                "the scene has obstacles, which a correction would enter: expected none. Leave the "
-                "model out."
-            )
+        for found, what in (
+            (self.problem.contact, "obstacles, which a correction would enter"),
+            (self.problem.fibres, "actuators, which no model was trained with"),
+        ):
+            if found is not None:
+                raise InputError(f"the scene has {what}: expected none. Leave the model out.")
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate)

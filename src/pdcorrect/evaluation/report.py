@@ -342,6 +342,8 @@ def gained_energy(stats: Mapping[str, Any]) -> str:
     if "contact_energy" in stats:
         stored = stored + stats["contact_energy"]
         put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
+    if "actuator_work" in stats:
+        put_in = put_in + stats["actuator_work"]
     put_in = np.cumsum(put_in)
     gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
     if not gained > _GAINED * stored.max():

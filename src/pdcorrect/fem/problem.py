@@ -21,6 +21,7 @@ from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.contact import Contact, surface_points
 from pdcorrect.fem.elastic_body import ElasticBody
+from pdcorrect.fem.fibres import Fibres
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
@@ -51,6 +52,8 @@ class Problem(ElasticBody):
     loads : tuple of NodalLoad
     contact : Contact or None
         Of the surface with the scene's obstacles.
+    fibres : Fibres or None
+        Of the scene's actuators.
     material_changed, density_changed : bool
         Whether the moduli, or the density, are no longer those of ``scene``.
     """
@@ -61,6 +64,7 @@ class Problem(ElasticBody):
     clamps: Clamps
     loads: tuple[NodalLoad, ...]
     contact: Contact | None = None
+    fibres: Fibres | None = None
     material_changed: bool = False
     density_changed: bool = False
 
@@ -192,9 +196,11 @@ class Problem(ElasticBody):
         self, mass_factor: float, stiffness_factor: float, volume_scale: float = 1.0
     ) -> sp.csr_matrix:
         """A M + b sum (2 mu + omega) w D^T D for factors a (1/s2) and b: G of any integrator."""
-        mass = self.mass_matrix.copy()
-        mass.resize((self.unknowns, self.unknowns))
-        return sp.csr_matrix(stiffness_factor * self.laplacian(volume_scale) + mass_factor * mass)
+        nodal = mass_factor * self.mass_matrix
+        if self.fibres is not None:
+            nodal = nodal + self.fibres.laplacian()
+        nodal.resize((self.unknowns, self.unknowns))
+        return sp.csr_matrix(stiffness_factor * self.laplacian(volume_scale) + nodal)
 
     # --- changes ------------------------------------------------------------------
 
@@ -299,11 +305,12 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
         points = surface_points(body.mesh, space, clamps.free)
         young = max([scene.material.young, *(part.young or 0.0 for part in scene.materials)])
         contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
+    fibres = Fibres.of(scene.actuators, body, selector) if scene.actuators else None
     freeze(clamps.free, matrix.indices, matrix.indptr)
     freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
-        loads, contact, correction=correction,
+        loads, contact, fibres, correction=correction,
     )  # fmt: skip
 
 

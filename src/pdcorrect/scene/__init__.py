@@ -7,6 +7,7 @@ key, the value, and what was expected.  `docs/scene.md` lists all keys.
 
 from __future__ import annotations
 
+from pdcorrect.scene.actuators import Actuator
 from pdcorrect.scene.bodies import Beam, Body, Cross, MeshFile, Voxels, Weight
 from pdcorrect.scene.clamps import Clamp, Initial, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
@@ -25,6 +26,7 @@ from pdcorrect.scene.scene import (
 )
 
 __all__ = [
+    "Actuator",
     "Beam",
     "Body",
     "BodyForce",

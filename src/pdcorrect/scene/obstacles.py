@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Union
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from pdcorrect._config import NonNegative, Positive, Strict, Vector
+from pdcorrect._config import Direction, NonNegative, Positive, Strict, Vector
 from pdcorrect.scene.clamps import Motion
 
 
@@ -42,9 +42,7 @@ class Plane(_Obstacle):
 
     shape: Literal["plane"]
     point: Vector
-    normal: Vector
-
-    _direction = field_validator("normal")(lambda vector: _nonzero(vector))
+    normal: Direction
 
 
 class Sphere(_Obstacle):
@@ -60,11 +58,9 @@ class Cylinder(_Obstacle):
 
     shape: Literal["cylinder"]
     centre: Vector
-    axis: Vector
+    axis: Direction
     radius: Positive
     length: Positive | None = None
-
-    _direction = field_validator("axis")(lambda vector: _nonzero(vector))
 
 
 class Box(_Obstacle):
@@ -78,12 +74,6 @@ class Box(_Obstacle):
         if not all(low < high for low, high in zip(*self.box, strict=True)):
             raise ValueError("expected box = [lowest corner, highest corner]")
         return self
-
-
-def _nonzero(vector: Vector) -> Vector:
-    if not sum(x * x for x in vector) > 0.0:
-        raise ValueError("expected a direction, not the zero vector")
-    return vector
 
 
 Obstacle = Annotated[Union[Plane, Sphere, Cylinder, Box], Field(discriminator="shape")]

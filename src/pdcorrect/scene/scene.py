@@ -10,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.errors import InputError, SceneError
+from pdcorrect.scene.actuators import Actuator
 from pdcorrect.scene.bodies import Body, MeshFile
 from pdcorrect.scene.clamps import Clamp, Initial
 from pdcorrect.scene.loads import Load
@@ -151,6 +152,7 @@ class Scene(TomlConfig):
     clamps: tuple[Clamp, ...] = ()
     loads: tuple[Load, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
+    actuators: tuple[Actuator, ...] = ()
     solver: Solver = Solver()
 
     source: ClassVar[str] = "scene"

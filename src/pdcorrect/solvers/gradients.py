@@ -276,6 +276,15 @@ class Gradients:
             raise InputError("the scene has no obstacles: expected one or more.")
         return self._objective.contact
 
+    # --- by actuators ---------------------------------------------------------------------
+
+    @property
+    def activations(self) -> tuple[Array, ...]:
+        """By the stretches of each actuator's table ``activation``, (rows,) each."""
+        if self._objective.fibres is None:
+            raise InputError("the scene has no actuators: expected one or more.")
+        return self._objective.fibres.slopes(self._y, self.x)
+
     # --- by damping ---------------------------------------------------------------------
 
     @property

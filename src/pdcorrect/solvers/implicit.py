@@ -27,7 +27,7 @@ from pdcorrect.solvers.step import (
     check_input,
     hessian_factors,
 )
-from pdcorrect.state import State, Status, StepResult
+from pdcorrect.state import State, Status, StepResult, joined_stats
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class _Outcome:
     clamp_work: float
     damping_loss: float
     modes: Array | None
-    contact: dict[str, float]
+    more: dict[str, float]
 
 
 class ImplicitStepper:
@@ -348,7 +348,7 @@ class ImplicitStepper:
             "clamp_work": outcome.clamp_work,
             "damping_loss": outcome.damping_loss,
             "smallest_volume_ratio": float(ratios.min()),
-            **outcome.contact,
+            **outcome.more,
         }
         status = minimum.status
         if not status.ok:  # what it remembers would be out of balance
@@ -375,15 +375,23 @@ def _outcome(
     clamp_work = float(np.vdot(reaction, moved)) / stage.load_factor
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
+    elastic = problem.energy_and_forces(end)[0]
+    if problem.fibres is not None:
+        elastic += problem.fibres.energy(end[:nodes] - problem.positions, stage.end)
     return _Outcome(
         after,
         minimum,
-        elastic_energy=problem.energy_and_forces(end)[0],
+        elastic_energy=elastic,
         external_work=float(np.vdot(objective.loads, moved)),
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, moved, h),
         modes=end[nodes:] if problem.space.internal else None,
-        contact={} if objective.contact is None else objective.contact.report(y),
+        more={
+            name: value
+            for term in (objective.fibres, objective.contact)
+            if term is not None
+            for name, value in term.report(y).items()
+        },
     )
 
 
@@ -403,12 +411,7 @@ def _joined(parts: list[_Outcome], end: State) -> _Outcome:
         clamp_work=sum(part.clamp_work for part in parts),
         damping_loss=sum(part.damping_loss for part in parts),
         modes=last.modes,
-        contact=last.contact and {
-            **last.contact,
-            "smallest_gap": min(part.contact["smallest_gap"] for part in parts),
-            "obstacle_work": sum(part.contact["obstacle_work"] for part in parts),
-            "friction_loss": sum(part.contact["friction_loss"] for part in parts),
-        },
+        more=joined_stats([part.more for part in parts]),
     )  # fmt: skip
 
 

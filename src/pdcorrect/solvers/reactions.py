@@ -119,6 +119,8 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
     out += problem.external_forces(state.time, None, state.positions)
     if forces is not None:
         out += forces
+    if problem.fibres is not None:
+        out += problem.fibres.forces(state.positions - problem.positions, state.time)
     if problem.contact is not None:
         out += contact_forces(problem, state).sum(axis=0)
     if damping.mass:

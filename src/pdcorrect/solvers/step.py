@@ -26,6 +26,7 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.problem import Problem
+from pdcorrect.solvers.actuation import FibreTangent, FibreTerm
 from pdcorrect.solvers.contact import ContactTangent, ContactTerm
 from pdcorrect.solvers.damping import Rayleigh, Viscous, ViscousTangent
 from pdcorrect.solvers.integrators import StepEquation
@@ -76,6 +77,9 @@ class StepObjective:
         has_rayleigh = stage.rate and (damping.mass or damping.stiffness)
         self.rayleigh = Rayleigh(problem, stage) if has_rayleigh else None
         self.viscous = Viscous(problem, stage) if stage.strains else None
+        self.fibres = None
+        if problem.fibres is not None:
+            self.fibres = FibreTerm(problem.fibres, problem.positions, stage, state)
         self.contact = None
         if problem.contact is not None:
             self.contact = ContactTerm(problem.contact, stage, state)
@@ -130,7 +134,7 @@ class StepObjective:
         value = energy + kinetic - work
         gradient -= elastic
         gradient -= self.forces
-        for term in (self.rayleigh, self.viscous, self.contact):
+        for term in (self.rayleigh, self.viscous, self.fibres, self.contact):
             if term is not None:
                 loss, force = term.value_and_gradient(y)
                 value, self.scale = value + loss, self.scale + loss
@@ -175,14 +179,17 @@ class StepObjective:
         result does not depend on the state at the step's start.
         """
         if at_rest:
-            return self.problem.linearise(y, project).blocks() * self.factors[1]
+            blocks = self.problem.linearise(y, project).blocks() * self.factors[1]
+            if self.fibres is not None:
+                self.fibres.relaxed_tangent(y).add_to(blocks)
+            return blocks
         return self.hessian_operator(y, project).blocks()
 
     def hessian_operator(self, y: Array, project: bool = False) -> HessianOperator:
         """The second derivative without assembling; ``project`` as in `cell_hessians`."""
         viscous = None if self.viscous is None else self.viscous.tangent(y, project)
-        contact = None if self.contact is None else self.contact.tangent(y, project)
-        return HessianOperator(self, self.problem.linearise(y, project), viscous, contact)
+        local = [t.tangent(y, project) for t in (self.fibres, self.contact) if t is not None]
+        return HessianOperator(self, self.problem.linearise(y, project), viscous, local)
 
     def longest_step(self, y: Array, direction: Array) -> float:
         """See `ContactTerm.longest_step`."""
@@ -202,8 +209,8 @@ class HessianOperator:
 
     objective: StepObjective
     tangent: Linearisation
-    viscous: ViscousTangent | None = None
-    contact: ContactTangent | None = None
+    viscous: ViscousTangent | None
+    local: Sequence[FibreTangent | ContactTangent]
 
     def __call__(self, x: Array) -> Array:
         out = self.product(x)
@@ -220,8 +227,8 @@ class HessianOperator:
             out += objective.rayleigh.stiffness * objective.rayleigh.tangent.apply(x)
         if self.viscous is not None:
             out += self.viscous.apply(x)
-        if self.contact is not None:
-            out += self.contact.apply(x)
+        for term in self.local:
+            out += term.apply(x)
         return out
 
     def blocks(self) -> Array:
@@ -232,8 +239,8 @@ class HessianOperator:
             out += rayleigh.stiffness * rayleigh.tangent.blocks()
         if self.viscous is not None:
             out += self.viscous.blocks()
-        if self.contact is not None:
-            self.contact.add_to(out)
+        for term in self.local:
+            term.add_to(out)
         return out
 
 
