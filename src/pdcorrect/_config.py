@@ -34,6 +34,13 @@ def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return vector
 
 
+def _possible(path: Path) -> Path:
+    if not path.name or "\0" in str(path):
+        raise ValueError("expected the path of a file")
+    return path
+
+
+FilePath = Annotated[Path, AfterValidator(_possible)]
 Direction = Annotated[Vector, AfterValidator(_not_zero)]
 Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
 
@@ -157,8 +164,12 @@ def explained(error: ValidationError, model: type[BaseModel]) -> str:
     tables = _tables_of(model)
     items = sorted(error.errors(), key=lambda x: x["type"] != "extra_forbidden")
     nested = {item["loc"][:k] for item in items for k in range(len(item["loc"]))}
-    every = dict.fromkeys(_sentence(x, tables) for x in items if x["loc"] not in nested)
-    sentences = list(every)[:_MOST_SENTENCES]
+    every: dict[str, list[str]] = {}
+    for item in items:
+        if item["loc"] not in nested:
+            key, told = _sentence(item, tables)
+            every.setdefault(key, []).append(told)
+    sentences = [_joined(*one) for one in list(every.items())[:_MOST_SENTENCES]]
     if len(every) > len(sentences):
         sentences.append(f"And {len(every) - len(sentences)} more.")
     return " ".join(" ".join(sentences).split())
@@ -173,23 +184,32 @@ class _Table(NamedTuple):
     keys: frozenset[str]
 
 
-def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> str:
+def _joined(key: str, told: Sequence[str]) -> str:
+    """One sentence of what is wrong with a key: one thing, or the members of a union."""
+    first, *others = dict.fromkeys(told)
+    others = [text.removeprefix("expected ") for text in others]
+    text = ", or ".join([first, *others])
+    text = f"{key}: {text}" if key else text
+    return text if text.endswith((".", "?")) else f"{text}."
+
+
+def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> tuple[str, str]:
+    """A key, with its value, and what is wrong with it."""
     kind, location, value = item["type"], item["loc"], item["input"]
     context = item.get("ctx", {})
     key = _key(location, tables, kind == "extra_forbidden")
     if kind == "extra_forbidden":
-        return f"{key}: unknown key; {_advice(key, tables)}"
+        return key, f"unknown key; {_advice(key, tables)}"
     if kind in ("union_tag_not_found", "union_tag_invalid"):  # wrong is the key that chooses
         chooses = str(context["discriminator"]).strip("'")
         key, value = f"{key}.{chooses}", value.get(chooses) if isinstance(value, dict) else value
     if kind in ("missing", "union_tag_not_found"):
-        return f"{key}: missing; a value is required."
+        return key, "missing; a value is required."
     told = item["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
     told = _WORDS[kind].format(**context) if kind in _WORDS else told
     if key and (value is not None or kind != "value_error"):
         key = f"{key} = {_shown(value)}"
-    told = f"{key}: {told[:1].lower()}{told[1:]}" if key else told
-    return told if told.endswith((".", "?")) else f"{told}."
+    return key, f"{told[:1].lower()}{told[1:]}" if key else told
 
 
 def _key(location: tuple[int | str, ...], tables: Sequence[_Table], unknown: bool) -> str:

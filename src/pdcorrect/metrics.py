@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.probes import probe_weights
 from pdcorrect.solvers.rollout import restrict
 from pdcorrect.trajectory import Trajectory
 
@@ -243,3 +244,30 @@ def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, 
             "frame 0 are unknown: expected energy_balance(run, problem)."
         )
     return 0.0, 0.0
+
+
+def probes(run: Trajectory, problem: Problem | None = None) -> dict[str, Array]:
+    """Displacements of the scene's probes, by name, (T+1, 3) each, m.
+
+    Parameters
+    ----------
+    run : Trajectory
+    problem : Problem, optional
+        What was stepped; the run's own by default.
+
+    Raises
+    ------
+    InputError
+        If the run has no problem and none is given, as of a run that was read from a file.
+    SceneError
+        If a probe is outside the body.
+    """
+    problem = run.problem if problem is None else problem
+    if problem is None:
+        raise InputError("the run has no problem: expected probes(run, problem).")
+    weights = probe_weights(problem)
+    moved = run.positions - run.points
+    return {
+        probe.name: np.stack([np.asarray(row @ frame).ravel() for frame in moved])
+        for probe, row in zip(problem.scene.probes, weights, strict=True)
+    }

@@ -71,6 +71,10 @@ def simulate(
         log = _run(stepper, count, output, earlier, overwrite)
         _summary(log.arrays(), stepper, before)
         common.say(f"wrote {output}")
+    if loaded.probes:
+        from pdcorrect.io.probes import write_probes
+
+        common.say(f"wrote {write_probes(load_trajectory(output), stepper.problem, output)}")
     if vtu:
         from pdcorrect.io.vtk import write_vtu_series
 

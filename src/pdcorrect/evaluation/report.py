@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import pdcorrect.figures as figures
 from pdcorrect._environment import environment
@@ -19,9 +20,11 @@ from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
 from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
-from pdcorrect.metrics import largest_displacement
+from pdcorrect.metrics import largest_displacement, probes
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
+
+Array = NDArray[np.float64]
 
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
@@ -198,13 +201,13 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
     runs = [comparison.runs[label] for label in labels]
     truth = comparison.on_coarse[comparison.reference]
     distance = np.linalg.norm(truth.positions - truth.points, axis=2)
-    frame, node = np.unravel_index(int(distance.argmax()), distance.shape)
+    frame = int(distance.max(axis=1).argmax())
     figures.render(
         runs,
         folder / "comparison.png",
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
-        frame=int(frame),
+        frame=frame,
     )
     names = ["comparison.png"]
     overlaid = overlaid_labels(comparison)
@@ -217,8 +220,7 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
             frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
         )
         names.append("overlay.png")
-    point = truth.points[node]
-    figures.plot_node_trajectories(runs, folder / "node.png", node_point=point, labels=labels)
+    names += _draw_places(comparison, distance, folder)
     figures.plot_energy(runs, folder / "energy.png", labels=labels)
     relative = comparison.converged is not None
     marks = {row.label: (row.seconds_a_frame, _error(row)) for row in comparison.rows}
@@ -232,7 +234,31 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
             "converged motion" if relative else "reference",
         )
         figures.plot_error_against_time(marks, folder / "error_against_time.png", relative)
-    return [*names, "node.png", "energy.png"]
+    return [*names, "energy.png"]
+
+
+def _draw_places(comparison: Comparison, distance: Array, folder: Path) -> list[str]:
+    """Displacements of the scene's probes, or else of the free node that moves farthest."""
+    runs = {row.label: comparison.runs[row.label] for row in comparison.rows}
+    if not comparison.scene.probes:
+        problem = next(iter(runs.values())).problem
+        if problem is not None:
+            distance = distance * problem.free.all(axis=1)[problem.mesh.coarse_nodes]
+        point = comparison.on_coarse[comparison.reference].points[distance.max(axis=0).argmax()]
+        figures.plot_node_trajectories(
+            list(runs.values()), folder / "node.png", node_point=point, labels=list(runs)
+        )
+        return ["node.png"]
+    found = {label: probes(run) for label, run in runs.items()}
+    names = []
+    for number, probe in enumerate(comparison.scene.probes):
+        names.append(f"probe_{number}.png")
+        figures.plot_displacements(
+            {label: (run.times, found[label][probe.name]) for label, run in runs.items()},
+            folder / names[-1],
+            title=probe.name,
+        )
+    return names
 
 
 def _error(row: Row) -> float:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
 from pdcorrect.scene import Clamp, Motion, Region
+from pdcorrect.scene.regions import unit_vector
 
 _TOLERANCE = 1e-6
 """Of the coarse cell size: how far a node may lie outside a region it belongs to."""
@@ -42,7 +43,7 @@ class Selector:
                     f"{len(coarse) - 1}, the nodes of the coarse mesh."
                 )
             return coarse[np.unique(region.nodes)]
-        inside = region.contains(self._positions, self._tolerance, self._mesh.bounds)
+        inside = region.contains(self._positions, self._tolerance, self._mesh.positions)
         return self._found(np.flatnonzero(inside), region, key, "node")
 
     def coarse_nodes(self, region: Region, key: str) -> NDArray[np.int64]:
@@ -57,7 +58,7 @@ class Selector:
                 f"{key} = {region.describe()}: expected a region with a volume (box, sphere, "
                 "everywhere), for cells are chosen by their centres."
             )
-        inside = region.contains(self._mesh.centres, self._tolerance, self._mesh.bounds)
+        inside = region.contains(self._mesh.centres, self._tolerance, self._mesh.positions)
         return self._found(np.flatnonzero(inside), region, key, "cell centre")
 
     def faces(self, region: Region, key: str) -> NDArray[np.int64]:
@@ -67,7 +68,7 @@ class Selector:
         if region.nodes is not None:
             member[self.nodes(region, key)] = True
         else:
-            member = region.contains(self._mesh.positions, self._tolerance, self._mesh.bounds)
+            member = region.contains(self._mesh.positions, self._tolerance, self._mesh.positions)
         found = np.flatnonzero(member[faces].all(axis=1))
         return faces[self._found(found, region, key, "boundary face")]
 
@@ -147,7 +148,7 @@ class Course:
     def __init__(self, motion: Motion) -> None:
         self._times = np.array(motion.times)
         self._angles = None if motion.rotation is None else np.array(motion.rotation)
-        self._axis, self._centre = motion.axis, np.array(motion.centre)
+        self._axis, self._centre = unit_vector(motion.axis), np.array(motion.centre)
         self._ways = () if motion.displacement is None else tuple(np.array(motion.displacement).T)
 
     def frame(self, time: float) -> tuple[Array, Array]:
@@ -159,7 +160,7 @@ class Course:
         out = points
         if self._angles is not None:
             angle = np.interp(time, self._times, self._angles)
-            turn = Rotation.from_euler(self._axis, angle, degrees=True)
+            turn = Rotation.from_rotvec(angle * self._axis, degrees=True)
             out = self._centre + turn.apply(points - self._centre)
         if self._ways:
             out = out + [np.interp(time, self._times, way) for way in self._ways]

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.scene import Actuator
+from pdcorrect.scene.regions import unit_vector
 
 Array = NDArray[np.float64]
 
@@ -62,7 +63,7 @@ class Fibres:
         cells, gradients, rest, owners, weights = [], [], [], [], []
         for i, actuator in enumerate(actuators):
             found = selector.cells(actuator.region, f"actuators[{i}].region")
-            m = np.array(actuator.direction) / np.linalg.norm(actuator.direction)
+            m = unit_vector(actuator.direction)
             lanes = body.quadrature.lanes[found, :width][..., points]
             cells.append(found)
             gradients.append(np.einsum("i,ckiq->cqk", m, lanes))

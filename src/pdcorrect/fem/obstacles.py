@@ -13,7 +13,6 @@ coordinates, and each of these is one interval of the path.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.fem.clamps import Course
 from pdcorrect.scene.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
+from pdcorrect.scene.regions import unit_vector
 
 Array = NDArray[np.float64]
 
@@ -207,7 +207,7 @@ class RigidObstacle:
 def _coordinates(declared: Obstacle, less: float) -> list[_Coordinate]:
     """Those of a shape whose surface is moved in by ``less``."""
     if isinstance(declared, Plane):
-        normal = _unit(declared.normal)
+        normal = unit_vector(declared.normal)
         return [_Slab(np.array(declared.point) - less * normal, normal)]
     if isinstance(declared, Box):
         low, high = np.array(declared.box)
@@ -217,12 +217,8 @@ def _coordinates(declared: Obstacle, less: float) -> list[_Coordinate]:
     if isinstance(declared, Sphere):
         return [_Radial(centre, np.eye(3), declared.radius - less)]
     assert isinstance(declared, Cylinder)
-    axis = _unit(declared.axis)
+    axis = unit_vector(declared.axis)
     side = _Radial(centre, np.eye(3) - np.outer(axis, axis), declared.radius - less)
     if declared.length is None:
         return [side]
     return [side, _Slab(centre, axis, 0.5 * declared.length - less)]
-
-
-def _unit(vector: Sequence[float]) -> Array:
-    return np.array(vector) / np.linalg.norm(vector)

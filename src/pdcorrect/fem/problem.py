@@ -22,6 +22,7 @@ from pdcorrect.fem.clamps import Clamps, Selector, resolve_clamps
 from pdcorrect.fem.contact import Contact, surface_points
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.fibres import Fibres
+from pdcorrect.fem.initial import motion_from
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
@@ -33,6 +34,9 @@ from pdcorrect.state import State
 Array = NDArray[np.float64]
 _LEAST_BYTES = 4000
 """Of memory that a cell takes, less than half of what was measured; eight times it as "hex27"."""
+
+_JUMP = 1e-3
+"""Of the coarse cell size: how far clamps may be from where a run starts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,22 +127,35 @@ class Problem(ElasticBody):
         return State(self.positions.copy(), np.zeros_like(self.positions), 0.0)
 
     def initial_state(self) -> State:
-        """Rest positions with the scene's initial velocities, time zero: where runs start.
+        """Where runs start, at time zero: the scene's initial velocities, from rest positions.
 
-        Clamped components have none; where the scene gives them some, a `PdcorrectWarning`
-        says so.
+        Or a frame of the run that ``initial.run`` names, its velocities added.  Clamped
+        components have none; where the scene gives them some, a `PdcorrectWarning` says so.
         """
-        return State(self.positions.copy(), self._initial_velocities.copy(), 0.0)
+        positions, velocities = self._initial_motion
+        return State(positions.copy(), velocities.copy(), 0.0)
 
     @cached_property
-    def _initial_velocities(self) -> Array:
+    def _initial_motion(self) -> tuple[Array, Array]:
         initial = self.scene.initial
         if initial is None:
-            return np.zeros_like(self.positions)
+            return self.positions, np.zeros_like(self.positions)
         mass = self.mass
         if self.mass_rule == "per-node":  # whose centre depends on the mesh
             mass = lumped(mass_matrix("lumped", self.space, self.materials.density))
         wanted = initial.velocities(self.positions, mass @ self.positions / mass.sum())
+        if initial.run is not None:
+            frame = -1 if initial.frame is None else initial.frame
+            start, speed = motion_from(initial.run, frame, self.positions, self.cell_size)
+            jump = np.abs(start - self.clamped_positions(0.0))[~self.free].max(initial=0.0)
+            if jump > _JUMP * self.cell_size:
+                warnings.warn(
+                    f"initial.run: clamps are up to {jump:.3g} m from where that run's frame has "
+                    "the nodes, which jump there in the first step.",
+                    PdcorrectWarning,
+                    stacklevel=3,
+                )
+            return start, np.where(self.free, speed + wanted, self._clamp_velocities)
         if wanted[~self.free].any():
             warnings.warn(
                 "initial: some of the nodes that it sets in motion are clamped; their clamped "
@@ -146,9 +163,12 @@ class Problem(ElasticBody):
                 PdcorrectWarning,
                 stacklevel=3,
             )
+        return self.positions, np.where(self.free, wanted, self._clamp_velocities)
+
+    @property
+    def _clamp_velocities(self) -> Array:
         h = self.time_step
-        driven = (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
-        return np.where(self.free, wanted, driven)
+        return (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
 
     # --- loads and clamps ---------------------------------------------------------
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.figures.curves import (
+    plot_displacements,
     plot_energy,
     plot_error_against_time,
     plot_error_over_time,
@@ -39,6 +40,7 @@ from pdcorrect.trajectory import Trajectory
 
 __all__ = [
     "check_offscreen",
+    "plot_displacements",
     "plot_energy",
     "plot_error_against_time",
     "plot_error_over_time",

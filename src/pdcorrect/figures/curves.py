@@ -109,16 +109,25 @@ def plot_node_trajectories(
     runs, place = _labelled(trajectories, labels), np.asarray(node_point, dtype=np.float64)
     if place.shape != (3,):
         raise InputError(f"node_point has shape {place.shape}: expected three coordinates.")
+    nodes = [int(np.linalg.norm(run.points - place, axis=1).argmin()) for run, _ in runs]
+    histories = {
+        label: (run.times, run.positions[:, node] - run.points[node])
+        for (run, label), node in zip(runs, nodes, strict=True)
+    }
+    where = ", ".join(f"{x:.3g}" for x in runs[0][0].points[nodes[0]])
+    return plot_displacements(histories, output, title=f"node at rest at ({where}) m")
+
+
+def plot_displacements(
+    histories: Mapping[str, tuple[Array, Array]], output: str | Path, *, title: str
+) -> Path:
+    """Displacement in x, y, z over time: by label, times (T,), s, and values (T, 3), m."""
     figure, axes = _axes(3, 7.0)
-    for index, (run, label) in enumerate(runs):
-        node = int(np.linalg.norm(run.points - place, axis=1).argmin())
-        moved = 1e3 * (run.positions[:, node] - run.points[node])
-        for axis, values, name in zip(axes, moved.T, "xyz", strict=True):
-            axis.plot(run.times, values, label=label, **_style(index))
+    for index, (label, (times, moved)) in enumerate(histories.items()):
+        for axis, values, name in zip(axes, 1e3 * moved.T, "xyz", strict=True):
+            axis.plot(times, values, label=label, **_style(index))
             axis.set_ylabel(f"{name} displacement [mm]")
-    nearest = runs[0][0].points[np.linalg.norm(runs[0][0].points - place, axis=1).argmin()]
-    where = ", ".join(f"{x:.3g}" for x in nearest)
-    axes[0].set_title(f"node at rest at ({where}) m", fontsize=11)
+    axes[0].set_title(title, fontsize=11)
     _legend(figure, axes)
     axes[-1].set_xlabel("time [s]")
     return _save(figure, output)

@@ -13,6 +13,7 @@ from pdcorrect.scene.clamps import Clamp, Initial, Motion
 from pdcorrect.scene.loads import BodyForce, Force, Gravity, Load, Pressure, Torsion, Traction
 from pdcorrect.scene.materials import EffectiveModuli, Material, MaterialRegion
 from pdcorrect.scene.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
+from pdcorrect.scene.probes import Probe
 from pdcorrect.scene.regions import Region
 from pdcorrect.scene.scene import (
     Damping,
@@ -47,6 +48,7 @@ __all__ = [
     "Obstacle",
     "Plane",
     "Pressure",
+    "Probe",
     "Region",
     "Scene",
     "Solver",

@@ -12,9 +12,9 @@ from typing import Annotated, Literal, Union
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
-from pdcorrect._config import Cells, Count, Positive, PositiveCount, Strict, Vector
+from pdcorrect._config import Cells, Count, FilePath, Positive, PositiveCount, Strict, Vector
 from pdcorrect.errors import SceneError
 
 _MOST_CELLS = 10**8
@@ -177,40 +177,55 @@ class Weight(_VoxelBody):
 
 
 class Voxels(_VoxelBody):
-    """Any set of grid cells: a nested list ``occupancy[x][y][z]`` of 0 and 1."""
+    """Any set of grid cells: a nested list ``occupancy[x][y][z]`` of 0 and 1.
+
+    Or the path of a NumPy file (``.npy``) of such an array, in which all but 0 is solid.
+    """
 
     shape: Literal["voxels"]
-    occupancy_list: tuple[tuple[tuple[Literal[0, 1], ...], ...], ...] = Field(alias="occupancy")
+    given: tuple[tuple[tuple[Literal[0, 1], ...], ...], ...] | FilePath = Field(alias="occupancy")
 
     @model_validator(mode="after")
     def _rectangular(self) -> Voxels:
-        widths = {len(plane) for plane in self.occupancy_list}
-        depths = {len(row) for plane in self.occupancy_list for row in plane}
+        if isinstance(self.given, Path):
+            return self
+        widths = {len(plane) for plane in self.given}
+        depths = {len(row) for plane in self.given for row in plane}
         if len(widths) != 1 or len(depths) != 1:
             raise ValueError("expected all planes and rows of occupancy to have the same length")
         return self
 
     def occupancy(self) -> Occupancy:
         """Solid cells (nx, ny, nz), the corner at the origin."""
-        solid = np.array(self.occupancy_list, dtype=bool)
+        solid = _read(self.given) if isinstance(self.given, Path) else np.array(self.given, bool)
         if not solid.any():
             raise SceneError("body.occupancy has no solid cells: expected at least one 1.")
         return solid, (0, 0, 0)
+
+
+def _read(path: Path) -> NDArray[np.bool_]:
+    """The solid cells of a NumPy file."""
+    try:
+        array = np.load(path, allow_pickle=False, mmap_mode="r")
+        shape, kind = array.shape, array.dtype.kind
+    except (OSError, ValueError, EOFError, AttributeError) as error:
+        raise SceneError(
+            f"body.occupancy = {str(path)!r} cannot be read ({error}): expected a NumPy file, .npy."
+        ) from None
+    if len(shape) != 3 or kind not in "biu":
+        raise SceneError(
+            f"body.occupancy = {str(path)!r} holds {array.dtype} of shape {shape}: expected whole "
+            "numbers or truth values of shape (x, y, z)."
+        )
+    return _grid(shape) | (array != 0)
 
 
 class MeshFile(Strict):
     """Hexahedral mesh from a file that meshio reads (Gmsh, Abaqus, VTU)."""
 
     shape: Literal["file"]
-    path: Path
+    path: FilePath
     scale: Positive = 1.0
-
-    @field_validator("path")
-    @classmethod
-    def _possible(cls, path: Path) -> Path:
-        if "\0" in str(path):
-            raise ValueError("expected a path without the character NUL")
-        return path
 
 
 Body = Annotated[Union[Beam, Cross, Weight, Voxels, MeshFile], Field(discriminator="shape")]

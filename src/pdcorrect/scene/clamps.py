@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pdcorrect._config import Axis, Number, Strict, Vector
+from pdcorrect._config import Axis, Direction, FilePath, Number, Strict, Vector
 from pdcorrect.scene.regions import Region
 
 Array = NDArray[np.float64]
@@ -25,13 +25,13 @@ class Motion(Strict):
     displacement
         One vector (m) for each time.
     rotation
-        One angle (degrees) for each time, about ``axis`` through ``centre``.
+        One angle (degrees) for each time, about ``axis`` (by name, or a vector) through ``centre``.
     """
 
     times: tuple[Number, ...] = Field(min_length=1)
     displacement: tuple[Vector, ...] | None = None
     rotation: tuple[Number, ...] | None = None
-    axis: Axis = "x"
+    axis: Axis | Direction = "x"
     centre: Vector = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
@@ -75,12 +75,23 @@ class Initial(Strict):
         G, rows of the derivatives of v_x, v_y, v_z by x, y, z, 1/s.
     centre
         c, m; the centre of mass by default.
+    run, frame
+        A trajectory file, from whose frame (-1 is the last) positions and velocities are taken;
+        the velocities above are added.
     """
 
     velocity: Vector = _STILL
     angular_velocity: Vector = _STILL
     velocity_gradient: tuple[Vector, Vector, Vector] = (_STILL, _STILL, _STILL)
     centre: Vector | None = None
+    run: FilePath | None = None
+    frame: int | None = None
+
+    @model_validator(mode="after")
+    def _frame_of_a_run(self) -> Initial:
+        if self.frame is not None and self.run is None:
+            raise ValueError("expected run beside frame")
+        return self
 
     def velocities(self, points: Array, centre_of_mass: Array) -> Array:
         """The field at rest positions (n, 3), m, as (n, 3), m/s."""

@@ -8,8 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pdcorrect._config import Axis, Count, Number, Positive, Strict, Vector, as_toml
+from pdcorrect._config import Axis, Count, Direction, Number, Positive, Strict, Vector, as_toml
 from pdcorrect.errors import SceneError
+
+
+def unit_vector(direction: Axis | tuple[float, float, float]) -> NDArray[np.float64]:
+    """Along an axis by name, or along a vector, (3,)."""
+    vector = np.eye(3)["xyz".index(direction)] if isinstance(direction, str) else direction
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 class Region(Strict):
@@ -18,8 +24,8 @@ class Region(Strict):
     Attributes
     ----------
     plane, at
-        Points with coordinate ``plane`` equal to ``at`` (m, or "min" / "max" of
-        the body).
+        Points at ``at`` (m from the origin, or "min" / "max" of the body) along ``plane``, an axis
+        by name or the normal of an oblique plane.
     box
         Lowest and highest corner, m.
     sphere, radius
@@ -30,7 +36,7 @@ class Region(Strict):
         The whole body.
     """
 
-    plane: Axis | None = None
+    plane: Axis | Direction | None = None
     at: Annotated[Number | Literal["min", "max"] | None, Field(union_mode="left_to_right")] = None
     box: tuple[Vector, Vector] | None = None
     sphere: Vector | None = None
@@ -53,21 +59,22 @@ class Region(Strict):
         return self
 
     def contains(
-        self, points: NDArray[np.float64], tolerance: float, bounds: NDArray[np.float64]
+        self, points: NDArray[np.float64], tolerance: float, body: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
         """Which of ``points`` (n, 3) lie in a geometric region, as (n,) bool.
 
-        ``tolerance`` (m) widens the region; ``bounds`` (2, 3) are the body's
-        lowest and highest coordinates, for ``at = "min" | "max"``.  A region of
+        ``tolerance`` (m) widens the region; ``body`` (N, 3) are the body's corners, for
+        ``at = "min" | "max"``.  A region of
         node numbers is resolved by the caller, who knows the numbering.
         """
         if self.everywhere:
             return np.ones(len(points), dtype=bool)
         if self.plane is not None:
-            axis = "xyz".index(self.plane)
-            low, high = bounds[:, axis]
-            at = {"min": low, "max": high}[self.at] if isinstance(self.at, str) else self.at
-            return np.abs(points[:, axis] - np.float64(at)) <= tolerance
+            normal = unit_vector(self.plane)
+            at = self.at
+            if isinstance(at, str):
+                at = float(getattr(np, at)(body @ normal))
+            return np.asarray(np.abs(points @ normal - at) <= tolerance)
         if self.box is not None:
             low, high = np.sort(np.asarray(self.box), axis=0)
             inside = (points >= low - tolerance) & (points <= high + tolerance)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from pdcorrect._config import NonNegative, Positive, PositiveCount, Strict, TomlConfig
+from pdcorrect._config import FilePath, NonNegative, Positive, PositiveCount, Strict, TomlConfig
 from pdcorrect.errors import InputError, SceneError
 from pdcorrect.scene.actuators import Actuator
 from pdcorrect.scene.bodies import Body, MeshFile
@@ -16,6 +16,7 @@ from pdcorrect.scene.clamps import Clamp, Initial
 from pdcorrect.scene.loads import Load
 from pdcorrect.scene.materials import Material, MaterialRegion
 from pdcorrect.scene.obstacles import Obstacle
+from pdcorrect.scene.probes import Probe
 
 Integrator = Literal["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"]
 
@@ -97,7 +98,7 @@ class Solver(Strict):
         "hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced", "hex8-learned",
         "hex27",
     ] = "hex8"  # fmt: skip
-    weights: Path | None = None
+    weights: FilePath | None = None
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
 
     @model_validator(mode="before")
@@ -114,12 +115,8 @@ class Solver(Strict):
 
     @model_validator(mode="after")
     def _weights_of_learned(self) -> Solver:
-        """Weights are a file, and of the learned element."""
-        if self.weights is None:
-            return self
-        if not self.weights.name or "\0" in str(self.weights):
-            raise ValueError("weights: expected the path of a file")
-        if self.element != "hex8-learned":
+        """Only the learned element has weights."""
+        if self.weights is not None and self.element != "hex8-learned":
             raise ValueError(
                 f"weights with element = {self.element!r}: expected 'hex8-learned', or no weights"
             )
@@ -153,6 +150,7 @@ class Scene(TomlConfig):
     loads: tuple[Load, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
     actuators: tuple[Actuator, ...] = ()
+    probes: tuple[Probe, ...] = ()
     solver: Solver = Solver()
 
     source: ClassVar[str] = "scene"
@@ -167,6 +165,14 @@ class Scene(TomlConfig):
         if not name.strip():
             raise ValueError("expected a name that is not empty")
         return name
+
+    @field_validator("probes")
+    @classmethod
+    def _told_apart(cls, probes: tuple[Probe, ...]) -> tuple[Probe, ...]:
+        names = [probe.name for probe in probes]
+        if len(set(names)) < len(names):
+            raise ValueError("expected a name for each that no other has")
+        return probes
 
     @model_validator(mode="after")
     def _motion_has_inertia(self) -> Scene:
@@ -187,12 +193,22 @@ class Scene(TomlConfig):
             If the file cannot be read, is not TOML, or is not a valid scene.
         """
         scene = super().load(path)
-        if isinstance(scene.body, MeshFile):  # relative to the scene file, from now on absolute
-            found = (Path(path).parent / scene.body.path).resolve()
-            scene = scene.with_changes(body={"path": found})
-        if scene.solver.weights is not None:
-            found = (Path(path).parent / scene.solver.weights).resolve()
-            scene = scene.with_changes(solver={"weights": found})
+        named = {
+            "body": {
+                "path": getattr(scene.body, "path", None),
+                "occupancy": getattr(scene.body, "given", None),
+            },
+            "initial": {"run": scene.initial and scene.initial.run},
+            "solver": {"weights": scene.solver.weights},
+        }
+        for section, keys in named.items():  # from now on absolute
+            found = {
+                key: (Path(path).parent / value).resolve()
+                for key, value in keys.items()
+                if isinstance(value, Path)
+            }
+            if found:
+                scene = scene.with_changes(**{section: found})
         return scene
 
     def with_changes(self, **sections: Any) -> Scene:

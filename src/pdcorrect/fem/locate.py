@@ -1,0 +1,68 @@
+"""Points of a body at rest: which cell each lies in, and where in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from pdcorrect.fem.hexahedron import VTK_CORNERS
+
+Array = NDArray[np.float64]
+
+_CANDIDATES = 27
+"""Cells whose centres are nearest: with distorted cells the right one may not be the first."""
+_NEWTON = 20
+
+
+def locate(
+    positions: Array, cells: NDArray[np.int64], points: Array
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """The place of points (P, 3), m, in trilinear cells (C, 8) of nodes at positions (N, 3), m.
+
+    Returns
+    -------
+    cells : (P,)
+        Each point's cell, or the nearest one.
+    local : (P, 3)
+        Its place on the unit cell; of a point outside, the nearest one found.
+    distances : (P,)
+        From that place, m; zero up to rounding for points inside.
+    """
+    count = min(_CANDIDATES, len(cells))
+    _, near = cKDTree(positions[cells].mean(axis=1)).query(points, k=count)
+    near = near.reshape(len(points), count)
+    corners = positions[cells[near]]  # (P, c, 8, 3)
+    local = _inverted(corners, np.broadcast_to(points[:, None], (*near.shape, 3)))
+    local = np.clip(local, 0.0, 1.0)
+    way = np.einsum("pck,pcki->pci", trilinear(local), corners) - points[:, None]
+    distances = np.linalg.norm(way, axis=2)
+    best = distances.argmin(axis=1)[:, None]
+    chosen = np.take_along_axis(local, best[..., None], axis=1)[:, 0]
+    return (
+        np.take_along_axis(near, best, axis=1)[:, 0],
+        chosen,
+        np.take_along_axis(distances, best, axis=1)[:, 0],
+    )
+
+
+def trilinear(local: Array) -> Array:
+    """Shape functions (..., 8) at places (..., 3) on the unit cell, VTK order."""
+    x = local[..., None, :]
+    return np.asarray(np.where(VTK_CORNERS == 1, x, 1.0 - x).prod(axis=-1))
+
+
+def _inverted(corners: Array, points: Array) -> Array:
+    """Places (..., 3) that the trilinear maps of corners (..., 8, 3) take to points (..., 3)."""
+    sign, local = 2.0 * VTK_CORNERS - 1.0, np.full(points.shape, 0.5)
+    for _ in range(_NEWTON):
+        factors = np.where(VTK_CORNERS == 1, local[..., None, :], 1.0 - local[..., None, :])
+        others = [factors[..., [j for j in range(3) if j != i]].prod(axis=-1) for i in range(3)]
+        slopes = np.stack(others, axis=-1) * sign  # (..., 8, 3)
+        J = np.einsum("...ki,...kj->...ij", corners, slopes)
+        rest = points - np.einsum("...k,...ki->...i", factors.prod(axis=-1), corners)
+        step = np.linalg.solve(J, rest[..., None])[..., 0]
+        local = np.clip(local + step, -1.0, 2.0)  # cells that are far off do not matter
+        if np.abs(step).max() < 1e-14:
+            break
+    return local
