@@ -36,13 +36,20 @@ def simulate(
     vtu: Annotated[
         Optional[Path], typer.Option(help="Folder for the run, with stress, for ParaView.")
     ] = None,
+    allow_inverted: Annotated[
+        bool, typer.Option("--allow-inverted", help="Exit status 0 also with inverted cells.")
+    ] = False,
     overwrite: common.Overwrite = False,
     resume: Annotated[
         bool, typer.Option(help="Continue an existing output file after its last complete frame.")
     ] = False,
 ) -> None:
-    """Run one scene and write its trajectory, frame by frame."""
+    """Run one scene and write its trajectory, frame by frame.
+
+    Exit status 1 if frames ended with inverted cells, which are written all the same.
+    """
     from pdcorrect._files import make_folder
+    from pdcorrect.evaluation.report import inverted_frames
     from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.scene import Scene
 
@@ -67,9 +74,12 @@ def simulate(
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     before = 0 if earlier is None else len(earlier)
+    inverted = ""
     if before < count:
-        log = _run(stepper, count, output, earlier, overwrite)
-        _summary(log.arrays(), stepper, before)
+        stats = _run(stepper, count, output, earlier, overwrite).arrays()
+        _summary(stats, stepper, before)
+        inverted = inverted_frames(stats, loaded.time.step)
+        common.say(inverted)
         common.say(f"wrote {output}")
     if loaded.probes:
         from pdcorrect.io.probes import write_probes
@@ -84,6 +94,8 @@ def simulate(
         common.say(f"wrote {series}")
     if estimate_error:
         common.say(_estimated(load_trajectory(output)))
+    if inverted and not allow_inverted:
+        raise typer.Exit(common.FAILED)
 
 
 def _make_stepper(
@@ -155,12 +167,7 @@ def _run(
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, energy, and what is unusual about a run."""
-    from pdcorrect.evaluation.report import (
-        gained_energy,
-        inverted_frames,
-        refused_corrections,
-        three_digits,
-    )
+    from pdcorrect.evaluation.report import gained_energy, refused_corrections, three_digits
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()
@@ -190,7 +197,6 @@ def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
         f"{stats['kinetic_energy'][-1]:.4g} J; over the run "
         + ", ".join(f"{text} {stats[name].sum():.4g} J" for name, text in work.items())
     )
-    common.say(inverted_frames(stats, problem.scene.time.step))
     if problem.scene.time.integrator != "quasi-static":
         common.say(gained_energy(stats))
     if "gate" in stats:

@@ -6,14 +6,20 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
+from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.scene import Clamp, Motion, Region
 from pdcorrect.scene.regions import unit_vector
 
+_RIGID = 1e-9
+"""Relative size of a rigid motion at clamped components that counts as none."""
 _TOLERANCE = 1e-6
 """Of the coarse cell size: how far a node may lie outside a region it belongs to."""
 
@@ -165,3 +171,42 @@ class Course:
         if self._ways:
             out = out + [np.interp(time, self._times, way) for way in self._ways]
         return out
+
+
+def check_held(positions: Array, cells: NDArray[np.int64], free: NDArray[np.bool_]) -> None:
+    """Refuse a body, or one of its parts, that clamps let move as a rigid one.
+
+    Of nodes at positions (N, 3), m, with ``free`` components (N, 3): without inertia such a
+    motion has no solution.
+    """
+    width = cells.shape[1]
+    edges = np.repeat(cells[:, :1], width - 1, axis=1).ravel(), cells[:, 1:].ravel()
+    graph = sp.coo_array((np.ones(len(edges[0])), edges), shape=(len(positions),) * 2)
+    count, part = connected_components(graph, directed=False)
+    for number in range(count):
+        nodes = np.flatnonzero(part == number)
+        held = rigid_motions(positions[nodes])[~free[nodes].ravel()]
+        loose = la.null_space(held, rcond=_RIGID) if len(held) else np.eye(6)
+        if not loose.size:
+            continue
+        turns = loose[3:]
+        moves = loose[:3] @ la.null_space(turns, rcond=_RIGID)
+        told = [
+            f"{verb} {' and '.join(_directions(space))}"
+            for verb, space in (("move along", moves), ("turn about", la.orth(turns, rcond=_RIGID)))
+            if space.size
+        ]
+        which = "the body" if count == 1 else f"the part of the body at node {nodes[0]}"
+        raise SceneError(
+            f"clamps let {which} {' and '.join(told)}: expected clamps against every rigid motion, "
+            "for quasi-static bodies have no inertia."
+        )
+
+
+def _directions(space: Array) -> list[str]:
+    """A basis of a space of directions (3, k) in words, axes by name where they lie in it."""
+    inside = np.linalg.norm(la.orth(space).T, axis=0) > 1.0 - _RIGID
+    named = [name for name, is_in in zip("xyz", inside, strict=True) if is_in]
+    if len(named) == space.shape[1]:
+        return named
+    return [str((column / np.abs(column).max()).round(3).tolist()) for column in space.T]

@@ -28,6 +28,7 @@ from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix
+from pdcorrect.fem.plausibility import warn_of_units
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
@@ -305,6 +306,7 @@ def discretise(
     body = ElasticBody(refined, space, space.quadrature(), materials, cell_size)
     problem = problem_from_body(scene, refine, body)
     warn_of_thin_cells(scene.solver.element, refined, problem.free)
+    warn_of_units(scene, body)
     return problem
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from pdcorrect.errors import InputError
+from pdcorrect.fem.clamps import check_held
 from pdcorrect.fem.factorisation import Backend, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.follower import settle
@@ -112,6 +113,8 @@ class ImplicitStepper:
         self.integrator = time.integrator if integrator is None else integrator
         viscous = problem.scene.damping.viscosity > 0.0
         self.integrate = make_integrator(self.integrator, time.spectral_radius, viscous)
+        if self.integrator == "quasi-static":
+            check_held(problem.positions, problem.cells, problem.free)
         within = self.tolerance * problem.cell_size
         if problem.contact is not None:
             within = min(within, _OF_DISTANCE * min(problem.contact.distances))

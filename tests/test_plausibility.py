@@ -1,0 +1,101 @@
+"""What looks wrong is told before it is computed, and what went wrong ends with a status."""
+
+import warnings
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import pdcorrect as pc
+from conftest import CLAMPED, beam
+from pdcorrect.cli.program import app
+from pdcorrect.errors import PdcorrectWarning, SceneError
+
+QUASI_STATIC = {"step": 0.1, "frames": 1, "integrator": "quasi-static"}
+
+
+def plausible(**changes):
+    element = {"element": "hex8-enhanced", "mass": "averaged"}
+    return beam((2, 1, 1), **{"solver": element, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"body": {"cell_size": 60.0}, "time": {"step": 10.0}}, "120 m"),
+        ({"body": {"cell_size": 4e-5}, "time": {"step": 1e-6}}, "8e-05 m"),
+        ({"material": {"density": 1e-3}, "time": {"step": 1e-5}}, "0.001 kg"),
+        ({"material": {"young": 0.1}, "time": {"step": 1e-4}}, "steps"),
+        ({"material": {"young": 2e11}, "time": {"step": 1.0}}, "steps"),
+    ],
+)
+def test_magnitudes_of_other_units_get_one_line(changes, named):
+    with pytest.warns(PdcorrectWarning, match=named) as told:
+        pc.discretise(plausible(**changes))
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"body": {"cell_size": 40.0}, "material": {"young": 3e10, "density": 2400.0}},
+        {"body": {"cell_size": 2e-4}, "time": {"step": 1e-4}},
+        {"material": {"young": 2e11, "density": 7800.0}, "time": {"step": 1e-3}},
+        {"material": {"young": 2e11}, "time": QUASI_STATIC},
+    ],
+)
+def test_usual_magnitudes_get_none(changes):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pc.discretise(plausible(**changes))
+
+
+X, Y, Z = ({"region": {"plane": axis, "at": "min"}, "components": [axis]} for axis in "xyz")
+EDGE = {"region": {"plane": [1, 0, 1], "at": "min"}}
+
+
+@pytest.mark.parametrize(
+    ("clamps", "loose"),
+    [
+        ([], "move along x and y and z and turn about x and y and z"),
+        ([X], "move along y and z and turn about x"),
+        ([X, Y], "move along z:"),
+        ([EDGE], "turn about y:"),
+        ([{"region": {"nodes": [0, 7]}}], r"turn about \["),
+    ],
+)
+@pytest.mark.parametrize("kind", [pc.Newton, pc.ProjectiveDynamics])
+def test_statics_name_the_rigid_motion_that_clamps_leave(kind, clamps, loose):
+    problem = pc.discretise(plausible(clamps=clamps, time=QUASI_STATIC))
+    with pytest.raises(SceneError, match=loose):
+        kind(problem)
+
+
+@pytest.mark.parametrize("clamps", [CLAMPED, [X, Y, Z], [{"region": {"nodes": [0, 1, 2]}}]])
+def test_held_statics_step(clamps):
+    stepper = pc.Newton(pc.discretise(plausible(clamps=clamps, time=QUASI_STATIC)))
+    assert stepper(stepper.problem.rest_state()).status.ok
+
+
+def test_each_part_of_a_body_needs_its_clamps():
+    occupancy = [[[1]], [[0]], [[1]]]
+    body = {"shape": "voxels", "occupancy": occupancy, "cell_size": 0.02}
+    scene = plausible().model_dump(mode="python", exclude_unset=True, by_alias=True)
+    apart = pc.Scene(**{**scene, "body": body, "time": QUASI_STATIC})
+    with pytest.raises(SceneError, match="part of the body at node 8"):
+        pc.Newton(pc.discretise(apart))
+
+
+@pytest.mark.parametrize(("options", "status"), [([], 1), (["--allow-inverted"], 0)])
+def test_inverted_frames_end_with_status_1_unless_allowed(tmp_path, options, status):
+    press = {"times": [0, 0.01], "displacement": [[0, 0, 0], [-0.045, 0, 0]]}
+    clamps = [*CLAMPED, {"region": {"plane": "x", "at": "max"}, "motion": press}]
+    scene = plausible(clamps=clamps, loads=[], time={"step": 0.01, "frames": 1})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    output = tmp_path / "run.h5"
+    command = ["simulate", str(tmp_path / "scene.toml"), "-o", str(output), *options]
+    done = CliRunner().invoke(app, command)
+    run = pc.load_trajectory(output)
+    assert np.min(run.stats["smallest_volume_ratio"]) <= 0
+    assert done.exit_code == status
