@@ -243,7 +243,7 @@ def _draw_places(comparison: Comparison, distance: Array, folder: Path) -> list[
     if not comparison.scene.probes:
         problem = next(iter(runs.values())).problem
         if problem is not None:
-            distance = distance * problem.free.all(axis=1)[problem.mesh.coarse_nodes]
+            distance = distance * problem.free[problem.mesh.coarse_nodes].all(axis=1)
         point = comparison.on_coarse[comparison.reference].points[distance.max(axis=0).argmax()]
         figures.plot_node_trajectories(
             list(runs.values()), folder / "node.png", node_point=point, labels=list(runs)

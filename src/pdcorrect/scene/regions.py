@@ -69,9 +69,8 @@ class Region(Strict):
         """
         if self.everywhere:
             return np.ones(len(points), dtype=bool)
-        if self.plane is not None:
-            normal = unit_vector(self.plane)
-            at = self.at
+        if self.plane is not None and self.at is not None:
+            normal, at = unit_vector(self.plane), self.at
             if isinstance(at, str):
                 at = float(getattr(np, at)(body @ normal))
             return np.asarray(np.abs(points @ normal - at) <= tolerance)

@@ -193,7 +193,7 @@ class Scene(TomlConfig):
             If the file cannot be read, is not TOML, or is not a valid scene.
         """
         scene = super().load(path)
-        named = {
+        named: dict[str, dict[str, Any]] = {
             "body": {
                 "path": getattr(scene.body, "path", None),
                 "occupancy": getattr(scene.body, "given", None),
