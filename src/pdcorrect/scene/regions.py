@@ -14,7 +14,9 @@ from pdcorrect.errors import SceneError
 
 def unit_vector(direction: Axis | tuple[float, float, float]) -> NDArray[np.float64]:
     """Along an axis by name, or along a vector, (3,)."""
-    vector = np.eye(3)["xyz".index(direction)] if isinstance(direction, str) else direction
+    if isinstance(direction, str):
+        return np.eye(3)["xyz".index(direction)]
+    vector = np.array(direction)
     return np.asarray(vector / np.linalg.norm(vector))
 
 
