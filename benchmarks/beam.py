@@ -164,7 +164,7 @@ def elements(width: str, height: str, length: str, rounds: str = "5") -> dict[st
 def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[str, Any]:
     """Milliseconds of one iteration of L-BFGS with a full history, without the error estimate."""
     from pdcorrect.solvers.first_hessian import TrueHessian
-    from pdcorrect.solvers.implicit import quiet_blas
+    from pdcorrect.solvers.implicit import limited_threads
     from pdcorrect.solvers.integrators import backward_euler
     from pdcorrect.solvers.minimise import MinimiserOptions, minimise
     from pdcorrect.solvers.step import GlobalSolver, StepObjective
@@ -174,7 +174,7 @@ def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[
     state = problem.rest_state()
     loads = problem.external_forces(0.0, 0.01)
     objective = StepObjective(problem, state, backward_euler(problem, state, 0.01), loads)
-    with quiet_blas():
+    with limited_threads(problem):
         if first_hessian == "rest":
             solve: Any = TrueHessian(TangentFactory(problem), lagged=False).solver(objective)
         else:

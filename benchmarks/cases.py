@@ -98,6 +98,26 @@ def threads() -> list[dict[str, Any]]:
     return rows
 
 
+def busy() -> list[dict[str, Any]]:
+    """Milliseconds a step on one and two threads beside other busy processes."""
+    script = str(Path(__file__).parent / "busy.py")
+    rows = []
+    for others in (0, 5, 10):
+        loop = [sys.executable, "-c", "while True: pass"]
+        started = [subprocess.Popen(loop) for _ in range(others)]
+        try:
+            out = subprocess.run(
+                [sys.executable, script], check=True, capture_output=True, text=True
+            )
+        finally:
+            for other in started:
+                other.kill()
+                other.wait()
+        found = json.loads(out.stdout.splitlines()[-1])
+        rows += [{"other busy processes": others, **row} for row in found]
+    return rows
+
+
 def first_hessian() -> list[dict[str, Any]]:
     """Mean iterations and milliseconds over eight frames, by the first Hessian of L-BFGS."""
     rows = []
@@ -227,6 +247,7 @@ CASES: dict[str, Callable[[], Any]] = {
     "start_up": start_up,
     "steps": steps,
     "threads": threads,
+    "busy": busy,
     "first_hessian": first_hessian,
     "volume_scale": volume_scale,
     "factor_size": factor_size,

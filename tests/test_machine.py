@@ -1,42 +1,59 @@
-"""How much memory may be used."""
+"""Machines that keep no files, have few threads, or are busy."""
 
-import os
+import subprocess
+import sys
 
+import numba
 import pytest
 
-from pdcorrect._environment import total_memory
+import pdcorrect as pc
+from conftest import beam
+from pdcorrect.solvers import implicit
 
-V1, V2 = "sys/fs/cgroup/memory/{}/memory.limit_in_bytes", "sys/fs/cgroup/{}/memory.max"
-MACHINE = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-
-
-def system(root, groups, limits):
-    """A system's files: the groups that a process is in, and limits by file."""
-    for name, content in {"proc/self/cgroup": groups, **limits}.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(content)
-    return root
-
-
-@pytest.mark.parametrize(
-    ("groups", "limits", "expected"),
-    [
-        ("0::/jobs/7\n", {V2.format("jobs/7"): "3000000\n"}, 3e6),
-        ("0::/jobs/7\n", {V2.format("jobs/7"): "max\n", V2.format("jobs"): "2000000\n"}, 2e6),
-        ("0::/jobs/7\n", {V2.format("jobs/8"): "1000\n"}, MACHINE),
-        ("0::/seen/from/outside\n", {V2.format("."): "4000000\n"}, 4e6),
-        ("4:memory:/jobs\n1:cpu:/x\n", {V1.format("jobs"): "5000000\n"}, 5e6),
-        ("4:cpu,memory:/\n0::/\n", {V1.format("."): "9223372036854771712\n"}, MACHINE),
-        ("1:cpu:/jobs\n", {V1.format("jobs"): "1000\n"}, MACHINE),
-        ("0::/\n", {V2.format("."): "\n"}, MACHINE),
-        ("no group\n0::/jobs\n", {V2.format("jobs"): "6000000\n"}, 6e6),
-    ],
-)
-def test_the_least_limit_of_the_control_groups_counts(tmp_path, groups, limits, expected):
-    assert total_memory(system(tmp_path, groups, limits)) == expected
+WITHOUT_A_CACHE = """
+import warnings
+import numba.core.caching as caching
+caching.CacheImpl._locator_classes = []
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    import numpy as np
+    from pdcorrect.fem.decomposition import OPTIONS
+    from pdcorrect.solvers.first_hessian import _turn
+texts = [str(w.message) for w in told if w.category.__name__ == "PdcorrectWarning"]
+assert len(texts) == 1 and "NUMBA_CACHE_DIR" in texts[0], texts
+assert not OPTIONS["cache"]
+x = np.ones((2, 3))
+_turn(np.stack([2 * np.eye(3)] * 2), x, x)
+assert (x == 2).all()
+"""
 
 
-def test_without_control_groups_it_is_the_machine_s(tmp_path):
-    assert total_memory(tmp_path) == MACHINE
-    assert 0 < total_memory() <= MACHINE
+def test_kernels_run_where_none_can_be_kept():
+    subprocess.run([sys.executable, "-c", WITHOUT_A_CACHE], check=True)
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_only_large_problems_take_all_threads_and_give_them_back(monkeypatch, few):
+    monkeypatch.setattr(implicit, "_SHARED_POINTS", 10**9 if few else 0)
+    monkeypatch.setattr(numba, "set_num_threads", lambda n: used.append(n))
+    used, most = [], numba.get_num_threads()
+    stepper = pc.Newton(pc.discretise(beam((2, 1, 1))))
+    stepper(stepper.problem.rest_state())
+    assert used == ([1, most] if few else [most])
+
+
+@pytest.mark.parametrize("command", ["simulate", "compare"])
+def test_threads_are_set_before_the_kernels_are_loaded(command):
+    script = f"""
+import os, sys
+sys.argv = ["pdcorrect", "{command}", "--threads", "1", "none.toml", "-o", "none"]
+from pdcorrect.cli.program import main
+assert "numba" not in sys.modules
+try:
+    main()
+except SystemExit as end:
+    assert end.code == 2
+import numba
+assert numba.get_num_threads() == 1
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)

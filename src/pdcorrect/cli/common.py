@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
@@ -27,6 +28,19 @@ OutputFolder = Annotated[Path, typer.Option("-o", "--output", help="Folder for t
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there already.")]
 Gated = Annotated[
     bool, typer.Option(help="Of correctors: let the default gate refuse corrections.")
+]
+
+
+def _use_threads(count: int | None) -> None:
+    """Before numba is imported, which reads these once."""
+    if count is not None:
+        for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+            os.environ[name] = str(count)
+
+
+Threads = Annotated[
+    Optional[int],
+    typer.Option(help="Of the kernels; by default as many as cores.", min=1, callback=_use_threads),
 ]
 Learned = Annotated[bool, typer.Option("--learned", help="With the learned element.")]
 EstimateError = Annotated[
@@ -64,11 +78,7 @@ def tell_of_compiling() -> None:
 
         def on_start(self, event: object) -> None:
             if not self.done:
-                typer.echo(
-                    "compiling kernels, which takes a few minutes; they are kept on disk for the "
-                    "next time",
-                    err=True,
-                )
+                typer.echo("compiling kernels, which takes a few minutes the first time", err=True)
             self.done = True
 
         def on_end(self, event: object) -> None:

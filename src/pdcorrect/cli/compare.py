@@ -20,6 +20,7 @@ def compare(
     scene: common.SceneFile,
     output: common.OutputFolder = Path("comparison"),
     frames: common.Frames = None,
+    threads: common.Threads = None,
     model: Annotated[
         Optional[list[str]],
         typer.Option(help="Also a corrector, by name or folder; repeatable (extra 'learn')."),

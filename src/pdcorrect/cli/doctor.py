@@ -34,10 +34,14 @@ def doctor() -> None:
 def _installed() -> Iterator[Check]:
     import numpy as np
 
+    from pdcorrect.fem.decomposition import OPTIONS
+
     for name, found in versions().items():
         yield name, found, found != "missing" or name in _OPTIONAL
     yield "processor", f"{processor()}, {os.cpu_count()} cores", True
-    yield "kernel threads", f"{threads()} (set NUMBA_NUM_THREADS)", True
+    yield "kernel threads", f"{threads()} (--threads, or NUMBA_NUM_THREADS)", True
+    kept = OPTIONS["cache"]
+    yield "compiled kernels", "kept on disk" if kept else "not kept: set NUMBA_CACHE_DIR", kept
     config = np.show_config(mode="dicts")
     blas = config.get("Build Dependencies", {}).get("blas", {}) if config else {}
     name = f"{blas.get('name', 'unknown')} {blas.get('version', '')}".strip()

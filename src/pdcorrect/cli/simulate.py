@@ -33,6 +33,7 @@ def simulate(
     learned: common.Learned = False,
     estimate_error: common.EstimateError = False,
     frames: common.Frames = None,
+    threads: common.Threads = None,
     vtu: Annotated[
         Optional[Path], typer.Option(help="Folder for the run, with stress, for ParaView.")
     ] = None,

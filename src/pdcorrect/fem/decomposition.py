@@ -18,12 +18,34 @@ v_i = (s_i + sqrt(s_i^2 + 4 k)) / 2.
 from __future__ import annotations
 
 import math
+import warnings
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core.caching import FunctionCache
 
-OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
+from pdcorrect.errors import PdcorrectWarning
+
+
+def _kept() -> bool:
+    """Whether compiled kernels can be kept on disk; if not, a `PdcorrectWarning` says so."""
+    try:
+        FunctionCache(_kept)  # type: ignore[no-untyped-call]
+    except RuntimeError:  # no folder that can be written
+        warnings.warn(
+            "compiled kernels cannot be kept, so every program compiles them anew, which takes "
+            "minutes: set NUMBA_CACHE_DIR to a folder that can be written.",
+            PdcorrectWarning,
+            stacklevel=2,
+        )
+        return False
+    return True
+
+
+OPTIONS: dict[str, Any] = {
+    "cache": _kept(), "error_model": "numpy", "fastmath": {"contract", "nsz"},
+}  # fmt: skip
 """numba settings of all kernels: IEEE division, fused multiply-add allowed."""
 
 _SWEEPS = 12

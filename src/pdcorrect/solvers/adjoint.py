@@ -26,7 +26,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.solvers.adjoint_solve import AdjointSolver
 from pdcorrect.solvers.gradients import Gradients, TakenStep
-from pdcorrect.solvers.implicit import ImplicitStepper, positive, quiet_blas
+from pdcorrect.solvers.implicit import ImplicitStepper, limited_threads, positive
 from pdcorrect.solvers.integrators import Integrator, equal_steps, solution
 from pdcorrect.solvers.step import StepObjective, nodal_array
 from pdcorrect.state import State, Status, StepResult
@@ -121,7 +121,7 @@ def adjoint(
     state, h = stepper.accepted(state, forces, time_step)
     integrate = stepper.integrate.held(state, h)
     step = TakenStep(stepper, state, remembered, forces, h, integrate, solver, tolerance)
-    with quiet_blas():
+    with limited_threads(stepper.problem):
         y = step_solution(step.objective(h), integrate, h, result)
         return Gradients(step, checked, y)
 

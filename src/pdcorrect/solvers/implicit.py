@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from numbers import Real
-from typing import Any, Self
+from typing import Self
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
@@ -36,6 +38,8 @@ _FALLBACK_ITERATIONS = 60
 _SUBSTEP_LEVELS = 4
 _OF_DISTANCE = 2e-5
 """Of an obstacle's distance: largest tolerance, as contact forces change fast within it."""
+_SHARED_POINTS = 4000
+"""Quadrature points from which the kernels take more than one thread."""
 _LARGEST = 1e30
 
 
@@ -146,7 +150,7 @@ class ImplicitStepper:
             If shapes are wrong or a number is not finite.
         """
         state, h = self.accepted(state, forces, time_step)
-        with quiet_blas():
+        with limited_threads(self.problem):
             return self._step(state, forces, h)
 
     def accepted(
@@ -178,7 +182,7 @@ class ImplicitStepper:
 
     def prepare(self) -> Self:
         """Factorise and load the kernels now, so that the first step is like the others."""
-        with quiet_blas():
+        with limited_threads(self.problem):
             rest = self.problem.rest_state()
             objective = self.objective(rest, None, self.time_step)
             objective.value_and_gradient(objective.start)
@@ -423,13 +427,22 @@ def _threadpools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def quiet_blas() -> AbstractContextManager[Any]:
-    """BLAS on one thread: idle BLAS threads spin and take the kernels' cores.
+@contextmanager
+def limited_threads(problem: Problem) -> Iterator[None]:
+    """BLAS on one thread, and the kernels of small problems too.
 
-    The products here are too small to gain from threads (``benchmarks``, case
-    threads).
+    Idle BLAS threads spin and take the kernels' cores, and the products here are too small to gain
+    from them.  Kernels of small problems gain little from a second thread, and lose much where
+    another program has its core (``benchmarks``, case threads).
     """
-    return _threadpools().limit(limits=1, user_api="blas")
+    before = numba.get_num_threads()
+    with _threadpools().limit(limits=1, user_api="blas"):
+        if problem.quadrature.weights.size < _SHARED_POINTS:
+            numba.set_num_threads(1)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
 
 
 def whole(name: str, value: int, least: int = 0) -> int:
