@@ -6,6 +6,7 @@ Newton and the corrected solver are interchangeable because of it.
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.errors import require_extra
 from pdcorrect.state import State, StepResult
 
 if TYPE_CHECKING:
@@ -89,6 +91,41 @@ class Trajectory:
     def __len__(self) -> int:
         """Number of steps T (there are T + 1 frames)."""
         return len(self.times) - 1
+
+    def _repr_html_(self) -> str:
+        """A table for notebooks."""
+        moved = np.linalg.norm(self.positions - self.points, axis=2).max()
+        rows = {
+            "steps": f"{len(self)}, to t = {self.times[-1]:g} s",
+            "mesh": f"{len(self.points)} nodes, {len(self.cells)} cells",
+            "largest displacement": f"{1e3 * moved:.4g} mm",
+            **self.attributes,
+        }
+        lines = (
+            f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
+            for name, value in rows.items()
+        )
+        return f"<table>{''.join(lines)}</table>"
+
+    def to_pyvista(self, frame: int = -1) -> Any:
+        """A frame as `pyvista.UnstructuredGrid` (extra ``view``).
+
+        Points are the positions, point data ``displacement`` (m) and ``velocity`` (m/s); cells of
+        27 nodes are VTK's triquadratic hexahedra.
+        """
+        require_extra("pyvista", "view")
+        import pyvista as pv
+
+        kind = {8: pv.CellType.HEXAHEDRON, 27: pv.CellType.TRIQUADRATIC_HEXAHEDRON}
+        cells = {kind[self.cells.shape[1]]: self.cells}
+        grid = pv.UnstructuredGrid(cells, self.positions[frame])
+        grid.point_data["displacement"] = self.positions[frame] - self.points
+        grid.point_data["velocity"] = self.velocities[frame]
+        return grid
+
+    def plot(self, frame: int = -1, **options: Any) -> Any:
+        """Show a frame, coloured by displacement; options of `pyvista.DataSet.plot`."""
+        return self.to_pyvista(frame).plot(**{"scalars": "displacement", **options})
 
     def state(self, frame: int = -1) -> State:
         """The state at a frame."""

@@ -16,6 +16,8 @@ from pdcorrect.cli.dataset import app as dataset
 from pdcorrect.cli.doctor import doctor
 from pdcorrect.cli.evaluate import evaluate
 from pdcorrect.cli.export import export
+from pdcorrect.cli.info import info
+from pdcorrect.cli.new import new
 from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
 from pdcorrect.cli.train import train, train_element, tune_element
@@ -30,8 +32,8 @@ from pdcorrect.errors import (
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for command in (
-    simulate, compare, render, export, train, train_element, tune_element, evaluate, validate,
-    doctor,
+    new, simulate, info, compare, render, export, train, train_element, tune_element, evaluate,
+    validate, doctor,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(dataset, name="dataset")
