@@ -234,8 +234,8 @@ def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, 
     if problem is not None:
         kinetic = 0.5 * float(np.vdot(velocities, problem.mass_times(velocities)))
         elastic = problem.energy(positions)
-        if problem.fibres is not None:
-            elastic += problem.fibres.energy(positions - problem.positions, run.times[0])
+        for one in problem.attached:
+            elastic += one.energy(positions - problem.positions, run.times[0])
         return kinetic, elastic
     moves = velocities.any() or (positions != run.points).any()
     if moves or "actuator_work" in run.stats:

@@ -46,7 +46,11 @@ def check_problems(
     if (integrator or first.time.integrator) == "generalised-alpha":
         names.append("time.spectral_radius")
     for i, problem in enumerate(problems):
-        for found, what in ((problem.contact, "obstacles"), (problem.fibres, "actuators")):
+        for found, what in (
+            (problem.contact, "obstacles"),
+            (problem.fibres, "actuators"),
+            (problem.rollers, "oblique rollers"),
+        ):
             if found is not None:
                 raise InputError(
                     f"scene {scene_name(problems, i)} has {what}, which batches do not know: "

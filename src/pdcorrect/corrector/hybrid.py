@@ -119,6 +119,7 @@ class HybridStepper:
         for found, what in (
             (self.problem.contact, "obstacles, which a correction would enter"),
             (self.problem.fibres, "actuators, which no model was trained with"),
+            (self.problem.rollers, "oblique rollers, which no model was trained with"),
         ):
             if found is not None:
                 raise InputError(f"the scene has {what}: expected none. Leave the model out.")

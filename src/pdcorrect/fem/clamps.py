@@ -97,12 +97,13 @@ Array = NDArray[np.float64]
 class Clamps:
     """Components (N, 3) that are free, rest positions (N, 3), m, and the clamps that move.
 
-    Those by their nodes, components and course.
+    Those by their nodes, components and course; ``oblique`` ones leave all components free.
     """
 
     free: NDArray[np.bool_]
     rest: Array
     moving: tuple[tuple[NDArray[np.int64], NDArray[np.int64], Course], ...]
+    oblique: tuple[ObliqueClamp, ...] = ()
 
     @property
     def still(self) -> NDArray[np.bool_]:
@@ -123,13 +124,31 @@ class Clamps:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class ObliqueClamp:
+    """Nodes (m,) held along a unit vector that is no axis; their course, if they move."""
+
+    nodes: NDArray[np.int64]
+    normal: Array
+    course: Course | None
+
+    def displacements(self, rest: Array, time: float) -> Array:
+        """Of the clamp's nodes, (m, 3), m, at a time (s), for rest positions (N, 3) of all."""
+        places = rest[self.nodes]
+        return np.zeros_like(places) if self.course is None else self.course(places, time) - places
+
+
 def resolve_clamps(clamps: tuple[Clamp, ...], selector: Selector, rest: Array) -> Clamps:
     """Find the clamped components; two clamps may not move one differently."""
     owner = np.full(rest.shape, -1)
-    moving = []
+    moving, oblique = [], []
     for i, clamp in enumerate(clamps):
         nodes = selector.nodes(clamp.region, f"clamps[{i}].region")
-        components = np.array(sorted("xyz".index(c) for c in clamp.components))
+        course = None if clamp.motion is None else Course(clamp.motion)
+        if not clamp.held and clamp.normal is not None:
+            oblique.append(ObliqueClamp(nodes, unit_vector(clamp.normal), course))
+            continue
+        components = np.array(sorted("xyz".index(c) for c in clamp.held))
         place = np.ix_(nodes, components)
         for earlier in np.unique(owner[place][owner[place] >= 0]):
             if clamp.motion != clamps[earlier].motion:
@@ -140,12 +159,12 @@ def resolve_clamps(clamps: tuple[Clamp, ...], selector: Selector, rest: Array) -
                     "not overlap, or the same motion."
                 )
         owner[place] = i
-        if clamp.motion is not None:
-            moving.append((nodes, components, Course(clamp.motion)))
+        if course is not None:
+            moving.append((nodes, components, course))
     free = owner < 0
     if not free.any():
         raise SceneError("clamps hold every component of every node: expected a free one.")
-    return Clamps(free, rest, tuple(moving))
+    return Clamps(free, rest, tuple(moving), tuple(oblique))
 
 
 class Course:
@@ -173,11 +192,10 @@ class Course:
         return out
 
 
-def check_held(positions: Array, cells: NDArray[np.int64], free: NDArray[np.bool_]) -> None:
+def check_held(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> None:
     """Refuse a body, or one of its parts, that clamps let move as a rigid one.
 
-    Of nodes at positions (N, 3), m, with ``free`` components (N, 3): without inertia such a
-    motion has no solution.
+    Of nodes at positions (N, 3), m: without inertia such a motion has no solution.
     """
     width = cells.shape[1]
     edges = np.repeat(cells[:, :1], width - 1, axis=1).ravel(), cells[:, 1:].ravel()
@@ -185,7 +203,12 @@ def check_held(positions: Array, cells: NDArray[np.int64], free: NDArray[np.bool
     count, part = connected_components(graph, directed=False)
     for number in range(count):
         nodes = np.flatnonzero(part == number)
-        held = rigid_motions(positions[nodes])[~free[nodes].ravel()]
+        motions = rigid_motions(positions[nodes])
+        rows = [motions[~clamps.free[nodes].ravel()]]
+        for one in clamps.oblique:
+            own = motions.reshape(-1, 3, 6)[np.isin(nodes, one.nodes)]
+            rows.append(np.einsum("i,nij->nj", one.normal, own))
+        held = np.concatenate(rows)
         loose = la.null_space(held, rcond=_RIGID) if len(held) else np.eye(6)
         if not loose.size:
             continue

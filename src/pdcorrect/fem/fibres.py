@@ -11,6 +11,7 @@ fibres of length r, as projective dynamics wants it: A^T w V A belongs to the gl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -54,6 +55,7 @@ class Fibres:
     stretching: sp.csr_matrix
     cells: NDArray[np.int64]
     gradients: Array
+    at_end: ClassVar[bool] = False
 
     @classmethod
     def of(cls, actuators: tuple[Actuator, ...], body: ElasticBody, selector: Selector) -> Fibres:
@@ -136,8 +138,46 @@ class Fibres:
         work = self.weights * np.einsum("pi,pi->p", along, self.stretching @ z)
         return np.bincount(self.owners, work, minlength=len(self.tables)).astype(np.float64)
 
+    def tangent(
+        self, u: Array, time: float, project: bool = False, factor: float = 1.0
+    ) -> FibreTangent:
+        """The second derivative times a factor; ``project`` leaves out what is negative."""
+        return FibreTangent(self, factor * self.matrices(u, time, project))
+
+    def rest_tangent(self) -> FibreTangent:
+        """That of the body at rest if fibres were at rest too, whatever the time."""
+        outer = self.rest[:, :, None] * self.rest[:, None, :]
+        return FibreTangent(self, self.weights[:, None, None] * outer)
+
+    def work(self, before: tuple[Array, float], after: tuple[Array, float]) -> float:
+        """Of the change of activation between two displacements and times, J."""
+        start, end = self.tensions(*before), self.tensions(*after)
+        change = (self.activations(after[1]) - self.activations(before[1]))[self.owners]
+        return -0.5 * float(change @ (start + end))
+
     def blocks(self, matrices: Array) -> Array:
         """A^T H A by cell, (c, K, K, 3, 3), N/m, for H (P, 3, 3), J, in the order of ``cells``."""
         A = self.gradients
         H = matrices.reshape(*A.shape[:2], 3, 3)
         return np.asarray(np.einsum("cqk,cqij,cql->cklij", A, H, A, optimize=True))
+
+
+@dataclass(frozen=True, eq=False)
+class FibreTangent:
+    """Second derivatives of the fibres' energy by their stretched vectors, (P, 3, 3), J."""
+
+    fibres: Fibres
+    matrices: Array
+
+    def apply(self, x: Array) -> Array:
+        """Times x (N + B, 3)."""
+        A, out = self.fibres.stretching, np.zeros_like(x)
+        nodes = A.shape[1]
+        out[:nodes] = A.T @ np.einsum("pij,pj->pi", self.matrices, A @ x[:nodes])
+        return out
+
+    def add_to(self, blocks: Array) -> None:
+        """Add to the cells' matrices (C, L, L, 3, 3)."""
+        found = self.fibres.blocks(self.matrices)
+        width = found.shape[1]
+        np.add.at(blocks[:, :width, :width], self.fibres.cells, found)

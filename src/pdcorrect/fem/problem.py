@@ -29,6 +29,7 @@ from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix
 from pdcorrect.fem.plausibility import warn_of_units
+from pdcorrect.fem.rollers import Rollers
 from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
@@ -59,6 +60,8 @@ class Problem(ElasticBody):
         Of the surface with the scene's obstacles.
     fibres : Fibres or None
         Of the scene's actuators.
+    rollers : Rollers or None
+        Of clamps along directions that are no axes.
     material_changed, density_changed : bool
         Whether the moduli, or the density, are no longer those of ``scene``.
     """
@@ -70,6 +73,7 @@ class Problem(ElasticBody):
     loads: tuple[NodalLoad, ...]
     contact: Contact | None = None
     fibres: Fibres | None = None
+    rollers: Rollers | None = None
     material_changed: bool = False
     density_changed: bool = False
 
@@ -117,6 +121,11 @@ class Problem(ElasticBody):
         """Each cell's share of the mass matrix at density 1, (C, K, K), m3."""
         shares = self.space.cell_masses(self.mass_rule)
         return shares if self.correction is None else shares + self.correction.masses
+
+    @property
+    def attached(self) -> tuple[Fibres | Rollers, ...]:
+        """Energies besides the body's own."""
+        return tuple(one for one in (self.fibres, self.rollers) if one is not None)
 
     @property
     def time_step(self) -> float:
@@ -328,11 +337,12 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
         young = max([scene.material.young, *(part.young or 0.0 for part in scene.materials)])
         contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
     fibres = Fibres.of(scene.actuators, body, selector) if scene.actuators else None
+    rollers = Rollers.of(clamps.oblique, body) if clamps.oblique else None
     freeze(clamps.free, matrix.indices, matrix.indptr)
     freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
     return Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
-        loads, contact, fibres, correction=correction,
+        loads, contact, fibres, rollers, correction=correction,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from pdcorrect._config import Axis, Direction, FilePath, Number, Strict, Vector
 from pdcorrect.scene.regions import Region
 
 Array = NDArray[np.float64]
+_AXES: tuple[Axis, ...] = ("x", "y", "z")
 _STILL: Vector = (0.0, 0.0, 0.0)
 
 
@@ -53,13 +54,28 @@ class Motion(Strict):
 class Clamp(Strict):
     """Nodes of a region whose named components are held, or moved.
 
-    ``components = ["z"]`` makes a roller; without ``motion`` the nodes are held
-    at their rest positions.
+    ``components = ["z"]`` makes a roller, ``normal = [1, 0, 1]`` one along any direction; without
+    ``motion`` the nodes are held at their rest positions.
     """
 
     region: Region
     components: tuple[Axis, ...] = Field(default=("x", "y", "z"), min_length=1)
+    normal: Direction | None = None
     motion: Motion | None = None
+
+    @model_validator(mode="after")
+    def _components_or_normal(self) -> Clamp:
+        if self.normal is not None and "components" in self.model_fields_set:
+            raise ValueError("expected either components or normal, not both")
+        return self
+
+    @property
+    def held(self) -> tuple[Axis, ...]:
+        """Components that are held as such: none of an oblique clamp."""
+        if self.normal is None:
+            return self.components
+        along = [axis for axis, size in zip(_AXES, self.normal, strict=True) if size]
+        return (along[0],) if len(along) == 1 else ()
 
 
 class Initial(Strict):

@@ -157,6 +157,8 @@ def _check_balance(objective: StepObjective, y: Array, result: StepResult) -> No
     if found <= allowed:
         return
     stiffest = float(objective.problem.scalar_matrix(*objective.factors).diagonal().max())
+    if objective.problem.rollers is not None:
+        stiffest = max(stiffest, float(objective.problem.rollers.stiffness.max()))
     if not found <= allowed + _ROUNDING * stiffest * float(np.abs(y).max()):
         raise InputError(
             f"the result is out of balance by {found:.2g} N as a step from this state with these "

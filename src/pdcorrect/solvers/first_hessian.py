@@ -45,7 +45,9 @@ class Rotations:
         owners = np.repeat(np.arange(len(cells)), cells.shape[1])
         ones = np.ones(cells.size)
         self._gather = sp.csr_matrix((ones, (cells.ravel(), owners)), shape=(count, len(cells)))
-        self._held = ~problem.free.all(axis=1)
+        self._held = np.array(~problem.free.all(axis=1))
+        if problem.rollers is not None:
+            self._held[problem.rollers.nodes] = True
 
     def of_cells(self, y: Array) -> Array:
         """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3).

@@ -106,7 +106,10 @@ class Gradients:
         self._scheme = step.integrate.scheme(step.state, step.time_step)
         self._sums: dict[str, Array] = {}
         self._pull(self._scheme.positions, None, after["positions"])
-        self._pull(self._scheme.velocities, self._scheme.clamped_velocities, after["velocities"])
+        by_velocities, rollers = after["velocities"], self._problem.rollers
+        if rollers is not None and self._scheme.clamped_velocities is not None:
+            by_velocities = rollers.along(by_velocities)
+        self._pull(self._scheme.velocities, self._scheme.clamped_velocities, by_velocities)
         for name, rows in self._scheme.memory.items():
             if name in after:
                 self._pull(*rows, after[name])
@@ -281,9 +284,10 @@ class Gradients:
     @property
     def activations(self) -> tuple[Array, ...]:
         """By the stretches of each actuator's table ``activation``, (rows,) each."""
-        if self._objective.fibres is None:
+        attached = self._objective.attached
+        if attached is None or self._problem.fibres is None:
             raise InputError("the scene has no actuators: expected one or more.")
-        return self._objective.fibres.slopes(self._y, self.x)
+        return attached.activation_slopes(self._y, self.x)
 
     # --- by damping ---------------------------------------------------------------------
 
@@ -345,11 +349,13 @@ class Gradients:
         return out + self._objective.stage.gain * contact.lagged_slopes(y, x)
 
     def _by_contact(self, y: Array, x: Array) -> tuple[Array, Array]:
-        """Derivatives of x . (contact forces) by positions after and before the step, (N, 3)."""
-        contact = self._objective.contact
-        if contact is None:
-            return np.zeros_like(x), np.zeros_like(x)
-        end, start = (contact.nodal(part.sum(axis=0), len(x)) for part in contact.slopes(y, x))
+        """Derivatives of x . forces, of obstacles and rollers, by positions after and before."""
+        end, start = np.zeros_like(x), np.zeros_like(x)
+        contact, attached = self._objective.contact, self._objective.attached
+        if contact is not None:
+            end, start = (contact.nodal(part.sum(axis=0), len(x)) for part in contact.slopes(y, x))
+        if attached is not None:
+            end = end + attached.end_slopes(y, x)
         return end, start
 
     def _by_sampled(self, name: str, y: Array, x: Array) -> Array:

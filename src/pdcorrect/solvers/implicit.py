@@ -118,7 +118,7 @@ class ImplicitStepper:
         viscous = problem.scene.damping.viscosity > 0.0
         self.integrate = make_integrator(self.integrator, time.spectral_radius, viscous)
         if self.integrator == "quasi-static":
-            check_held(problem.positions, problem.cells, problem.free)
+            check_held(problem.positions, problem.cells, problem.clamps)
         within = self.tolerance * problem.cell_size
         if problem.contact is not None:
             within = min(within, _OF_DISTANCE * min(problem.contact.distances))
@@ -374,17 +374,24 @@ def _outcome(
 ) -> _Outcome:
     y, nodes = minimum.positions, len(state.positions)
     stage, forces = objective.stage, objective.given_forces(y)
-    reaction = np.zeros_like(forces)
-    if problem.clamps.moving:
-        reaction = objective.balance(y)[1][:nodes] * ~problem.free
+    reaction, rollers = np.zeros_like(forces), problem.rollers
+    if problem.clamps.moving or rollers is not None:
+        unbalanced = objective.balance(y)[1][:nodes]
+        reaction = unbalanced * ~problem.free
     after = stage.finish(y[:nodes], forces + reaction)
     moved = after.positions - state.positions
+    if rollers is not None and objective.attached is not None:
+        pushed = unbalanced * problem.free + objective.attached.end_forces(y)
+        reaction = reaction + pushed - rollers.along(pushed)
     clamp_work = float(np.vdot(reaction, moved)) / stage.load_factor
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
     elastic = problem.energy_and_forces(end)[0]
-    if problem.fibres is not None:
-        elastic += problem.fibres.energy(end[:nodes] - problem.positions, stage.end)
+    for one in problem.attached:
+        elastic += one.energy(end[:nodes] - problem.positions, stage.end)
+    more = {} if objective.contact is None else objective.contact.report(y)
+    if objective.attached is not None:
+        more |= objective.attached.work(y)
     return _Outcome(
         after,
         minimum,
@@ -393,12 +400,7 @@ def _outcome(
         clamp_work=clamp_work,
         damping_loss=objective.damping_loss(y, moved, h),
         modes=end[nodes:] if problem.space.internal else None,
-        more={
-            name: value
-            for term in (objective.fibres, objective.contact)
-            if term is not None
-            for name, value in term.report(y).items()
-        },
+        more=more,
     )
 
 

@@ -125,6 +125,8 @@ class Integrator:
                 )
             memory = {name: split(*rows) for name, rows in scheme.memory.items()}
             velocities = split(scheme.velocities, scheme.clamped_velocities)
+            if problem.rollers is not None and scheme.clamped_velocities is not None:
+                velocities = problem.rollers.led(velocities, state.time, state.time + 2.0 * h)
             return State(scheme.positions(known), velocities, state.time + h, memory)
 
         first, last = (state.time + share * h for share in scheme.loads_over)

@@ -84,13 +84,13 @@ class ProjectiveDynamics(ImplicitStepper):
         recover: bool = True,
     ) -> None:
         super().__init__(problem, tolerance, time_step, integrator, backend, recover)
-        _check_method(problem, method, first_hessian)
+        general = backend in ("cholespy", "splu")
+        _check_method(problem, method, first_hessian, general)
         self.method = method
         self.name = f"projective dynamics ({method})"
         plain = method == "local-global"
         self.first_hessian = first_hessian
         if first_hessian == "auto":
-            general = backend in ("cholespy", "splu")
             self.first_hessian = "G" if plain else "G-scaled" if general else "rest"
         self._true: TrueHessian | None = None
         if self.first_hessian == "lagged" and problem.scene.time.substeps > 1:
@@ -188,7 +188,7 @@ class ProjectiveDynamics(ImplicitStepper):
         return found
 
 
-def _check_method(problem: Problem, method: str, first_hessian: str) -> None:
+def _check_method(problem: Problem, method: str, first_hessian: str, general: bool) -> None:
     if method not in get_args(Method):
         raise InputError(f"method = {method!r}: expected 'lbfgs' or 'local-global'.")
     names = get_args(FirstHessian)
@@ -198,6 +198,13 @@ def _check_method(problem: Problem, method: str, first_hessian: str) -> None:
         raise InputError("method = 'local-global' iterates with G itself: leave first_hessian.")
     if method == "local-global" and problem.contact is not None:
         raise InputError("method = 'local-global' with obstacles: expected method = 'lbfgs'.")
+    if problem.rollers is not None and (
+        method == "local-global" or first_hessian in ("G", "G-scaled") or general
+    ):
+        raise InputError(
+            "oblique rollers with the global matrix G, which knows no directions: expected method "
+            "= 'lbfgs' with first_hessian = 'rest' or 'lagged', and a backend for those."
+        )
     if method == "local-global" and problem.materials.model != COROTATED:
         raise InputError(
             f"method = 'local-global' with energy = {problem.scene.material.energy!r}: "

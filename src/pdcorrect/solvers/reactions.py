@@ -52,12 +52,17 @@ def reactions(
         If shapes are wrong or a number is not finite.
     """
     check_input(problem, state, forces)
+    acting, rollers = forces_at(problem, state, forces), problem.rollers
     if accelerations is None:
-        accelerations = solve_mass(problem, forces_at(problem, state, forces) * problem.free)
+        free = acting * problem.free
+        accelerations = solve_mass(problem, free if rollers is None else rollers.along(free))
     else:
         accelerations = nodal_array(problem, "accelerations", accelerations)
-    out = problem.mass_times(accelerations) - forces_at(problem, state, forces)
-    out[problem.free] = 0.0
+    missing = problem.mass_times(accelerations) - acting
+    out = np.where(problem.free, 0.0, missing)
+    if rollers is not None:
+        missing *= problem.free
+        out += missing - rollers.along(missing)
     return out
 
 

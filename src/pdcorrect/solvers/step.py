@@ -26,8 +26,8 @@ from pdcorrect.fem.factorisation import (
     factorise,
 )
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.actuation import FibreTangent, FibreTerm
-from pdcorrect.solvers.contact import ContactTangent, ContactTerm
+from pdcorrect.solvers.attached import AttachedTerm, Tangent
+from pdcorrect.solvers.contact import ContactTerm
 from pdcorrect.solvers.damping import Rayleigh, Viscous, ViscousTangent
 from pdcorrect.solvers.integrators import StepEquation
 from pdcorrect.solvers.schemes import Scheme
@@ -77,9 +77,7 @@ class StepObjective:
         has_rayleigh = stage.rate and (damping.mass or damping.stiffness)
         self.rayleigh = Rayleigh(problem, stage) if has_rayleigh else None
         self.viscous = Viscous(problem, stage) if stage.strains else None
-        self.fibres = None
-        if problem.fibres is not None:
-            self.fibres = FibreTerm(problem.fibres, problem.positions, stage, state)
+        self.attached = AttachedTerm(problem, stage, state) if problem.attached else None
         self.contact = None
         if problem.contact is not None:
             self.contact = ContactTerm(problem.contact, stage, state)
@@ -105,9 +103,12 @@ class StepObjective:
     def given_forces(self, y: Array) -> Array:
         """All forces (N, 3) of the equation at y but the body's own, N."""
         nodes = len(self.problem.positions)
-        if self.contact is None:
-            return self.forces[:nodes]
-        return self.forces[:nodes] - self.contact.value_and_gradient(y)[1][:nodes]
+        out = self.forces[:nodes]
+        if self.attached is not None:
+            out = out + self.attached.end_forces(y)
+        if self.contact is not None:
+            out = out - self.contact.value_and_gradient(y)[1][:nodes]
+        return out
 
     def _forces(self, y: Array) -> Array:
         stage = self.stage
@@ -134,7 +135,7 @@ class StepObjective:
         value = energy + kinetic - work
         gradient -= elastic
         gradient -= self.forces
-        for term in (self.rayleigh, self.viscous, self.fibres, self.contact):
+        for term in (self.rayleigh, self.viscous, self.attached, self.contact):
             if term is not None:
                 loss, force = term.value_and_gradient(y)
                 value, self.scale = value + loss, self.scale + loss
@@ -149,7 +150,8 @@ class StepObjective:
         does not depend on the accuracy of the rest.
         """
         nodes, factor = len(self.problem.positions), self.factors[0]
-        if not factor or self.contact is not None:
+        held = self.contact is not None or self.problem.rollers is not None
+        if not factor or held:
             return y, gradient
         mass = self.problem.mass
         shift = -gradient[:nodes].sum(axis=0) / (factor * mass.sum())
@@ -180,15 +182,17 @@ class StepObjective:
         """
         if at_rest:
             blocks = self.problem.linearise(y, project).blocks() * self.factors[1]
-            if self.fibres is not None:
-                self.fibres.relaxed_tangent(y).add_to(blocks)
+            for one in self.problem.attached:
+                one.rest_tangent().add_to(blocks)
             return blocks
         return self.hessian_operator(y, project).blocks()
 
     def hessian_operator(self, y: Array, project: bool = False) -> HessianOperator:
         """The second derivative without assembling; ``project`` as in `cell_hessians`."""
         viscous = None if self.viscous is None else self.viscous.tangent(y, project)
-        local = [t.tangent(y, project) for t in (self.fibres, self.contact) if t is not None]
+        local = [] if self.attached is None else self.attached.tangents(y, project)
+        if self.contact is not None:
+            local.append(self.contact.tangent(y, project))
         return HessianOperator(self, self.problem.linearise(y, project), viscous, local)
 
     def longest_step(self, y: Array, direction: Array) -> float:
@@ -210,7 +214,7 @@ class HessianOperator:
     objective: StepObjective
     tangent: Linearisation
     viscous: ViscousTangent | None
-    local: Sequence[FibreTangent | ContactTangent]
+    local: Sequence[Tangent]
 
     def __call__(self, x: Array) -> Array:
         out = self.product(x)

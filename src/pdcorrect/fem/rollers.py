@@ -1,0 +1,116 @@
+"""Oblique rollers: clamps of one direction that is no axis, by stiff springs along it.
+
+    W = sum_a k_a/2 (n_a . (x_a - x'_a(t)))^2
+
+with x' where the clamp would have the node.  k is so much larger than the body's own stiffness at
+the node that the springs give by a millionth of what the body does.  Components along an axis are
+held exactly instead, see `clamps`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.fem.clamps import ObliqueClamp
+from pdcorrect.fem.elastic_body import ElasticBody
+
+Array = NDArray[np.float64]
+
+_STIFFER = 1e6
+"""Than the body at a node."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rollers:
+    """Springs of all oblique clamps; their second derivative is constant.
+
+    Attributes
+    ----------
+    clamps : tuple of ObliqueClamp
+    rest : (N, 3)
+        Rest positions of all nodes, m.
+    nodes, normals : (m,), (m, 3)
+        Of the springs.
+    stiffness : (m,)
+        N/m.
+    cells, corners : (m,)
+        A cell of each node, and which of its nodes that is.
+    """
+
+    clamps: tuple[ObliqueClamp, ...]
+    rest: Array
+    nodes: NDArray[np.int64]
+    normals: Array
+    stiffness: Array
+    cells: NDArray[np.int64]
+    corners: NDArray[np.int64]
+    at_end: ClassVar[bool] = True
+
+    @classmethod
+    def of(cls, clamps: tuple[ObliqueClamp, ...], body: ElasticBody) -> Rollers:
+        """Those of a body's clamps."""
+        nodes = np.concatenate([clamp.nodes for clamp in clamps])
+        normals = np.concatenate([np.tile(c.normal, (len(c.nodes), 1)) for c in clamps])
+        own = body.laplacian().diagonal()[nodes]
+        assembly = body.assembly
+        cells, corners = np.divmod(assembly.slots[assembly.start[nodes]], assembly.cells.shape[1])
+        return cls(clamps, body.positions, nodes, normals, _STIFFER * own, cells, corners)
+
+    def energy(self, u: Array, time: float) -> float:
+        """J, for displacements u (N, 3), m."""
+        return float(0.5 * self.stiffness @ self._gaps(u, time) ** 2)
+
+    def forces(self, u: Array, time: float) -> Array:
+        """Of the springs on the nodes, (N, 3), N."""
+        out = np.zeros_like(self.rest)
+        pull = -self.stiffness * self._gaps(u, time)
+        np.add.at(out, self.nodes, pull[:, None] * self.normals)
+        return out
+
+    def tangent(self, u: Array, time: float, project: bool = False, factor: float = 1.0) -> Rollers:
+        """The second derivative times a factor."""
+        return self if factor == 1.0 else replace(self, stiffness=factor * self.stiffness)
+
+    def rest_tangent(self) -> Rollers:
+        """The same."""
+        return self
+
+    def led(self, velocities: Array, start: float, end: float) -> Array:
+        """Velocities (N, 3), m/s, across the rollers' planes their means from start to end."""
+        out = self.along(velocities)
+        for clamp in self.clamps:
+            way = clamp.displacements(self.rest, end) - clamp.displacements(self.rest, start)
+            out[clamp.nodes] += (way @ clamp.normal / (end - start))[:, None] * clamp.normal
+        return out
+
+    def along(self, x: Array) -> Array:
+        """X (N, 3) without its parts across the planes in which rollers may move."""
+        out = x.copy()
+        for clamp in self.clamps:
+            out[clamp.nodes] -= (out[clamp.nodes] @ clamp.normal)[:, None] * clamp.normal
+        return out
+
+    def apply(self, x: Array) -> Array:
+        """The second derivative times x (N + B, 3)."""
+        out = np.zeros_like(x)
+        along = self.stiffness * np.einsum("mi,mi->m", self.normals, x[self.nodes])
+        np.add.at(out, self.nodes, along[:, None] * self.normals)
+        return out
+
+    def add_to(self, blocks: Array) -> None:
+        """Add the second derivative to the cells' matrices (C, L, L, 3, 3)."""
+        n = self.normals
+        more = self.stiffness[:, None, None] * n[:, :, None] * n[:, None, :]
+        np.add.at(blocks, (self.cells, self.corners, self.corners), more)
+
+    def _targets(self, time: float) -> Array:
+        """X' less the rest positions, (m, 3), m."""
+        return np.concatenate([clamp.displacements(self.rest, time) for clamp in self.clamps])
+
+    def _gaps(self, u: Array, time: float) -> Array:
+        """How far each spring is stretched, (m,), m."""
+        return np.einsum("mi,mi->m", self.normals, u[self.nodes] - self._targets(time))
