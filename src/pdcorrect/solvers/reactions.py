@@ -54,8 +54,7 @@ def reactions(
     check_input(problem, state, forces)
     acting, rollers = forces_at(problem, state, forces), problem.rollers
     if accelerations is None:
-        free = acting * problem.free
-        accelerations = solve_mass(problem, free if rollers is None else rollers.along(free))
+        accelerations = solve_mass(problem, acting)
     else:
         accelerations = nodal_array(problem, "accelerations", accelerations)
     missing = problem.mass_times(accelerations) - acting
@@ -146,13 +145,18 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
 
 
 def solve_mass(problem: Problem, force: Array) -> Array:
-    """M^-1 force on the free components, for (N, 3) that is zero where clamped."""
+    """Accelerations (N, 3), m/s2, by a force (N, 3), N; none where clamped."""
+
+    def movable(x: Array) -> Array:
+        free = x * problem.free
+        return free if problem.rollers is None else problem.rollers.along(free)
+
     if problem.mass_is_diagonal:
-        return force / problem.mass[:, None]
+        return movable(force) / problem.mass[:, None]
     diagonal = problem.mass_matrix.diagonal()[:, None]
     found = conjugate_gradients(
-        lambda x: problem.mass_times(x) * problem.free,
-        force,
+        lambda x: movable(problem.mass_times(x)),
+        movable(force),
         lambda r: r / diagonal,
         tolerance=_MASS_TOLERANCE,
         max_steps=_MASS_STEPS,
