@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdcorrect.data.importing import (
     ImportedMotion,
@@ -17,7 +16,7 @@ from pdcorrect.data.importing import (
     shard_from_arrays,
     shard_of,
 )
-from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Shard, write_shard
+from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Array, Shard, write_shard
 from pdcorrect.data.simulate import arrays_of
 from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.fem.problem import Problem
@@ -26,7 +25,102 @@ from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
 from pdcorrect.trajectory import Trajectory
 
-Array = NDArray[Any]
+_NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
+_MOTION = ("reference", "forces", "coarse", "predictions")
+_BODY = ("body", "material", "materials", "clamps", "damping")
+"""Sections of a scene in which all simulations of a file agree."""
+
+
+def import_trajectories(
+    sources: Sequence[str | Path],
+    folder: str | Path,
+    *,
+    coarse: Sequence[str | Path] = (),
+    dataset: str | None = None,
+    split: str = "training",
+    number: int = 0,
+    best: bool = False,
+) -> Path:
+    """Write a file of a data set from trajectory files or from an ``.npz`` file; its path.
+
+    Parameters
+    ----------
+    sources : sequence of path
+        Trajectories (HDF5) of `shard_from_trajectories`, or one ``.npz`` file with the arrays
+        of `shard_from_arrays` by their names and one simulation ``reference``, or several as
+        ``reference_0``, ``reference_1``, …; likewise ``forces``, ``coarse``, ``predictions``.
+    folder : path
+        Of the data set; created if missing.
+    coarse : sequence of path
+        Trajectories of the coarse model, as many as sources.
+    dataset : str, optional
+        Its name; the folder's by default.
+    split, number, best
+        See `shard_from_arrays`.
+
+    Raises
+    ------
+    FileFormatError, InputError, OutputError
+        If a file cannot be read or fails a check, the folder is that of a generated data set,
+        or the file exists already or cannot be written.
+    """
+    if (Path(folder) / CONFIG).exists():
+        raise InputError(
+            f"{folder} holds {CONFIG}, as a generated data set: expected a folder of its own for "
+            "imported files."
+        )
+    path = Path(folder) / split / f"mesh-{number:04d}{SUFFIX}"
+    if path.exists():
+        raise InputError(f"{path} exists already: choose another number, or delete it first.")
+    about: dict[str, Any] = {
+        "dataset": dataset or Path(folder).resolve().name, "split": split, "number": number,
+        "best": best,
+    }  # fmt: skip
+    files = [Path(source) for source in sources]
+    if any(file.suffix == ".npz" for file in files):
+        if len(files) != 1 or coarse:
+            raise InputError(
+                f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
+            )
+        shard = _shard_of_npz(files[0], about)
+    else:
+        runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
+        shard = shard_from_trajectories(runs, others, **about)
+    write_shard(path, replace(shard, provenance={"sources": ", ".join(map(str, files))}))
+    return path
+
+
+def _shard_of_npz(path: Path, about: Mapping[str, Any]) -> Shard:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except Exception as error:  # zip, zlib and NumPy raise nearly every type on damaged bytes
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise FileFormatError(
+            f"{path}: cannot be read as .npz ({reason or type(error).__name__})."
+        ) from None
+    motions: list[ImportedMotion] = []
+    while names := _names_of(len(motions), arrays):
+        motions.append(ImportedMotion(**{k: arrays.pop(n) for k, n in names.items()}))
+    mass = arrays.pop("mass", None)
+    if arrays.keys() != set(_NEEDED):
+        raise InputError(
+            f"{path}: has arrays {', '.join(map(repr, arrays))} besides those of {len(motions)} "
+            f"simulations: expected {', '.join(_NEEDED)}; for one simulation {', '.join(_MOTION)}, "
+            "for several 'reference_0', 'forces_0' and so on."
+        )
+    try:
+        return shard_from_arrays(motions=motions, mass=mass, **about, **arrays)
+    except InputError as error:
+        raise type(error)(f"{path}: {error}") from None
+
+
+def _names_of(number: int, arrays: Mapping[str, Array]) -> dict[str, str]:
+    """Arrays of a simulation by what they are; none where it has no reference."""
+    for end in (f"_{number}", "") if number == 0 else (f"_{number}",):
+        if f"reference{end}" in arrays:
+            return {name: f"{name}{end}" for name in _MOTION if f"{name}{end}" in arrays}
+    return {}
 
 
 def shard_from_trajectories(
@@ -58,18 +152,16 @@ def shard_from_trajectories(
     ------
     InputError
         If a run has no scene, another material than it, another integrator than backward
-        Euler or does not start at rest, the coarse model has an element with nodes besides the
-        corners of the cells, the runs' scenes differ in a section but the loads of different
-        simulations, or in times, or a check of `shard_from_arrays` fails.
+        Euler or does not start at rest, the runs' scenes differ in a section but the loads of
+        different simulations, or in times, or as of `shard_from_arrays`.
     """
     references = [reference] if isinstance(reference, Trajectory) else list(reference)
     rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())
-    if rollouts and len(rollouts) != len(references):
+    if not references or len(rollouts) not in (0, len(references)):
         raise InputError(
-            f"{len(references)} references and {len(rollouts)} coarse runs: expected as many."
+            f"{len(references)} references and {len(rollouts)} coarse runs: expected one reference "
+            "or more, and as many coarse runs or none."
         )
-    if not references:
-        raise InputError("no simulations: expected at least one reference.")
     name = "the coarse run" if rollouts else "the reference"
     scenes = [_scene("the reference", run) for run in references]
     for k, run in enumerate(rollouts):
@@ -86,124 +178,10 @@ def shard_from_trajectories(
         loaded = problem.with_loads(scene.loads)
         told = loaded.scene.with_changes(name=scene.name, time={"frames": scene.time.frames})
         problems.append(replace(loaded, scene=told))
-        rollout = _restricted(rollouts[k], problem) if rollouts else None
-        motions.append(ImportedMotion(restrict(run, problem).positions, coarse=rollout))
-    step = problem.time_step
-    return shard_of(arrays_of(problem), motions, problems, step, dataset, split, number, best)
-
-
-def _restricted(coarse: Trajectory, problem: Problem) -> Array:
-    if len(coarse.points) != len(problem.positions):
-        raise InputError(
-            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
-            f"{len(problem.positions)}: expected a run with --refine 1."
-        )
-    return restrict(coarse, problem).positions
-
-
-def import_trajectories(
-    sources: Sequence[str | Path],
-    folder: str | Path,
-    *,
-    coarse: Sequence[str | Path] = (),
-    dataset: str | None = None,
-    split: str = "training",
-    number: int = 0,
-    best: bool = False,
-) -> Path:
-    """Write a file of a data set from trajectory files or from an ``.npz`` file.
-
-    Parameters
-    ----------
-    sources : sequence of path
-        Trajectories (HDF5) of `shard_from_trajectories`, or one ``.npz`` file with the arrays
-        of `shard_from_arrays` by their names and one simulation ``reference``, or several as
-        ``reference_0``, ``reference_1``, …; likewise ``forces``, ``coarse``, ``predictions``.
-    folder : path
-        Of the data set; created if missing.
-    coarse : sequence of path
-        Trajectories of the coarse model, as many as sources.
-    dataset : str, optional
-        Its name; the folder's by default.
-    split, number, best
-        See `shard_from_arrays`; ``best`` of trajectories only.
-
-    Returns
-    -------
-    Path
-        What was written.
-
-    Raises
-    ------
-    FileFormatError, InputError, OutputError
-        If a file cannot be read or fails a check, the folder is that of a generated data set,
-        or the file exists already or cannot be written.
-    """
-    if (Path(folder) / CONFIG).exists():
-        raise InputError(
-            f"{folder} holds {CONFIG}, as a generated data set: expected a folder of its own for "
-            "imported files."
-        )
-    path = Path(folder) / split / f"mesh-{number:04d}{SUFFIX}"
-    if path.exists():
-        raise InputError(f"{path} exists already: choose another number, or delete it first.")
-    name = dataset or Path(folder).resolve().name
-    files = [Path(source) for source in sources]
-    if any(file.suffix == ".npz" for file in files):
-        if len(files) != 1 or coarse:
-            raise InputError(
-                f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
-            )
-        shard = _shard_of_npz(files[0], name, split, number, best)
-    else:
-        runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
-        shard = shard_from_trajectories(
-            runs, others, dataset=name, split=split, number=number, best=best
-        )
-    write_shard(path, replace(shard, provenance={"sources": ", ".join(map(str, files))}))
-    return path
-
-
-_NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
-_MOTION = ("reference", "forces", "coarse", "predictions")
-_BODY = ("body", "material", "materials", "clamps", "damping")
-"""Sections of a scene in which all simulations of a file agree."""
-
-
-def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool) -> Shard:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except Exception as error:  # zip, zlib and NumPy raise nearly every type on damaged bytes
-        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
-        raise FileFormatError(
-            f"{path}: cannot be read as .npz ({reason or type(error).__name__})."
-        ) from None
-    motions: list[ImportedMotion] = []
-    while names := _names_of(len(motions), arrays):
-        motions.append(ImportedMotion(**{k: arrays.pop(n) for k, n in names.items()}))
-    mass = arrays.pop("mass", None)
-    if arrays.keys() != set(_NEEDED):
-        raise InputError(
-            f"{path}: has arrays {', '.join(map(repr, arrays))} besides those of {len(motions)} "
-            f"simulations: expected {', '.join(_NEEDED)}; for one simulation {', '.join(_MOTION)}, "
-            "for several 'reference_0', 'forces_0' and so on."
-        )
-    try:
-        return shard_from_arrays(
-            motions=motions, mass=mass, dataset=dataset, split=split, number=number, best=best,
-            **arrays,
-        )  # fmt: skip
-    except InputError as error:
-        raise type(error)(f"{path}: {error}") from None
-
-
-def _names_of(number: int, arrays: Mapping[str, Array]) -> dict[str, str]:
-    """Arrays of a simulation by what they are; none where it has no reference."""
-    for end in (f"_{number}", "") if number == 0 else (f"_{number}",):
-        if f"reference{end}" in arrays:
-            return {name: f"{name}{end}" for name in _MOTION if f"{name}{end}" in arrays}
-    return {}
+        other = _restricted(rollouts[k], problem) if rollouts else None
+        motions.append(ImportedMotion(restrict(run, problem).positions, coarse=other))
+    about = {"dataset": dataset, "split": split, "number": number}
+    return shard_of(arrays_of(problem), motions, problems, problem.time_step, about, best)
 
 
 def _scene(name: str, run: Trajectory) -> Scene:
@@ -219,8 +197,8 @@ def _scene(name: str, run: Trajectory) -> Scene:
             "the scene's; for others use shard_from_arrays."
         )
     scene = Scene.from_toml(run.scene_toml)
-    check_integrator(name, scene.time.integrator)
-    check_integrator(name, str(run.attributes.get("integrator", INTEGRATOR)))
+    for found in (scene.time.integrator, str(run.attributes.get("integrator", INTEGRATOR))):
+        check_integrator(name, found)
     if run.times[0] != 0 or run.velocities[0].any():
         raise InputError(
             f"{name} starts at {run.times[0]:g} s with velocities up to "
@@ -233,6 +211,15 @@ def _check_same(names: str, one: Scene, other: Scene, sections: Sequence[str]) -
     for section in sections:
         if getattr(one, section) != getattr(other, section):
             raise InputError(f"the scenes of {names} differ in {section}: expected equal ones.")
+
+
+def _restricted(coarse: Trajectory, problem: Problem) -> Array:
+    if len(coarse.points) != len(problem.positions):
+        raise InputError(
+            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
+            f"{len(problem.positions)}: expected a run with --refine 1."
+        )
+    return restrict(coarse, problem).positions
 
 
 def _check_times(coarse: Trajectory, run: Trajectory) -> None:
