@@ -62,20 +62,11 @@ def _digest(values: Array) -> str:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong with a data set, and in which file.
-
-    Attributes
-    ----------
-    path : Path
-    severity : {"error", "warning"}
-        Errors make the data unfit for use.
-    message : str
-        One sentence without full stop.
-    """
+    """What is wrong with a data set, and in which file."""
 
     path: Path
-    severity: Severity
-    message: str
+    severity: Severity  # errors make the data unfit for use
+    message: str  # one sentence without full stop
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.path}: {self.message}"

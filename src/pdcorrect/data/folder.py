@@ -22,13 +22,7 @@ Folders = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
 
 def folders_of(data: Folders) -> tuple[Path, ...]:
-    """Folders of data sets whose files are read one after the other.
-
-    Raises
-    ------
-    InputError
-        If there is none, or one comes twice.
-    """
+    """Folders of data sets whose files are read one after the other."""
     if isinstance(data, (str, os.PathLike)):
         return (Path(data),)
     found = tuple(map(Path, data))
@@ -57,13 +51,7 @@ def shard_number(path: Path) -> int:
 
 
 def splits_of(folder: str | Path) -> list[str]:
-    """Names of the splits that there are files of: the usual ones first.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Names of the splits that there are files of: the usual ones first."""
     found = list(dict.fromkeys(path.parent.name for path in all_shards(folder)))
     if not found:
         raise InputError(
@@ -76,11 +64,6 @@ def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -
     """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
 
     Names of other files do not matter.
-
-    Raises
-    ------
-    InputError
-        If there are none, or none are left.
     """
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
@@ -110,13 +93,6 @@ def read_files(
     read : callable
     damaged : dict or None
         Where given, files that are damaged are noted here and left out.
-
-    Raises
-    ------
-    FileFormatError
-        If a file is damaged; with ``damaged`` if all are.
-    FileVersionError
-        If one is of another version, which is no damage.
     """
     found = []
     for path in paths:
@@ -142,11 +118,6 @@ def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
     folder : path
     split : str, optional
         The only one to look at; all by default.
-
-    Raises
-    ------
-    InputError
-        If the configuration cannot be used.
     """
     folder = Path(folder)
     if not (folder / CONFIG).exists():
@@ -157,13 +128,7 @@ def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
 
 
 def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
-    """Refuse splits of which files are missing.
-
-    Raises
-    ------
-    InputError
-        If some are, with the first one's name, or as of `missing_files`.
-    """
+    """Refuse splits of which files are missing."""
     for split in splits:
         missing = missing_files(folder, split)
         if missing:

@@ -38,18 +38,11 @@ many of them are new.
 
 @dataclass(frozen=True)
 class Generated:
-    """What is there of a data set; true if that is all that was asked for.
+    """What is there of a data set; true if that is all that was asked for."""
 
-    Attributes
-    ----------
-    simulations : mapping of str to (int, int)
-        By split: how many simulations of how many are there.
-    asked : tuple of str
-        Splits that were to be computed.
-    """
-
+    # by split: how many simulations of how many are there
     simulations: Mapping[str, tuple[int, int]]
-    asked: tuple[str, ...]
+    asked: tuple[str, ...]  # splits that were to be computed
 
     def __bool__(self) -> bool:
         return all(self.simulations[name][0] == self.simulations[name][1] for name in self.asked)
@@ -137,11 +130,6 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
 
     That is one that is damaged, or lacks a run or the single steps of one, as files of earlier
     versions of the code may.
-
-    Raises
-    ------
-    InputError
-        If there is a whole file of something else.
     """
     path = plan.path(folder)
     if not path.exists():

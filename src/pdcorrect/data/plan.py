@@ -36,36 +36,21 @@ _DRAWS = 10_000
 
 @dataclass(frozen=True)
 class MeshPlan:
-    """One mesh with its material: the unit of generation, and one file of the data set.
-
-    Attributes
-    ----------
-    number : int
-        Of the mesh in its split.
-    design : Design
-        In cells.
-    young, poisson, density : float
-        Pa, dimensionless, kg/m3.
-    step : float
-        s.
-    refine : int
-        Of the reference.
-    stream : tuple of int
-        Name of the mesh's stream of random numbers.
-    """
+    """One mesh with its material: the unit of generation, and one file of the data set."""
 
     split: str
-    number: int
-    design: Design
+    number: int  # of the mesh in its split
+    design: Design  # in cells
+    # Pa, dimensionless, kg/m3
     young: float
     poisson: float
     density: float
     simulations: int
-    step: float
+    step: float  # s
     frames: int
-    refine: int
+    refine: int  # of the reference
     strength_factor: float
-    stream: tuple[int, ...]
+    stream: tuple[int, ...]  # name of the mesh's stream of random numbers
 
     @property
     def name(self) -> str:
@@ -82,11 +67,6 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
 
     The first mesh of the training split has the fewest and the second one the most nodes of
     the family's range, where there are two or more.
-
-    Raises
-    ------
-    InputError
-        If the family has fewer bodies than the data set wants.
     """
     plans: list[MeshPlan] = []
     known: set[str] = set()

@@ -233,13 +233,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         return batch
 
     def places(self, indices: Sequence[int] | Numbers) -> tuple[Numbers, Numbers, Numbers]:
-        """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,).
-
-        Raises
-        ------
-        IndexError
-            If there is no such window.
-        """
+        """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,)."""
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
@@ -436,13 +430,7 @@ class TrajectoryLoader:
         return {name: getattr(self, name) for name in names} | {"windows": len(self._owners)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from where ``state`` was taken.
-
-        Raises
-        ------
-        InputError
-            If it was taken with other windows, seed, block or ranks, whose order differs.
-        """
+        """Go on from where ``state`` was taken."""
         here = self.state_dict()
         for name in here.keys() - {"epoch", "position"}:
             if state.get(name) != here[name]:

@@ -72,51 +72,28 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One model's answer on the coarse nodes, see the layout.
+    """One model's answer on the coarse nodes, see the layout."""
 
-    Attributes
-    ----------
-    positions : (T+1, N, 3) or None
-        Free rollout from rest, m.
-    predictions : (T, N, 3) or None
-        Positions after one step from each frame of the reference but the last, m.
-    statistics : mapping of str to (T,) arrays
-        Of the rollout, or of the predictions where there is none, see `STATISTICS`.
-    attributes : mapping of str to str, int or float
-    velocities : (T+1, N, 3) or None
-        Of the rollout, m/s, where they are not the differences of its positions.
-    """
-
-    positions: Array | None = None
+    positions: Array | None = None  # (T+1, N, 3): free rollout from rest, m
+    # (T, N, 3): positions after one step from each frame of the reference but the last, m
     predictions: Array | None = None
+    # (T,): of the rollout, or of the predictions where there is none, see `STATISTICS`
     statistics: Mapping[str, Array] = field(default_factory=dict)
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    # (T+1, N, 3): of the rollout, m/s, where they are not the differences of its positions
     velocities: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One load on a mesh and what the models make of it.
+    """One load on a mesh and what the models make of it."""
 
-    Attributes
-    ----------
-    forces : (T, N, 3)
-        Nodal forces of the plain coarse model, N.
-    runs : mapping of str to Run
-    scene_toml : str
-        Of the plain coarse model; empty for imported data.
-    attempt : int
-        How many draws were rejected before, and ``rejected`` why.
-    seconds : mapping of str to float
-        Cost by run.
-    """
-
-    forces: Array
+    forces: Array  # (T, N, 3): nodal forces of the plain coarse model, N
     runs: Mapping[str, Run]
-    scene_toml: str = ""
-    attempt: int = 0
+    scene_toml: str = ""  # of the plain coarse model; empty for imported data
+    attempt: int = 0  # how many draws were rejected before, and ``rejected`` why
     rejected: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)  # cost by run
 
     @property
     def steps(self) -> int:

@@ -36,30 +36,16 @@ Lengths = dict[int | str, int]
 
 @dataclass(frozen=True)
 class ShardHeader:
-    """What a file holds, found without reading its arrays.
-
-    Attributes
-    ----------
-    path : Path
-    number : int
-        Of the mesh in its split.
-    nodes, cells : int
-    steps : tuple of int
-        T of each simulation.
-    runs : tuple of (names of runs with positions, names of runs with predictions)
-        For each simulation.
-    time_step : float
-        s.
-    config_hash, content_hash : str
-    """
+    """What a file holds, found without reading its arrays."""
 
     path: Path
-    number: int
+    number: int  # of the mesh in its split
     nodes: int
     cells: int
-    steps: tuple[int, ...]
+    steps: tuple[int, ...]  # T of each simulation
+    # for each simulation: names of runs with positions, and of those with predictions
     runs: tuple[tuple[frozenset[str], frozenset[str]], ...]
-    time_step: float
+    time_step: float  # s
     config_hash: str
     content_hash: str
 
@@ -72,11 +58,6 @@ def read_header(path: str | Path, *, verify: bool = False) -> ShardHeader:
     path : path
     verify : bool
         Compare the file with its checksum, which reads all of it.
-
-    Raises
-    ------
-    FileFormatError
-        If it is damaged or something else.
     """
     with _opened(Path(path), verify) as file:
         groups = [file["simulations"][key] for key in sorted(file["simulations"])]

@@ -41,32 +41,15 @@ from pdcorrect.state import State
 
 @dataclass(frozen=True)
 class Model:
-    """How a simulation is discretised and stepped.
-
-    Attributes
-    ----------
-    refine : int
-    best : bool
-        With the setting's better element and mass, see `_better`.
-    predict : bool
-        Whether to take single steps from the reference, too.
-    divisor : int
-        Parts of each time step.
-    heavy : bool
-        Density scaled so that the mass is the reference's.
-    truth : bool
-        Stepped by the reference's solver.
-    sample : bool
-        For the first simulation of the mesh only.
-    """
+    """How a simulation is discretised and stepped."""
 
     refine: int
-    best: bool = False
-    predict: bool = False
-    divisor: int = 1
-    heavy: bool = False
-    truth: bool = False
-    sample: bool = False
+    best: bool = False  # with the setting's better element and mass, see `_better`
+    predict: bool = False  # whether to take single steps from the reference, too
+    divisor: int = 1  # parts of each time step
+    heavy: bool = False  # density scaled so that the mass is the reference's
+    truth: bool = False  # stepped by the reference's solver
+    sample: bool = False  # for the first simulation of the mesh only
 
 
 def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
@@ -130,19 +113,12 @@ MOST_ATTEMPTS = 20
 
 @dataclass(frozen=True)
 class Engines:
-    """What steps the models, the reference, and meshes that are too large for either.
-
-    Attributes
-    ----------
-    models, truth, large : Engine
-    largest : int
-        Nodes beyond which a mesh is ``large``'s.
-    """
+    """What steps the models, the reference, and meshes that are too large for either."""
 
     models: Engine
     truth: Engine
     large: Engine
-    largest: int = sys.maxsize
+    largest: int = sys.maxsize  # nodes beyond which a mesh is ``large``'s
 
     def of(self, model: Model, problem: Problem) -> Engine:
         """The engine for a run."""

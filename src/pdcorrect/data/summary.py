@@ -26,87 +26,49 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class RunInfo:
-    """One run over the simulations that have it; None where nothing tells.
-
-    Attributes
-    ----------
-    simulations : int
-    iterations : float or None
-        Mean of a step.
-    relative_error : float or None
-        Of the rollout from the reference's, over that one's RMS displacement, mean over
-        simulations; beside a converged reference the error that counts.
-    rms_error : float or None
-        The same in m.
-    step_error : float or None
-        RMS distance from the reference after one step from each of its frames, mean, m.
-    omega : float or None
-        Share of the plain run's squared error that it removes, per cent, mean.
-    seconds : float
-        Cost, of single steps too.
-    """
+    """One run over the simulations that have it; None where nothing tells."""
 
     simulations: int
-    iterations: float | None
+    iterations: float | None  # mean of a step
+    # of the rollout from the reference's, over that one's RMS displacement, mean over simulations;
+    # beside a converged reference the error that counts
     relative_error: float | None
-    rms_error: float | None
+    rms_error: float | None  # the same in m
+    # RMS distance from the reference after one step from each of its frames, mean, m
     step_error: float | None
-    omega: float | None
-    seconds: float
+    omega: float | None  # share of the plain run's squared error that it removes, per cent, mean
+    seconds: float  # cost, of single steps too
 
 
 @dataclass(frozen=True)
 class SplitInfo:
-    """A split, or the whole data set.
+    """A split, or the whole data set."""
 
-    Attributes
-    ----------
-    meshes, simulations, frames, bytes : int
-        Frames over all simulations, without the rest shape.
-    nodes, young, poisson, density : (smallest, largest)
-        Of its meshes; Pa, dimensionless, kg/m3.
-    displacement : (smallest, largest)
-        Of the simulations' largest ones, m.
-    rejection_rate : float
-        Rejected draws over all draws.
-    rejections : mapping of str to int
-        Rejected draws by "run, reason".
-    runs : mapping of str to RunInfo
-    seconds : float
-        Cost of all runs.
-    """
-
+    # frames over all simulations, without the rest shape
     meshes: int
     simulations: int
     frames: int
     bytes: int
+    # smallest and largest of its meshes; Pa, dimensionless, kg/m3
     nodes: Range
     young: Range
     poisson: Range
     density: Range
-    displacement: Range
-    rejection_rate: float
-    rejections: Mapping[str, int]
+    displacement: Range  # smallest and largest of the simulations' largest ones, m
+    rejection_rate: float  # rejected draws over all draws
+    rejections: Mapping[str, int]  # rejected draws by "run, reason"
     runs: Mapping[str, RunInfo]
-    seconds: float
+    seconds: float  # cost of all runs
 
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """A data set in numbers, as a whole and by split.
-
-    Attributes
-    ----------
-    name : str
-    whole : SplitInfo
-    splits : mapping of str to SplitInfo
-    damaged : mapping of str to str
-        Files that were left out, and what is wrong with them.
-    """
+    """A data set in numbers, as a whole and by split."""
 
     name: str
     whole: SplitInfo
     splits: Mapping[str, SplitInfo]
+    # files that were left out, and what is wrong with them
     damaged: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> str:

@@ -99,28 +99,18 @@ _PATIENCE, _ANSWER = 600, 10
 class Workers:
     """Who computes.
 
-    Attributes
-    ----------
-    count : int
-        Processes on this machine, each with one thread.
-    scheduler : str or None
-        Address of a Dask scheduler whose workers are used instead.
-    device : str
-        "cpu": one simulation at a time.  "cuda": batches; with several workers on this
-        machine each takes a GPU of its own.
-    batch : int
-        Simulations that are computed together on a GPU.
-
     Raises
     ------
     InputError
         If ``count`` or ``batch`` is less than 1, or the device is another.
     """
 
-    count: int = 1
-    scheduler: str | None = None
+    count: int = 1  # processes on this machine, each with one thread
+    scheduler: str | None = None  # address of a Dask scheduler whose workers are used instead
+    # "cpu": one simulation at a time.  "cuda": batches; with several workers on this machine each
+    # takes a GPU of its own
     device: str = "cpu"
-    batch: int = 32
+    batch: int = 32  # simulations that are computed together on a GPU
 
     def __post_init__(self) -> None:
         for name, value in (("count", self.count), ("batch", self.batch)):

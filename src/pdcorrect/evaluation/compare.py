@@ -58,39 +58,25 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Outcome of `compare`.
-
-    Attributes
-    ----------
-    rows : tuple of Row
-        In the order coarse to fine, without cases that failed.
-    runs, on_coarse : dict of str to Trajectory
-        Each case on its own mesh, and on the coarse nodes.
-    cases : tuple of Case
-    models : dict of str to dict
-        Of correctors, by label: model, base, the data set that it was trained on, that one's
-        time integrator, and digest of its weights.
-    reference : str
-        Label of the case that errors are measured against.
-    solver_error : float or None
-        Largest node distance between PD and Newton on the coarse mesh, m: they minimise the same
-        energy, so this is solver error, unless the body buckles and they take different branches.
-        None without both, or if a frame needed a fallback.
-    failures : dict of str to str
-        Of cases that did not come to their end, by label: why.
-    converged, finer : Trajectory or None
-        The converged motion, and what errors on the coarse mesh are estimated by, if asked for.
-    """
+    """Outcome of `compare`."""
 
     scene: Scene
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # in the order coarse to fine, without cases that failed
+    # each case on its own mesh, and on the coarse nodes
     runs: dict[str, Trajectory]
     on_coarse: dict[str, Trajectory]
-    reference: str
+    reference: str  # label of the case that errors are measured against
+    # largest node distance between PD and Newton on the coarse mesh, m: they minimise the same
+    # energy, so this is solver error, unless the body buckles and they take different branches.
+    # None without both, or if a frame needed a fallback
     solver_error: float | None
     cases: tuple[Case, ...]
+    # of correctors, by label: model, base, the data set that it was trained on, that one's time
+    # integrator, and digest of its weights
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    # of cases that did not come to their end, by label: why
     failures: Mapping[str, str] = field(default_factory=dict)
+    # the converged motion, and what errors on the coarse mesh are estimated by, if asked for
     converged: Trajectory | None = None
     finer: Trajectory | None = None
 
@@ -117,14 +103,7 @@ def make_stepper(problem: Problem, solver: str) -> Stepper:
 
 
 def case_stepper(scene: Scene, case: Case) -> Stepper:
-    """What steps a case, factorised and with its kernels compiled.
-
-    Raises
-    ------
-    InputError
-        If there is no such solver, base or model, a model does not fit the scene, or the case
-        has another solver, mesh or base than the model.
-    """
+    """What steps a case, factorised and with its kernels compiled."""
     if case.model is None:
         return make_stepper(case.problem(scene), case.solver)
     from pdcorrect.corrector.hybrid import hybrid_of

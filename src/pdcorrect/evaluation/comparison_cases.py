@@ -17,31 +17,18 @@ _SECOND_ORDER = "generalised-alpha"
 
 @dataclass(frozen=True)
 class Case:
-    """One solver on one mesh.
-
-    Attributes
-    ----------
-    label : str
-    solver : str
-        "pd" or "newton".
-    refine : int
-    base : {"plain", "enhanced", "learned", "best"}
-        Element and mass of the scene, or of its `best_coarse`, `learned_coarse` or
-        `trained_coarse`, on which correctors of the base "best" were trained.
-    model : str or None
-        Name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base.
-    gate : bool
-        Whether a default `Gate` lets the corrector pass.
-    element, integrator : str or None
-        In place of the scene's; an element on the scene's cells, of base "plain" only.
-    """
+    """One solver on one mesh."""
 
     label: str
-    solver: str
+    solver: str  # "pd" or "newton"
     refine: int
+    # of `CASE_BASES`: element and mass of the scene, or of its `best_coarse`, `learned_coarse` or
+    # `trained_coarse`, on which correctors of the base "best" were trained
     base: str = "plain"
+    # name or folder of a corrector of the steps: with solver "pd", refine 1 and its own base
     model: str | None = None
-    gate: bool = True
+    gate: bool = True  # whether a default `Gate` lets the corrector pass
+    # in place of the scene's; an element on the scene's cells, of base "plain" only
     element: str | None = None
     integrator: str | None = None
 
@@ -52,13 +39,7 @@ class Case:
         return self.refine == 1 and self.base == "plain" and changes == (None, None, None)
 
     def problem(self, scene: Scene) -> Problem:
-        """What is stepped.
-
-        Raises
-        ------
-        InputError
-            If there is no such base, or an element is given with another one than "plain".
-        """
+        """What is stepped."""
         if self.integrator is not None:
             scene = scene.with_changes(time={"integrator": self.integrator})
         if self.base not in CASE_BASES or (self.base != "plain" and self.element is not None):
@@ -94,13 +75,7 @@ _TRAINED = Case("coarse PD as trained", "pd", 1, "best")
 
 
 def with_learned(scene: Scene) -> Scene:
-    """`learned_coarse` of a scene whose nodes it has.
-
-    Raises
-    ------
-    InputError
-        If the scene's own element has 27 nodes.
-    """
+    """`learned_coarse` of a scene whose nodes it has."""
     if scene.solver.element == _27_NODES:
         raise InputError(
             "learned: the scene's 27-node elements have nodes where it has none: expected a "
@@ -145,12 +120,6 @@ def cases_for(
     second_order : bool
         The best coarse model, the learned and the 27-node elements also by generalised-alpha,
         where the scene has another integrator.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, models learned from references of unlike elements, or the
-        scene's own element has 27 nodes and others are asked for.
     """
     check_scene(scene)
     own = scene.solver.element

@@ -34,17 +34,9 @@ RESAMPLES, LEVEL = 2000, 0.95
 
 @dataclass(frozen=True)
 class Summary:
-    """How a measure is distributed over trajectories.
+    """How a measure is distributed over trajectories."""
 
-    Attributes
-    ----------
-    count, meshes : int
-        Trajectories that have the measure, and meshes that these are on.
-    mean, median, q05, q95, smallest, largest : float
-    interval : (float, float) or None
-        Of the mean, see `mean_interval`.
-    """
-
+    # trajectories that have the measure, and meshes that these are on
     count: int
     meshes: int
     mean: float
@@ -53,7 +45,7 @@ class Summary:
     q95: float
     smallest: float
     largest: float
-    interval: tuple[float, float] | None
+    interval: tuple[float, float] | None  # of the mean, see `mean_interval`
 
 
 def summarise(values: Sequence[float], meshes: Sequence[int], seed: int = 0) -> Summary:
@@ -262,13 +254,7 @@ def write_evaluation(
     notes: Sequence[str] = (),
     seed: int = 0,
 ) -> list[Path]:
-    """Write all files of an evaluation into a folder.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be written.
-    """
+    """Write all files of an evaluation into a folder."""
     folder = make_folder(folder)
     contents = {
         TRAJECTORIES: trajectories_csv(evaluation),

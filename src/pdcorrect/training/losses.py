@@ -136,13 +136,7 @@ class BodyModes(NamedTuple):
 
 
 def body_modes(problem: Problem, count: int = MODES) -> BodyModes:
-    """The lowest modes of a body at rest, of the problem's own mass and stiffness.
-
-    Raises
-    ------
-    ConvergenceError
-        As of `pdcorrect.modes`.
-    """
+    """The lowest modes of a body at rest, of the problem's own mass and stiffness."""
     nodes = len(problem.positions)
     count = min(count, int(problem.free.sum()) - 1)
     if count < 1:

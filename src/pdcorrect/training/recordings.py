@@ -25,29 +25,18 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A simulation.
+    """A simulation."""
 
-    Attributes
-    ----------
-    path : Path
-        The file, which has one mesh.
-    dataset, config_hash, content_hash, split : str
-    number : int
-        On its mesh.
-    reference, plain : (T+1, N, 3)
-        The reference, and the rollout of the plain coarse model, m.
-    one_step, rollout : float
-        Mean squared errors of the base model, m2, see `pdcorrect.training.losses`.
-    """
-
-    path: Path
+    path: Path  # the file, which has one mesh
     dataset: str
     config_hash: str
     content_hash: str
     split: str
-    number: int
+    number: int  # on its mesh
+    # (T+1, N, 3): the reference, and the rollout of the plain coarse model, m
     reference: Array
     plain: Array
+    # mean squared errors of the base model, m2, see `pdcorrect.training.losses`
     one_step: float
     rollout: float
 
@@ -73,14 +62,6 @@ def load_recordings(
     """The simulations of a split, mesh by mesh, without those of files in ``without``.
 
     ``scenes`` says whether the base model is to step again, for which it takes the scenes.
-
-    Raises
-    ------
-    InputError
-        If there is no such split, or a simulation lacks a run or a scene that is needed; names
-        the file and all that it lacks.
-    FileFormatError
-        If a file is damaged.
     """
     found = []
     for path in shard_paths(folder, split, without):
@@ -100,13 +81,7 @@ def base_errors(recordings: Sequence[Recording], device: str | torch.device = "c
 
 
 def make_problems(recordings: Sequence[Recording], base: Base) -> list[Problem]:
-    """The base model's problems; those of one mesh share its discretisation.
-
-    Raises
-    ------
-    InputError
-        If a scene is not that of the recorded mesh.
-    """
+    """The base model's problems; those of one mesh share its discretisation."""
     known: dict[Path, list[Problem]] = {}
     for path in dict.fromkeys(recording.path for recording in recordings):
         known[path] = rebuilt_problems(read_shard(path, runs=(base,)), path, base)

@@ -116,15 +116,7 @@ class SceneGroup:
 
     @cached_property
     def vibrations(self) -> Vibrations:
-        """Small vibrations of the base model's bodies about their shapes at rest.
-
-        Raises
-        ------
-        InputError
-            If steps are not those of backward Euler.
-        ConvergenceError
-            If a body's modes are not found.
-        """
+        """Small vibrations of the base model's bodies about their shapes at rest."""
         if self.stepper.integrator != "backward-euler":
             raise InputError(
                 f"loss.ahead with integrator {self.stepper.integrator!r}: expected backward-euler, "
@@ -189,11 +181,6 @@ class SceneGroups:
 
         Meshes are in random order and simulations of a mesh stay together, for they share
         factorisations.
-
-        Raises
-        ------
-        InputError
-            If there is none for this process.
         """
         usable = [r for r in self.recordings if r.steps >= shortest]
         meshes = list(dict.fromkeys(r.path for r in usable))

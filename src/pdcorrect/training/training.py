@@ -357,16 +357,7 @@ class Training:
 
 
 def load_start(config: TrainingConfig, device: torch.device) -> LoadedModel | None:
-    """The model that a training goes on with, if there is one.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, or its architecture, base model or velocity is another one
-        than the training's.
-    FileFormatError
-        If a file is damaged.
-    """
+    """The model that a training goes on with, if there is one."""
     if config.start_from is None:
         return None
     model = load_model(config.start_from, device)

@@ -38,22 +38,12 @@ _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 
 @dataclass(frozen=True, eq=False)
 class StepBatch:
-    """A step of B bodies with n nodes.
-
-    Attributes
-    ----------
-    bodies : BodyGraph
-    snapshot : Snapshot
-    target : (n, 3)
-        The correction that leads to the reference, m.
-    scale : (B,)
-        Mean squared one-step error of the base model on each trajectory, m2.
-    """
+    """A step of B bodies with n nodes."""
 
     bodies: BodyGraph
     snapshot: Snapshot
-    target: Tensor
-    scale: Tensor
+    target: Tensor  # (n, 3): the correction that leads to the reference, m
+    scale: Tensor  # (B,): mean squared one-step error of the base model on each trajectory, m2
 
     def with_noise(self, tau: float, generator: torch.Generator) -> StepBatch:
         """The same with Gaussian noise on the proposal, which the target takes back.
