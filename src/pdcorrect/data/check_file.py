@@ -183,16 +183,8 @@ def _same(found: Any, wanted: Any) -> bool:
 def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:
     """Steps of the coarse models that come out otherwise when they are taken again.
 
-    Parameters
-    ----------
-    path : Path
-        Of the shard's file, for messages.
-    shard : Shard
-        Generated, not imported.
-    count : int
-        Single steps and steps of rollouts of each simulation and model.
-    tolerance : float
-        The solver's, m.
+    ``count`` single steps and steps of rollouts of each simulation and model of a generated file;
+    ``tolerance`` is the solver's, m.
     """
     for name in BASES:
         if all(name in simulation.runs for simulation in shard.simulations):

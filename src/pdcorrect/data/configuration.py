@@ -51,68 +51,36 @@ TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
 
 
 class MaterialRange(Strict):
-    """From what the material of a mesh is drawn; all its simulations share it.
+    """From what the material of a mesh is drawn; all its simulations share it."""
 
-    Attributes
-    ----------
-    young
-        Pa, log-uniform.
-    poisson
-        Uniform.
-    density
-        kg/m3, uniform.
-    """
-
-    young: Range
-    poisson: PoissonRange
-    density: Range
+    young: Range  # Pa, log-uniform
+    poisson: PoissonRange  # uniform
+    density: Range  # kg/m3, uniform
 
 
 class MotionRange(Strict):
-    """From what a simulation's load is drawn.
+    """From what a simulation's load is drawn."""
 
-    Attributes
-    ----------
-    kind
-        "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in
-        time.  "impulse": a force on the body's inflated part (or free end) during the first
-        ``duration`` seconds.  "stretch": a force on that part along the axis away from the
-        clamps, with a transverse share, that rises during ``duration`` seconds and stays.
-        "body-force": an acceleration of the whole body in a random direction that rises so, too.
-    strength
-        Uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over
-        the mass of the loaded part, m/s2.  Impulse: momentum over that mass, m/s.  Body force:
-        m/s2.
-    duration
-        s; not used by torsion.
-    attraction
-        k of eq. 6-1, uniform.
-    stretch
-        alpha of eq. 6-1 over the cell size, uniform.
-    transverse
-        Of stretch: transverse over axial force, uniform.
-    """
-
+    # "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in time.
+    # "impulse": a force on the body's inflated part (or free end) during the first ``duration``
+    # seconds.  "stretch": a force on that part along the axis away from the clamps, with a
+    # transverse share, that rises during ``duration`` seconds and stays.  "body-force": an
+    # acceleration of the whole body in a random direction that rises so, too
     kind: MotionName
+    # uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over the mass of
+    # the loaded part, m/s2.  Impulse: momentum over that mass, m/s.  Body force: m/s2
     strength: Range
-    duration: Positive = 0.01
-    attraction: Span = (0.0, 0.5)
-    stretch: Span = (0.5, 1.5)
-    transverse: Span = (0.0, 0.3)
+    duration: Positive = 0.01  # s; not used by torsion
+    attraction: Span = (0.0, 0.5)  # k of eq. 6-1, uniform
+    stretch: Span = (0.5, 1.5)  # alpha of eq. 6-1 over the cell size, uniform
+    transverse: Span = (0.0, 0.3)  # of stretch: transverse over axial force, uniform
 
 
 class Reference(Strict):
-    """What the data set takes for the truth.
-
-    Attributes
-    ----------
-    solver
-        "pd" or "newton".
-    refine
-        Cells into which each coarse cell is cut, along each axis.
-    """
+    """What the data set takes for the truth."""
 
     solver: Literal["pd", "newton"] = "pd"
+    # cells into which each coarse cell is cut, along each axis
     refine: Annotated[int, Field(strict=True, ge=2, le=16)] = 4
 
 
@@ -130,26 +98,18 @@ class Split(Strict):
 
 
 class ExtraSplit(Split):
-    """An evaluation split that leaves the training distribution in the named respects.
-
-    Attributes
-    ----------
-    family, young, poisson
-        In place of the data set's.
-    strength_factor, step_factor, frames_factor
-        On its loads, its time step and its number of frames.
-    refine
-        Of the reference.
-    """
+    """An evaluation split that leaves the training distribution in the named respects."""
 
     name: Name
+    # in place of the data set's
     family: FamilyName | None = None
     young: Range | None = None
     poisson: PoissonRange | None = None
+    # on its loads, its time step and its number of frames
     strength_factor: Positive = 1.0
     step_factor: Positive = 1.0
     frames_factor: PositiveCount = 1
-    refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None
+    refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None  # of the reference
 
 
 class DatasetConfig(TomlConfig):

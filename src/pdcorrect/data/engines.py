@@ -67,15 +67,8 @@ class Engine(Protocol):
 class OneByOne:
     """One problem after the other, on the CPU.
 
-    Parameters
-    ----------
-    solver : {"pd", "newton"}
-        "pd" without fallbacks and with at most `MOST_ITERATIONS`.
-    tolerance : float
-        Of the coarse cell size.
-    adds_up : bool
-        Whether it falls with the square of a rollout's ``divisor``, since errors of more steps
-        add up.
+    Projective dynamics has no fallbacks and at most `MOST_ITERATIONS`.  The tolerance is of the
+    coarse cell size; if errors add up it falls with the square of a rollout's ``divisor``.
     """
 
     def __init__(self, solver: SolverName, tolerance: float, adds_up: bool = False) -> None:

@@ -61,10 +61,7 @@ def splits_of(folder: str | Path) -> list[str]:
 
 
 def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -> list[Path]:
-    """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
-
-    Names of other files do not matter.
-    """
+    """Files of a split, by number; not those of some names, such as ``training/mesh-0042``."""
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
         names = ", ".join(splits_of(folder))
@@ -87,12 +84,8 @@ def read_files(
 ) -> list[Found]:
     """What ``read`` makes of each file.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-    read : callable
-    damaged : dict or None
-        Where given, files that are damaged are noted here and left out.
+    With ``damaged`` files that are damaged are noted there and left out; `FileFormatError` if all
+    are.
     """
     found = []
     for path in paths:
@@ -109,15 +102,9 @@ def read_files(
 
 
 def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
-    """Files that a data set's ``config.toml`` asks for and that are not there.
+    """Files that ``config.toml`` asks for, of all splits or one, and that are not there.
 
     None are missing where there is no configuration, as in imported data sets.
-
-    Parameters
-    ----------
-    folder : path
-    split : str, optional
-        The only one to look at; all by default.
     """
     folder = Path(folder)
     if not (folder / CONFIG).exists():

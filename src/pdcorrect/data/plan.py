@@ -130,17 +130,7 @@ def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
 
 
 def draw_scene(config: DatasetConfig, mesh: MeshPlan, simulation: int, attempt: int = 0) -> Scene:
-    """A simulation's scene, for the plain coarse model.
-
-    Parameters
-    ----------
-    config : DatasetConfig
-    mesh : MeshPlan
-    simulation : int
-        Its number on the mesh.
-    attempt : int
-        Counts the draws of this simulation's load: those before were rejected.
-    """
+    """A simulation's scene, for the plain coarse model, after ``attempt`` rejected draws."""
     rng = np.random.default_rng((*mesh.stream, 1 + simulation, attempt))
     published = config.setting == "as-published"
     cell = config.cell_size

@@ -1,37 +1,15 @@
 """What a file of a data set holds: one mesh with its material, and its simulations.
 
-The layout of the HDF5 file, version 1 (``docs/datasets.md``)::
-
-    /                     attributes: format, version, dataset, split, number, setting,
-                          config_hash, time_step, tolerance, content_hash
-    mesh/points           (N, 3) float64   rest positions of the coarse mesh, m
-    mesh/cells            (C, 8) int32     nodes of each cell, VTK order
-    mesh/free             (N, 3) bool      components that may move
-    mesh/mass             (N,) float64     lumped masses of the plain coarse model, kg
-    material/young        (C,) float64     Pa
-    material/poisson      (C,) float64
-    material/density      (C,) float64     kg/m3
-    simulations/KKKK/     attributes: attempt, scene (TOML), rejected (list of str)
-      forces              (T, N, 3)        nodal forces of the plain coarse model, N, step by step
-      runs/NAME/          attributes: what the run is (solver, refine, element, mass, ...)
-        positions         (T+1, N, 3)      on the coarse nodes, m; frame 0 is the rest shape
-        velocities        (T+1, N, 3)      m/s, of references in the setting "converged"
-        predictions       (T, N, 3)        one step from each frame of the reference, m
-        iterations, error_estimates (m), smallest_volume_ratios   (T,)
-    provenance/           attributes: code version, hardware, date; not part of the hash
-    cost/KKKK             attributes: seconds by run; not part of the hash
-
-Arrays without a type are float32 or, by choice, float64.  A run has positions,
-predictions or both.  In front, in the room that HDF5 leaves to others, the user block, are
-three lines of text, padded with zeros::
+`docs/datasets.md` has the layout of the HDF5 file, version 1.  In front, in the room that HDF5
+leaves to others, the user block, are three lines of text, padded with zeros::
 
     pdcorrect-dataset 1
     bytes 10485760
     sha256 0f3c...
 
-the format's version, the size of the whole file, and the SHA-256 of the first two lines
-and of everything after the user block.  A damaged file is thus found out before HDF5,
-which some damage makes crash, sees any of it.
+the format's version, the size of the whole file, and the SHA-256 of the first two lines and of
+everything after the user block.  A damaged file is thus found out before HDF5, which some damage
+makes crash, sees any of it.
 """
 
 from __future__ import annotations
@@ -155,15 +133,7 @@ def write_shard(
 ) -> str:
     """Write a file whole or not at all; returns the hash of its content.
 
-    Parameters
-    ----------
-    path : path
-        In a folder that need not exist.
-    shard : Shard
-    dtype : {"float32", "float64"}
-        Of forces and positions.
-    overwrite : bool
-        Replace an existing file.
+    ``dtype``, "float32" or "float64", is that of forces, positions and velocities.
 
     Raises
     ------

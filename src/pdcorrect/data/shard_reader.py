@@ -51,14 +51,7 @@ class ShardHeader:
 
 
 def read_header(path: str | Path, *, verify: bool = False) -> ShardHeader:
-    """Sizes and names of a file of a data set.
-
-    Parameters
-    ----------
-    path : path
-    verify : bool
-        Compare the file with its checksum, which reads all of it.
-    """
+    """Sizes and names of a file of a data set; ``verify`` compares all of it with its checksum."""
     with _opened(Path(path), verify) as file:
         groups = [file["simulations"][key] for key in sorted(file["simulations"])]
         return ShardHeader(

@@ -177,19 +177,8 @@ class _Draft:
 def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines) -> list[Shard]:
     """All simulations of some meshes of one split, computed together.
 
-    A drawn load under which a run fails or inverts a cell is rejected and drawn again.
-
-    Parameters
-    ----------
-    config : DatasetConfig
-    plans : sequence of MeshPlan
-        Of one split.
-    engines : Engines
-
-    Raises
-    ------
-    ConvergenceError
-        If a simulation is rejected `MOST_ATTEMPTS` times.
+    A drawn load under which a run fails or inverts a cell is rejected and drawn again, and
+    `ConvergenceError` is raised after `MOST_ATTEMPTS` draws.
     """
     waiting: list[_Draft] = []
     for plan in plans:
@@ -332,21 +321,9 @@ def discretise_stored(scene: Scene, shard: Shard, refine: int = 1) -> Problem:
 def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem]:
     """The problem of each simulation of a file, discretised as one of its runs was.
 
-    They share mesh, operators and masses.
-
-    Parameters
-    ----------
-    shard : Shard
-    path : Path
-        Of its file, for messages.
-    run : str
-        One of `pdcorrect.fem.problem.BASES`, or "reference".
-
-    Raises
-    ------
-    InputError
-        If a simulation has no scene, as imported ones, lacks the run, or what its scene
-        leads to is not what the file holds.
+    They share mesh, operators and masses.  ``path`` is the file's, for messages, and ``run`` one of
+    `pdcorrect.fem.problem.BASES`, or "reference".  `InputError` if a simulation has no scene, as
+    imported ones, lacks the run, or what its scene leads to is not what the file holds.
     """
     stored = shard.simulations[0].runs.get(run)
     if stored is None or run not in (*BASES, REFERENCE):

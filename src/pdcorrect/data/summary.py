@@ -112,15 +112,9 @@ def dataset_info(
     *,
     skip_damaged: bool = False,
 ) -> DatasetInfo:
-    """Read a data set and summarise it.
+    """Read a data set and summarise it; ``on_file`` is called with each file after it was read.
 
-    Parameters
-    ----------
-    folder : path
-    on_file : callable, optional
-        Called with each file after it was read.
-    skip_damaged : bool
-        Whether damaged files are left out, and listed in the result.
+    With ``skip_damaged`` damaged files are left out, and listed in the result.
 
     Raises
     ------

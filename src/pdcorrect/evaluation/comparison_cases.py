@@ -101,25 +101,14 @@ def cases_for(
 ) -> tuple[Case, ...]:
     """What `compare` runs by default: the scene as it is, and always the best coarse model.
 
-    The reference is the fine mesh with the element of the best coarse model; with correctors it
-    is what they learned from, and the coarse models that they correct are among the cases.  A
-    scene of 27-node elements, or of the best coarse model's own, has its own element on the fine
-    mesh.  The coarse run of a scene with the learned element is called so.
+    The reference is the fine mesh with the element of the best coarse model; with correctors, by
+    name or folder, it is what they learned from, and the coarse models that they correct are among
+    the cases.  A scene of 27-node elements, or of the best coarse model's own, has its own element
+    on the fine mesh.  The coarse run of a scene with the learned element is called so.
 
-    Parameters
-    ----------
-    scene : Scene
-    models : sequence of str
-        Names or folders of correctors.
-    gate : bool
-        Of the correctors.
-    hex27 : bool
-        Also 27-node elements on the coarse mesh.
-    learned : bool
-        Also the learned element, where it is not the scene's own.
-    second_order : bool
-        The best coarse model, the learned and the 27-node elements also by generalised-alpha,
-        where the scene has another integrator.
+    ``gate`` is about correctors.  ``hex27`` and ``learned`` add elements on the coarse mesh;
+    ``second_order`` adds the best coarse model and these by generalised-alpha, where the scene has
+    another integrator.
     """
     check_scene(scene)
     own = scene.solver.element

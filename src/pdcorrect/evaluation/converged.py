@@ -216,12 +216,7 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> NDArray
 def finer_run(
     scene: Scene, frames: int, refine: int = 1, *, on_step: OnStep | None = None
 ) -> Trajectory:
-    """The run from which `error_estimate` measures those with ``refine`` cells for each coarse one.
-
-    Raises
-    ------
-    ConvergenceError
-    """
+    """What `error_estimate` measures runs from, of ``refine`` cells for each coarse one."""
     # weights tuned to a body do not know finer cells
     scene = scene.with_changes(solver={"weights": None})
     if scene.time.integrator != "quasi-static":

@@ -67,15 +67,11 @@ def mean_interval(
 ) -> tuple[float, float] | None:
     """Expanded percentile bootstrap interval of the mean (Hesterberg 2015, section 5.2).
 
-    Clusters are drawn with replacement, not values: trajectories on one mesh share its
-    shape and material, so they tell less than as many on different meshes.  With n clusters
-    the percentiles are those at which a normal variable with the deviation of a resample,
-    too small by sqrt((n - 1) / n), is Student's t with n - 1 degrees of freedom: 0.9 and
-    99.1 instead of 2.5 and 97.5 for ten clusters.
-
-    Returns
-    -------
-    (low, high), or None if there is one cluster only, which tells nothing of others
+    Clusters are drawn with replacement, not values: trajectories on one mesh share its shape and
+    material, so they tell less than as many on different meshes.  With n clusters the percentiles
+    are those at which a normal variable with the deviation of a resample, too small by sqrt((n - 1)
+    / n), is Student's t with n - 1 degrees of freedom: 0.9 and 99.1 instead of 2.5 and 97.5 for ten
+    clusters. None if there is one cluster only, which tells nothing of others.
     """
     found = np.asarray(values, dtype=np.float64)
     names, owner = np.unique(np.asarray(clusters), return_inverse=True)

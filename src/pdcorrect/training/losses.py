@@ -74,17 +74,9 @@ def body_losses(
 ) -> Tensor:
     """The loss of each body, (B,).
 
-    Parameters
-    ----------
-    loss : Loss
-    errors : (..., 3)
-        Distances at nodes, m.
-    total : callable
-        Sums of values (...) over the nodes of each body, (B,), which has ``counts`` (B,).
-    scale : (B,)
-        d(j), m2.
-    added : (B,)
-        To relative losses, before they are bent.
+    ``errors`` (..., 3) are distances at nodes, m; ``total`` sums values (...) over the nodes of
+    each body, of which it has ``counts`` (B,); ``scale`` (B,) is d(j), m2.  ``added`` (B,) comes to
+    relative losses before they are bent.
     """
     if loss.kind == "relative":
         ratios = total(errors.square().sum(dim=-1)) / (counts * scale) + added

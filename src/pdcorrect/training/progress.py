@@ -162,15 +162,10 @@ def _hash(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 class HistoryFile:
-    """Rows of numbers by iteration, written at once.
+    """Rows of numbers by iteration, in ``history.csv`` and for TensorBoard, written at once.
 
-    Parameters
-    ----------
-    folder : Path
-    length : int
-        Bytes of ``history.csv`` that are kept: what came later is repeated.
-    iteration : int
-        From which on TensorBoard forgets what it has.
+    Of what is there ``length`` bytes are kept, and what TensorBoard has of iterations before
+    ``iteration``: what came later is repeated.
     """
 
     def __init__(self, folder: Path, length: int = 0, iteration: int = 0) -> None:

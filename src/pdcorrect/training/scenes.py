@@ -30,21 +30,8 @@ _LEAST_FREE = 0.2
 class SceneGroup:
     """B recorded simulations in one `BatchStepper`.
 
-    Parameters
-    ----------
-    recordings : sequence of Recording
-    base : {"plain", "best"}
-    device : str or torch.device
-    modes : dict, optional
-        Modes of meshes that are known already, by file; new ones are added.
-
-    Attributes
-    ----------
-    steps : (B,) int
-        T of each simulation.
-    errors : BaseErrors
-    counts : (B,) tensor
-        Nodes of each; ``nodes`` are those of all.
+    ``modes`` are those of meshes that are known already, by file; new ones are added.  ``steps``
+    (B,) is T of each simulation, ``counts`` (B,) its nodes, of which all have ``nodes``.
     """
 
     def __init__(
