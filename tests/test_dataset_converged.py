@@ -172,7 +172,7 @@ def test_batches_compute_the_same(original):
 
     plan = make_plan(CONFIG)[-1]
     engine = Batched("cpu", CONFIG.tolerance, adds_up=True)
-    (found,) = simulate(CONFIG, [plan], Engines(engine, engine, engine))
+    (found,) = simulate(CONFIG, [plan], Engines(engine, engine))
     wanted = read_shard(original / f"{plan.name}.h5")
     for mine, other in zip(found.simulations, wanted.simulations, strict=True):
         assert mine.runs.keys() == other.runs.keys()

@@ -141,7 +141,7 @@ def test_batches_agree_with_one_by_one():
     batched = Batched("cpu", config.tolerance, most=4)
     alone = OneByOne("pd", config.tolerance)
     found = [
-        simulate(config, plans, Engines(engine, engine, engine)) for engine in (batched, alone)
+        simulate(config, plans, Engines(engine, engine)) for engine in (batched, alone)
     ]  # fmt: skip
     for one, other in zip(*found, strict=True):
         for a, b in zip(one.simulations, other.simulations, strict=True):
@@ -174,14 +174,14 @@ def test_a_rejected_load_is_noted_and_drawn_again():
     config = small(frames=1, training={"meshes": 1, "simulations": 2})
     plan = make_plan(config)[0]
     engine = Failing(2)
-    (shard,) = simulate(config, [plan], Engines(engine, engine, engine))
+    (shard,) = simulate(config, [plan], Engines(engine, engine))
     first, second = shard.simulations
     assert (first.attempt, second.attempt) == (2, 0)
     assert first.rejected == ("reference, step 1: broke",) * 2
     assert first.scene_toml == draw_scene(config, plan, 0, attempt=2).to_toml()
     engine = Failing(1000)
     with pytest.raises(ConvergenceError, match="20 loads"):
-        simulate(config, [plan], Engines(engine, engine, engine))
+        simulate(config, [plan], Engines(engine, engine))
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):

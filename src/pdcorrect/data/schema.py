@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import part_of_process, replacing
+from pdcorrect._files import make_folder, write_bytes
 from pdcorrect.errors import InputError, OutputError
 
 FORMAT, VERSION = "pdcorrect-dataset", 1
@@ -155,14 +154,8 @@ def write_shard(
         found = content_hash(file)
         file.attrs[HASH] = found
     seal(image.getbuffer())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path, part_of_process(path)) as part, open(part, "wb") as stream:
-            stream.write(image.getbuffer())
-            stream.flush()
-            os.fsync(stream.fileno())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+    make_folder(path.parent)
+    write_bytes(path, image.getvalue())
     return found
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -111,19 +110,14 @@ MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
 
 
-@dataclass(frozen=True)
-class Engines:
-    """What steps the models, the reference, and meshes that are too large for either."""
+class Engines(NamedTuple):
+    """What steps the models, and the reference."""
 
     models: Engine
     truth: Engine
-    large: Engine
-    largest: int = sys.maxsize  # nodes beyond which a mesh is ``large``'s
 
-    def of(self, model: Model, problem: Problem) -> Engine:
+    def of(self, model: Model) -> Engine:
         """The engine for a run."""
-        if len(problem.positions) > self.largest:
-            return self.large
         return self.truth if model.truth else self.models
 
 
@@ -223,28 +217,18 @@ def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
         return [d for d in drafts if d.alive and d.wants(name)]
 
     for name in sorted(names, key=lambda n: (names[n].refine, names[n].divisor)):
-        chosen = wanted(name)
-        for draft, steps in zip(chosen, _rollouts(chosen, name, names[name], engines), strict=True):
-            draft.keep(draft.steps, name, steps)
+        if chosen := wanted(name):
+            model, problems = names[name], [draft.loaded(name) for draft in chosen]
+            frames = chosen[0].plan.frames
+            found = engines.of(model).rollouts(problems, frames, model.divisor)
+            for draft, steps in zip(chosen, found, strict=True):
+                draft.keep(draft.steps, name, steps)
     for name in (n for n, model in names.items() if model.predict):
         if chosen := wanted(name):
             problems, states = [d.loaded(name) for d in chosen], [_states(d) for d in chosen]
             found = engines.models.predictions(problems, states)
             for draft, steps in zip(chosen, found, strict=True):
                 draft.keep(draft.predictions, name, steps)
-
-
-def _rollouts(drafts: Sequence[_Draft], name: str, model: Model, engines: Engines) -> list[Steps]:
-    """One run of some drafts; each by the engine that its mesh needs."""
-    problems = [draft.loaded(name) for draft in drafts]
-    chosen = [engines.of(model, problem) for problem in problems]
-    found: dict[int, Steps] = {}
-    for engine in {id(each): each for each in chosen}.values():
-        own = [i for i, each in enumerate(chosen) if each is engine]
-        frames = drafts[0].plan.frames
-        steps = engine.rollouts([problems[i] for i in own], frames, model.divisor)
-        found |= dict(zip(own, steps, strict=True))
-    return [found[i] for i in range(len(problems))]
 
 
 def _states(draft: _Draft) -> list[State]:
@@ -294,7 +278,7 @@ def _run(draft: _Draft, name: str, engines: Engines, setting: str) -> Run:
         predictions=None if predictions is None else predictions.positions,
         statistics={key: getattr(steps, key) for key in STATISTICS},
         attributes={
-            **engines.of(model, problem).describe(),
+            **engines.of(model).describe(),
             "refine": model.refine,
             "nodes": len(problem.positions),
             "element": problem.element,
