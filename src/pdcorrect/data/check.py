@@ -75,26 +75,12 @@ class Finding:
 def check_dataset(
     folder: str | Path, on_file: Callable[[Path], None] | None = None, repeat: int = 1
 ) -> list[Finding]:
-    """Read everything in a data set's folder and report what is wrong.
+    """Read everything in a data set's folder and report what is wrong; nothing if it is sound.
 
-    Of a generated one forces are computed again, too, and some steps of the coarse models taken
-    again, so that what files say of themselves is not all that is known of them.
-
-    Parameters
-    ----------
-    folder : path
-        With ``config.toml`` and a folder of files for each split.
-    on_file : callable, optional
-        Called with each mesh's file after it was checked.
-    repeat : int
-        Steps of each coarse run, and single steps from the reference, that are taken again in
-        each simulation of a generated data set.
-
-    Returns
-    -------
-    list of Finding
-        Empty for a sound data set.  A file that cannot be read is one finding; the others
-        are checked all the same.
+    A file that cannot be read is one finding; the others are checked all the same.  Of a generated
+    set forces are computed again, too, and in each simulation ``repeat`` steps of each coarse run
+    and single steps from the reference are taken again, so that what files say of themselves is not
+    all that is known of them.  ``on_file`` is called with each mesh's file after it was checked.
 
     Raises
     ------

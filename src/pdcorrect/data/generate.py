@@ -77,7 +77,7 @@ def generate(
     seconds : float, optional
         Begin nothing new after so much time; what is under way is finished.
     on_begin, on_file : callable, optional
-        For progress.
+        For progress, see `OnBegin` and `OnFile`.
 
     Returns
     -------
@@ -90,10 +90,8 @@ def generate(
     InputError
         If the folder holds another data set, a split is unknown, the family has fewer bodies
         than the configuration asks for, or no scheduler or worker answers.
-    ConvergenceError
-        If the loads are so strong that no draw is accepted.
-    OutputError
-        If a file cannot be written.
+    ConvergenceError, OutputError
+        If the loads are so strong that no draw is accepted, or a file cannot be written.
     """
     folder = Path(folder)
     plans = make_plan(config)

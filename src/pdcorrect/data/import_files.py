@@ -134,26 +134,17 @@ def shard_from_trajectories(
 ) -> Shard:
     """A file of a data set from runs of ``pdcorrect simulate`` on one mesh, checked.
 
-    The scenes in the runs give mesh, material, clamps and loads, and the coarse runs' where
-    there are any, else the references', element and masses of the coarse model.  References
-    are restricted to the coarse nodes; predictions are computed with `ProjectiveDynamics` on
-    the coarse mesh.
-
-    Parameters
-    ----------
-    reference : Trajectory or sequence of Trajectory
-        Of refined meshes, with their scenes.
-    coarse : Trajectory or sequence of Trajectory, optional
-        Rollouts of the coarse model, as many.
-    dataset, split, number, best
-        See `shard_from_arrays`.
+    The scenes in the runs give mesh, material, clamps and loads, and the coarse runs' where there
+    are any, as many as references, else the references', element and masses of the coarse model.
+    References, of refined meshes, are restricted to the coarse nodes; predictions are computed with
+    `ProjectiveDynamics` on the coarse mesh.  For the other arguments see `shard_from_arrays`.
 
     Raises
     ------
     InputError
-        If a run has no scene, another material than it, another integrator than backward
-        Euler or does not start at rest, the runs' scenes differ in a section but the loads of
-        different simulations, or in times, or as of `shard_from_arrays`.
+        If a run has no scene, another material than it, another integrator than backward Euler or
+        does not start at rest, the runs' scenes differ in a section but the loads of different
+        simulations, or in times, or as of `shard_from_arrays`.
     """
     references = [reference] if isinstance(reference, Trajectory) else list(reference)
     rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())

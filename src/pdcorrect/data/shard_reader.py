@@ -78,17 +78,9 @@ def read_shard(
 ) -> Shard:
     """Read a file of a data set, and find every changed byte by its checksum.
 
-    Parameters
-    ----------
-    path : path
-    runs : collection of str, or mapping of str to collections of str, optional
-        Names of those to read, as far as they are there; with names of arrays, such as
-        "predictions", only these of each.  All by default.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, is damaged or something else; names the file and the reason.
+    ``runs`` are names of those to read, as far as they are there; with names of arrays, such as
+    "predictions", only these of each.  `FileFormatError` names the file and the reason if it cannot
+    be read, is damaged or something else.
     """
     with _opened(Path(path), verify=True) as file:
         lengths: Lengths = {}

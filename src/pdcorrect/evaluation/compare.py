@@ -138,10 +138,9 @@ def compare(
         The first is the reference; those of `cases_for` by default.
     on_step : callable, optional
         For progress.
-    converged : Trajectory, optional
-        Of `pdcorrect.converged` for the same frames: relative errors are measured from it.
-    finer : Trajectory, optional
-        Of `finer_run` for the same frames: errors on the coarse mesh are estimated by it.
+    converged, finer : Trajectory, optional
+        Of `pdcorrect.converged` and `finer_run` for the same frames: relative errors are measured
+        from the one, errors on the coarse mesh estimated by the other.
 
     Raises
     ------

@@ -189,9 +189,9 @@ def evaluate(
 ) -> Evaluation:
     """Free rollouts and single steps of candidates, and of the stored runs, measured.
 
-    Every simulation is stepped again from rest, in all of the reference's frames, as the
-    data set's coarse runs were; see `measures` for what is measured and `roll_out` for what
-    becomes of simulations that fail.
+    Every simulation is stepped again from rest, in all of the reference's frames, as the data set's
+    coarse runs were; see `measures` for what is measured and `roll_out` for what becomes of
+    simulations that fail.
 
     Parameters
     ----------
@@ -212,10 +212,10 @@ def evaluate(
     Raises
     ------
     InputError
-        If names are not unlike, a base is none, files of the split are missing, or as of
-        `read_cases`.
+        If names are not unlike, files of the split are missing or of several data sets, or its
+        problems, or those of a base, cannot be rebuilt.
     FileFormatError
-        As of `read_cases`.
+        If a file is damaged.
     """
     if batch < 1 or workers < 1:
         raise InputError(f"batch = {batch}, workers = {workers}: expected 1 or more.")

@@ -132,16 +132,9 @@ class TrajectoryWriter:
     def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
         """Continue a finished or interrupted file after its last complete frame.
 
-        The file is first rewritten, without what is damaged or half written; until that is done
-        the old one stays.
-
-        Parameters
-        ----------
-        path : path
-            No other process may be writing it.
-        run : Trajectory, optional
-            What the file is to hold before the next frame; by default what
-            ``load_trajectory(path, salvage=True)`` reads from it.
+        The file, to which no other process may write, is first rewritten, without what is damaged
+        or half written; until that is done the old one stays.  ``run`` is what it is to hold before
+        the next frame; by default what ``load_trajectory(path, salvage=True)`` reads from it.
 
         Raises
         ------

@@ -154,19 +154,11 @@ class Vibrations:
         sum_{n = 1..T} (a_n x + b_n y)^2 |phi|^2 / (N T),
 
     without what unlike modes have in common, and wherever in the simulation it is, for users let
-    theirs go on.  A soft mode takes a second to show an error of its velocity, where derivatives
-    of training reach back over some hundredths of one.
+    theirs go on.  A soft mode takes a second to show an error of its velocity, where derivatives of
+    training reach back over some hundredths of one.
 
-    Parameters
-    ----------
-    bodies : sequence of BodyModes
-        Unlike ones; ``owners`` says which of them each body is, (B,).
-    steps : (B,) int
-        T of each body's simulation.
-    time_step : float
-        h, s.
-    nodes : int
-        Of padded tensors.
+    ``owners`` (B,) says which of the unlike ``bodies`` each is, ``steps`` (B,) are T, ``time_step``
+    is h, s, and ``nodes`` the number of padded tensors.
     """
 
     def __init__(

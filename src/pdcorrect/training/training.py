@@ -60,28 +60,11 @@ Report = Callable[[Progress, Mapping[str, Any]], None]
 class Training:
     """A training in a folder.
 
-    Parameters
-    ----------
-    config : TrainingConfig
-    data : path
-        Folder of the data set.
-    output : path
-        For ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard`` and
-        the best ``model``.
-    device : str
-    resume : bool
-        Go on from the checkpoint, if there is one.
-    incomplete : bool
-        Take the files that are there, if the data set's configuration asks for more.
-    world : ProcessGroup
-    on_report : callable, optional
-        Called with each row of the history.
-
-    Attributes
-    ----------
-    corrector : Corrector
-        In its present state; the best one is in the folder.
-    progress : Progress
+    The folder gets ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard``
+    and the best ``model``.  ``resume`` goes on from its checkpoint, if there is one; ``incomplete``
+    takes the data set's files that are there, if its configuration asks for more; ``on_report`` is
+    called with each row of the history.  ``corrector`` is in its present state, ``progress`` says
+    where it is.
 
     Raises
     ------
@@ -163,10 +146,7 @@ class Training:
     def run(self, seconds: float | None = None) -> bool:
         """Train until the end, or for about so many seconds; whether it is finished.
 
-        Raises
-        ------
-        ConvergenceError
-            If too many batches in a row had no finite gradient.
+        `ConvergenceError` if too many batches in a row had no finite gradient.
         """
         self._limit = math.inf if seconds is None else self.progress.seconds + seconds
         self._ticked = time.perf_counter()
