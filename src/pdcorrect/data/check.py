@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, step_faults
+from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, reason, step_faults
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
@@ -117,7 +117,6 @@ class _Check:
     meshes: dict[str, Path] = field(default_factory=dict)  # first file with a mesh, by digest
     bodies: dict[str, Path] = field(default_factory=dict)  # and with a material, too
     forces: dict[str, str] = field(default_factory=dict)  # where forces on a mesh came first
-    origins: dict[str, dict[str, Path]] = field(default_factory=dict)  # by code, and by device
 
     def note(self, path: Path, message: str, severity: Severity = "error") -> None:
         self.findings.append(Finding(path, severity, message))
@@ -131,7 +130,7 @@ class _Check:
             self.config = DatasetConfig.load(path)
             self.plans = {plan.path(self.folder): plan for plan in make_plan(self.config)}
         except InputError as error:
-            self.note(path, _reason(path, error))
+            self.note(path, reason(path, error))
 
     def load_manifest(self) -> None:
         """Read the hashes that the manifest lists; unfinished data sets have none."""
@@ -164,7 +163,7 @@ class _Check:
         try:
             shard = read_shard(path)
         except InputError as error:
-            self.note(path, _reason(path, error))
+            self.note(path, reason(path, error))
             return
         found, wanted = shard.attributes["config_hash"], self.config and self.config.hash()
         if wanted is not None and found != wanted:
@@ -178,7 +177,6 @@ class _Check:
             return
         for message in (*file_faults(shard), *self._config_faults(path, shard)):
             self.note(path, message)
-        self._origin(path, shard)
         self._repetitions(path, shard)
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
@@ -199,19 +197,6 @@ class _Check:
         if not found and self.repeat:
             limit = float(shard.attributes["tolerance"]) * cell_size(shard)
             yield from step_faults(path, shard, self.repeat, limit)
-
-    def _origin(self, path: Path, shard: Shard) -> None:
-        """Changes of the code and of the device between files, where they tell."""
-        for what, told in (("code", "made by other code than {} (SHA-256 {:.12})"),
-                           ("device", "computed on another device than {}: {}")):  # fmt: skip
-            own = shard.provenance.get(what)
-            if own is None:
-                continue
-            known = self.origins.setdefault(what, {})
-            if known and own not in known:
-                first = self._short(next(iter(known.values())))
-                self.note(path, told.format(first, own), "warning")
-            known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
@@ -245,7 +230,3 @@ def _imported(paths: Sequence[Path]) -> bool:
         with suppress(InputError):
             return not read_header(path).config_hash
     return False
-
-
-def _reason(path: Path, error: InputError) -> str:
-    return str(error).removeprefix(f"{path}: ").removesuffix(".")

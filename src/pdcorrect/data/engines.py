@@ -94,11 +94,7 @@ class OneByOne:
         for problem, states in zip(problems, starts, strict=True):
             began = time.perf_counter()
             stepper = self._stepper(steppers, problem, divisor)
-            frames, failure = _frames(stepper, problem, states, divisor)
-            columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
-            positions, velocities, iterations, errors, ratios = columns
-            seconds = time.perf_counter() - began
-            out.append(Steps(positions, velocities, iterations, errors, ratios, failure, seconds))
+            out.append(_steps(stepper, problem, states, divisor, began))
         return out
 
     def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:
@@ -129,13 +125,14 @@ def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Arr
     return problem.external_forces(first, last, state.positions)
 
 
-def _frames(
+def _steps(
     stepper: ImplicitStepper,
     problem: Problem,
     starts: Sequence[State | None],
     divisor: int,
-) -> tuple[list[tuple[Any, ...]], str]:
-    """The columns of `Steps` frame by frame, up to the first failure, and that one."""
+    began: float,
+) -> Steps:
+    """Frames up to the first failure, of ``divisor`` steps each."""
     frames: list[tuple[Any, ...]] = []
     nodes, state, failure = problem.mesh.coarse_nodes, problem.initial_state(), ""
     for start in starts:
@@ -152,5 +149,7 @@ def _frames(
             failure = failure or failure_of(result.status, ratio)
         frames.append((state.positions[nodes], state.velocities[nodes], iterations, error, ratio))
         if failure:
-            return frames, f"step {len(frames)}: {failure}"
-    return frames, ""
+            failure = f"step {len(frames)}: {failure}"
+            break
+    columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
+    return Steps(*columns, failure, time.perf_counter() - began)

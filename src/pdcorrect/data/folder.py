@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,21 +16,6 @@ from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _NAME = re.compile(rf"mesh-\d+{re.escape(SUFFIX)}")
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
-Folders = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-"""Of one data set, or of several."""
-
-
-def folders_of(data: Folders) -> tuple[Path, ...]:
-    """Folders of data sets whose files are read one after the other."""
-    if isinstance(data, (str, os.PathLike)):
-        return (Path(data),)
-    found = tuple(map(Path, data))
-    if not found:
-        raise InputError("no data set: expected the folder of one or more.")
-    for k, folder in enumerate(found):
-        if folder.resolve() in [other.resolve() for other in found[:k]]:
-            raise InputError(f"{folder}: expected each data set once.")
-    return found
 
 
 def all_shards(folder: str | Path) -> list[Path]:

@@ -6,12 +6,13 @@ from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
+from pdcorrect.data.folder import Damage, read_files, shard_paths
 from pdcorrect.data.schema import REFERENCE, Simulation
 from pdcorrect.data.shard_reader import ShardHeader, read_header, read_shard
 from pdcorrect.errors import InputError, require_extra
@@ -98,13 +99,11 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     Files are decoded when first needed and kept in memory.  No file stays open, so the
     data set may be forked, spawned and pickled; a pickled copy starts with an empty memory.
-    `batch` assembles many windows at once and is much quicker than
-    ``Batch.from_data_list``; `TrajectoryLoader` uses it.
+    `batch`, which `TrajectoryLoader` uses, is much quicker than ``Batch.from_data_list``.
 
     Parameters
     ----------
-    folder : path, or sequence of paths
-        Of the data set; of several, whose files follow one another.
+    folder : path
     split : str
     window : int
         k.
@@ -119,12 +118,10 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     skip_damaged : bool
         Leave out files that are damaged; all files are read once to find them.
     without : collection of str
-        Files of each data set that are left out, such as ``training/mesh-0042``.
+        Files that are left out, such as ``training/mesh-0042``.
 
     Attributes
     ----------
-    folders : tuple of Path
-        Of the data sets.
     headers : list of ShardHeader
         Of the files.
     damaged : dict of Path to str
@@ -133,15 +130,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     Raises
     ------
     InputError
-        If there is no such split, its simulations lack a run, or all are shorter than k; if a
-        folder comes twice.
+        If there is no such split, its simulations lack a run, or all are shorter than k.
     FileFormatError
         If a file is damaged; with ``skip_damaged`` if all are.
     """
 
     def __init__(
         self,
-        folder: Folders,
+        folder: str | Path,
         split: str,
         *,
         window: int = 1,
@@ -155,14 +151,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         super().__init__()
         if not isinstance(window, (int, np.integer)) or window < 1:
             raise InputError(f"window = {window}: expected 1 step or more, a whole number.")
-        self.folders, self.split = folders_of(folder), split
+        self.split = split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
         self.damaged: Damage = {}
-        paths = [path for each in self.folders for path in shard_paths(each, split, without)]
         self.headers = read_files(
-            paths, partial(read_header, verify=skip_damaged), self.damaged if skip_damaged else None
-        )
+            shard_paths(folder, split, without), partial(read_header, verify=skip_damaged),
+            self.damaged if skip_damaged else None,
+        )  # fmt: skip
         for header in self.headers:
             _check_runs(header, base, self.runs)
         counts = [max(0, steps - window + 1) for h in self.headers for steps in h.steps]
@@ -173,9 +169,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if not self._starts[-1]:
             longest = max((steps for h in self.headers for steps in h.steps), default=0)
-            names = ", ".join(map(str, self.folders))
             raise InputError(
-                f"{names}, {split}: no simulation has {window} steps, the longest {longest}: "
+                f"{folder}, {split}: no simulation has {window} steps, the longest {longest}: "
                 "expected a smaller window."
             )
         self._kept: OrderedDict[int, DecodedShard] = OrderedDict()
@@ -189,21 +184,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def get(self, idx: int) -> MeshSample:
         """Window ``idx``; its tensors are copies."""
-        ((file, simulation, frame),) = zip(*self._places(np.array([idx])), strict=True)
-        fields = self._window(int(file), int(simulation), int(frame))
-        return MeshSample(
-            num_nodes=len(fields["rest"]),
-            **{
-                name: self._numbers(name, [value]) if name in _OF_WINDOWS
-                else value.clone(memory_format=torch.contiguous_format)
-                for name, value in fields.items()
-            },
-        )  # fmt: skip
+        return self._batch(self._places(np.array([idx]))).get_example(0)
 
     def batch(self, indices: Sequence[int] | Numbers) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
-        places = zip(*(values.tolist() for values in self.places(indices)), strict=True)
-        windows = [self._window(*place) for place in places]
+        return self._batch(self.places(indices))
+
+    def _batch(self, places: tuple[Numbers, Numbers, Numbers]) -> Batch:
+        windows = [self._window(*map(int, place)) for place in zip(*places, strict=True)]
         nodes, cells, edges = (
             _ends([w[name].shape[-1] for w in windows])
             for name in ("mass", "cell_young", "edge_index")
@@ -215,7 +203,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             parts = [w[name] for w in windows]
             slices[name], raised[name] = nodes, torch.zeros_like(offsets)
             if name in _OF_WINDOWS:
-                batch[name], slices[name] = self._numbers(name, parts), graphs
+                dtype = torch.int64 if name in _WHOLE else self.dtype
+                batch[name], slices[name] = torch.tensor(parts, dtype=dtype), graphs
                 continue
             if name in _INDICES:
                 parts = [x + first for x, first in zip(parts, offsets.tolist(), strict=True)]
@@ -281,9 +270,6 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             "file": file, "mesh": header.number, "simulation": simulation, "frame": frame,
             "time": frame * header.time_step, "time_step": header.time_step,
         }  # fmt: skip
-
-    def _numbers(self, name: str, values: Sequence[float]) -> Tensor:
-        return torch.tensor(values, dtype=torch.int64 if name in _WHOLE else self.dtype)
 
     def _load(self, number: int) -> DecodedShard:
         wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))
