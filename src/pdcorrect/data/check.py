@@ -117,6 +117,7 @@ class _Check:
     meshes: dict[str, Path] = field(default_factory=dict)  # first file with a mesh, by digest
     bodies: dict[str, Path] = field(default_factory=dict)  # and with a material, too
     forces: dict[str, str] = field(default_factory=dict)  # where forces on a mesh came first
+    origins: dict[str, dict[str, Path]] = field(default_factory=dict)  # by code, and by device
 
     def note(self, path: Path, message: str, severity: Severity = "error") -> None:
         self.findings.append(Finding(path, severity, message))
@@ -177,6 +178,7 @@ class _Check:
             return
         for message in (*file_faults(shard), *self._config_faults(path, shard)):
             self.note(path, message)
+        self._origin(path, shard)
         self._repetitions(path, shard)
 
     def _config_faults(self, path: Path, shard: Shard) -> Iterator[str]:
@@ -197,6 +199,15 @@ class _Check:
         if not found and self.repeat:
             limit = float(shard.attributes["tolerance"]) * cell_size(shard)
             yield from step_faults(path, shard, self.repeat, limit)
+
+    def _origin(self, path: Path, shard: Shard) -> None:
+        """Changes of the code and of the device between files, where they tell."""
+        for what, told in (("code", "made by other code than {} (SHA-256 {:.12})"),
+                           ("device", "computed on another device than {}: {}")):  # fmt: skip
+            own, known = shard.provenance.get(what), self.origins.setdefault(what, {})
+            if own is not None and known.setdefault(own, path) == path and len(known) > 1:
+                first = self._short(next(iter(known.values())))
+                self.note(path, told.format(first, own), "warning")
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
