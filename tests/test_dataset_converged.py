@@ -272,7 +272,7 @@ def test_other_programs_get_it_without_single_steps(original, tmp_path):
 
 def test_a_step_corrector_is_not_trained_on_it(original):
     pytest.importorskip("torch")
-    from pdcorrect.training.recordings import load_recordings
+    from pdcorrect.training.scenes import load_recordings
 
     with pytest.raises(InputError, match="no single steps of run 'best'"):
         load_recordings(original, "training", "best")

@@ -585,7 +585,7 @@ def test_the_coarse_and_the_best_coarse_model_are_those_of_the_scene(runs):
 def test_models_of_the_best_coarse_model_are_trained_and_judged_on_an_import(runs, tmp_path):
     pytest.importorskip("torch")
     from pdcorrect.evaluation.evaluation import evaluate
-    from pdcorrect.training.recordings import load_recordings, make_problems
+    from pdcorrect.training.scenes import load_recordings, make_problems
 
     path = tmp_path / "evaluation" / "mesh-0000.h5"
     write_shard(path, shard_from_trajectories(*runs, split="evaluation", best=True))

@@ -20,7 +20,7 @@ from pdcorrect.training.progress import (  # noqa: E402
     write_checkpoint,
 )
 from pdcorrect.training.recipe import Loss, Rate, TrainingConfig  # noqa: E402
-from pdcorrect.training.recordings import _mean_square, load_recordings  # noqa: E402
+from pdcorrect.training.scenes import _mean_square, load_recordings  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 

@@ -17,8 +17,7 @@ from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup, joined  # noqa: E402
-from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups, base_errors, load_recordings  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402

@@ -41,8 +41,7 @@ from pdcorrect.training.progress import (
     write_checkpoint,
 )
 from pdcorrect.training.recipe import Stage, TrainingConfig
-from pdcorrect.training.recordings import Recording, data_hash, load_recordings
-from pdcorrect.training.scenes import SceneGroups
+from pdcorrect.training.scenes import Recording, SceneGroups, data_hash, load_recordings
 from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import OneStepBatches, StepWindows, seed_of

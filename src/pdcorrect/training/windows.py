@@ -25,7 +25,7 @@ from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses, network_precision
 from pdcorrect.training.recipe import Stage
-from pdcorrect.training.recordings import Recording, base_errors
+from pdcorrect.training.scenes import Recording, base_errors
 
 Numbers = NDArray[np.int64]
 
