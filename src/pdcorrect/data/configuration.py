@@ -113,58 +113,41 @@ class ExtraSplit(Split):
 
 
 class DatasetConfig(TomlConfig):
-    """A data set, up to the machine that computes it.
-
-    Attributes
-    ----------
-    family
-        Bodies, see `pdcorrect.data.families`.
-    setting
-        "as-published": nodal masses rho times cell volume, the published volume weight,
-        forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
-        sum to rho V, the volume weight of the material asked for, loads integrated on each
-        mesh, `pdcorrect.scene.trained_coarse` beside the plain model, its element in the
-        reference.  Both step by backward Euler.  "converged": as exact, with generalised-alpha,
-        `pdcorrect.best_coarse`, and a reference at a quarter of the step; no single steps.
-    coarse_nodes
-        Fewest and most nodes of a coarse mesh; the family's own by default.
-    cell_size, step
-        m and s.
-    tolerance
-        Of each time step, of the coarse cell size.
-    dtype
-        In which positions and forces are stored.
-    motion, mixed
-        One of them.  Of a list of motions each simulation draws one or two.
-    validation_share
-        Of the training meshes.
-    converged_steps
-        Steps by which the time-converged reference of the evaluation split divides
-        ``step``; 0 leaves it out.
-    finest_meshes
-        On so many meshes of the evaluation split, a run with cells half as long as the
-        reference's tells how exact it is.
-    """
+    """A data set, up to the machine that computes it."""
 
     name: Name
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]
-    family: FamilyName
+    family: FamilyName  # bodies, see `pdcorrect.data.families`
+    # "as-published": nodal masses rho times cell volume, the published volume weight, forces on the
+    # coarse nodes, plain elements on every mesh.  "exact": masses that sum to rho V, the volume
+    # weight of the material asked for, loads integrated on each mesh,
+    # `pdcorrect.scene.trained_coarse` beside the plain model, its element in the reference.  Both
+    # step by backward Euler.  "converged": as exact, with generalised-alpha,
+    # `pdcorrect.best_coarse`, and a reference at a quarter of the step; no single steps
     setting: Literal["as-published", "exact", "converged"]
+    # fewest and most nodes of a coarse mesh; the family's own by default
     coarse_nodes: NodeCounts | None = None
+    # m and s
     cell_size: Positive = 0.05
     step: Positive = 0.01
     frames: PositiveCount
+    # of each time step, of the coarse cell size
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
-    dtype: Literal["float32", "float64"] = "float32"
+    dtype: Literal["float32", "float64"] = "float32"  # in which positions and forces are stored
     material: MaterialRange
+    # one of them.  Of a list of motions each simulation draws one or two
     motion: MotionRange | None = None
     mixed: tuple[MotionRange, ...] | None = None
     reference: Reference = Reference()
+    # steps by which the time-converged reference of the evaluation split divides ``step``; 0 leaves
+    # it out
     converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
+    # on so many meshes of the evaluation split, a run with cells half as long as the reference's
+    # tells how exact it is
     finest_meshes: Count = 0
     training: Split
     evaluation: Split
-    validation_share: Share = 0.1
+    validation_share: Share = 0.1  # of the training meshes
     extra: tuple[ExtraSplit, ...] = ()
 
     @property

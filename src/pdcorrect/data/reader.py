@@ -331,19 +331,10 @@ def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> N
 class TrajectoryLoader:
     """Batches of windows in random order, epoch after epoch.
 
-    Each epoch shuffles the files, gives every rank an equal share of their windows (the
-    last few, fewer than ranks, are left out), and shuffles the windows within blocks of
-    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone.
-
-    Parameters
-    ----------
-    dataset : TrajectoryDataset
-    batch_size : int
-    seed : int
-    block : int, optional
-        Files; by default as many as fit into the data set's cache.
-    rank, world_size : int
-        Of distributed training.
+    Each epoch shuffles the files, gives every rank of ``world_size`` an equal share of their
+    windows (the last few, fewer than ranks, are left out), and shuffles the windows within blocks
+    of ``block`` successive files, by default as many as fit into the data set's cache.  Order
+    depends on seed, epoch, rank and ``world_size`` alone.
 
     Attributes
     ----------
