@@ -18,8 +18,7 @@ from pdcorrect.data.configuration import CONVERGED_DIVISOR, DatasetConfig
 from pdcorrect.data.export import export_meshgraphnet, export_vtu
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST, write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import MANIFEST, read_shard, write_shard
 from pdcorrect.data.simulate import simulate
 from pdcorrect.data.summary import dataset_info
 from pdcorrect.data.workers import make_engines

@@ -21,8 +21,7 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import MANIFEST, read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.data.workers import Workers, local_scheduler, make_engines
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
@@ -279,7 +278,7 @@ def test_folders_of_other_configurations_and_files_of_others_are_never_overwritt
     (foreign / "config.toml").write_text(other.to_toml())
     with pytest.raises(InputError, match=r"mesh-0000\.h5"):
         generate(other, foreign)
-    monkeypatch.setattr("pdcorrect.data.shard_reader.VERSION", 0)
+    monkeypatch.setattr("pdcorrect.data.schema.VERSION", 0)
     with pytest.raises(FileFormatError, match="version 1"):
         generate(config, folder)
 

@@ -12,8 +12,7 @@ from conftest import beam
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
 from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
-from pdcorrect.data.schema import write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import read_shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.scene import trained_coarse

@@ -11,8 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard, write_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402

@@ -24,8 +24,9 @@ from pdcorrect.data.schema import (
     Array,
     Shard,
     Simulation,
+    read_header,
+    read_shard,
 )
-from pdcorrect.data.shard_reader import read_header, read_shard
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 

@@ -151,5 +151,5 @@ def _steps(
         if failure:
             failure = f"step {len(frames)}: {failure}"
             break
-    columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
-    return Steps(*columns, failure, time.perf_counter() - began)
+    x, v, counts, errors, ratios = (np.stack(column) for column in zip(*frames, strict=True))
+    return Steps(x, v, counts, errors, ratios, failure, time.perf_counter() - began)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths, splits_of
-from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation, read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.graph import node_means, tetrahedra, velocities
 from pdcorrect.io.vtk import write_vtu_series

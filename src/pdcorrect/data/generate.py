@@ -17,8 +17,7 @@ from pdcorrect._files import clear_parts, make_folder, write_text
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.shard_reader import read_header
+from pdcorrect.data.schema import CONFIG, MANIFEST, read_header
 from pdcorrect.data.simulate import lacking, work_per_node
 from pdcorrect.data.workers import ONE_WORKER, Workers, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.data.folder import Damage, read_files, shard_paths
-from pdcorrect.data.schema import REFERENCE, Simulation
-from pdcorrect.data.shard_reader import ShardHeader, read_header, read_shard
+from pdcorrect.data.schema import REFERENCE, ShardHeader, Simulation, read_header, read_shard
 from pdcorrect.errors import InputError, require_extra
 from pdcorrect.fem.graph import mesh_edges, node_means, velocities
 

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdcorrect.data.folder import Damage, all_shards, read_files, splits_of
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation, read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard, read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.rollouts import Outcome

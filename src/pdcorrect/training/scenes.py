@@ -18,8 +18,7 @@ from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.batch_hybrid import HybridLayer
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Base, Problem
