@@ -36,7 +36,6 @@ def import_trajectories(
     folder: str | Path,
     *,
     coarse: Sequence[str | Path] = (),
-    dataset: str | None = None,
     split: str = "training",
     number: int = 0,
     best: bool = False,
@@ -50,11 +49,9 @@ def import_trajectories(
         of `shard_from_arrays` by their names and one simulation ``reference``, or several as
         ``reference_0``, ``reference_1``, …; likewise ``forces``, ``coarse``, ``predictions``.
     folder : path
-        Of the data set; created if missing.
+        Of the data set, which has its name; created if missing.
     coarse : sequence of path
         Trajectories of the coarse model, as many as sources.
-    dataset : str, optional
-        Its name; the folder's by default.
     split, number, best
         See `shard_from_arrays`.
 
@@ -73,7 +70,7 @@ def import_trajectories(
     if path.exists():
         raise InputError(f"{path} exists already: choose another number, or delete it first.")
     about: dict[str, Any] = {
-        "dataset": dataset or Path(folder).resolve().name, "split": split, "number": number,
+        "dataset": Path(folder).resolve().name, "split": split, "number": number,
         "best": best,
     }  # fmt: skip
     files = [Path(source) for source in sources]
