@@ -30,8 +30,7 @@ from pdcorrect.data.schema import (
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
-_DIGITS = 6
-"""Decimals, in cells, to which meshes are compared."""
+_DIGITS = 6  # decimals, in cells, to which meshes are compared
 _OTHERS = (CONFIG, MANIFEST, "README.md")
 Severity = Literal["error", "warning"]
 

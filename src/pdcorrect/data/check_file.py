@@ -30,10 +30,8 @@ _STEP_ERROR = 10.0
 """Largest distance from a step that is taken again, in tolerances of the data set."""
 _ROUNDINGS = 16.0
 """The same for rounding, in spacings of the largest coordinate: a step starts from two frames."""
-_SLACK = 1e-6
-"""Relative, for tolerances of numbers that are stored as float32."""
-_LOADS_COMPARED = 8
-"""Steps of each simulation, the first and the last among them."""
+_SLACK = 1e-6  # relative, for tolerances of numbers that are stored as float32
+_LOADS_COMPARED = 8  # steps of each simulation, the first and the last among them
 _LAST_DIGITS = 1e-14
 """Relative: by so much exponentials differ between processors, and with them what is drawn."""
 

@@ -22,8 +22,7 @@ from pdcorrect.data.simulate import lacking, work_per_node
 from pdcorrect.data.workers import ONE_WORKER, Workers, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
-_LONGEST = 4
-"""Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
+_LONGEST = 4  # most of the work of a full batch of usual simulations that a GPU takes at once
 
 OnBegin = Callable[[int, int, Sequence[str]], None]
 """Called before anything is computed: how many simulations of how many are there, and the names

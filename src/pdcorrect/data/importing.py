@@ -34,8 +34,7 @@ from pdcorrect.solvers.rollout import rollout
 from pdcorrect.state import State
 
 SETTING = "imported"
-_AT_REST = 1e-6
-"""Of a cell's shortest edge: how far what rests may be from the rest shape."""
+_AT_REST = 1e-6  # of a cell's shortest edge: how far what rests may be from the rest shape
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 """Of the largest coordinate: the same, of positions that were stored as float32."""
 

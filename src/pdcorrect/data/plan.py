@@ -30,8 +30,7 @@ from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
 
-_DRAWS = 10_000
-"""Bodies that are drawn for a mesh before giving up on one that is not there yet."""
+_DRAWS = 10_000  # bodies that are drawn for a mesh before giving up on one that is not there yet
 
 
 @dataclass(frozen=True)

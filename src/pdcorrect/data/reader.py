@@ -28,8 +28,7 @@ CACHE_BYTES = 4 * 2**30
 """Default bound of the decoded files that a process keeps, bytes."""
 _MODULI = ("young", "poisson", "density")
 _WHOLE = ("file", "mesh", "simulation", "frame")
-_OF_WINDOWS = (*_WHOLE, "time", "time_step")
-"""One number a window."""
+_OF_WINDOWS = (*_WHOLE, "time", "time_step")  # one number a window
 _INDICES = ("cells", "edge_index")
 
 

@@ -81,8 +81,7 @@ _BEST = Case("best coarse PD", "pd", 1, "enhanced")
 _FINE_BEST = Case("fine best PD", "pd", 4, "enhanced")
 _FINE_TRAINED = Case("fine PD as trained", "pd", 4, "best")
 """The reference that correctors of the base "best" have learned from."""
-_TRAINED = Case("coarse PD as trained", "pd", 1, "best")
-"""The coarse model that those correct."""
+_TRAINED = Case("coarse PD as trained", "pd", 1, "best")  # the coarse model that those correct
 
 
 def with_learned(scene: Scene) -> Scene:

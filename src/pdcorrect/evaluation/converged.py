@@ -31,12 +31,10 @@ TIME_ERROR, MESH_ERROR, MESH_CHECK = "time_error", "mesh_error", "mesh_error_fro
 """Attributes of runs whose own error was asked for."""
 
 INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
-_MOST_CELLS = 60_000
-"""Of a mesh that is only for the estimate of another's error."""
+_MOST_CELLS = 60_000  # of a mesh that is only for the estimate of another's error
 FINER = 2
 """Times as many cells along each axis, and substeps, as a run whose error is estimated."""
-_SAME = 1e-9
-"""Of the cell size, for states that are the same."""
+_SAME = 1e-9  # of the cell size, for states that are the same
 
 OnRun = Callable[[str, int, int], None]
 """Called with what is computed, its frame, and their number."""

@@ -63,10 +63,8 @@ _OVERLAID = (
     ("#cccccc", "#555555"),
 )
 """Of faces and edges: blue, green, red, and three more."""
-_STILL, _FILM = 1600, 1000
-"""Default widths of pictures and films, pixels."""
-_ROW = 5
-"""Panels side by side in a picture, at most."""
+_STILL, _FILM = 1600, 1000  # default widths of pictures and films, pixels
+_ROW = 5  # panels side by side in a picture, at most
 
 
 def render(

@@ -304,8 +304,7 @@ def _is_intact(dataset: Any, index: int) -> bool:
         return False
 
 
-_ROUNDING = 1e-9
-"""Of a cell size: the same mesh, made on another machine."""
+_ROUNDING = 1e-9  # of a cell size: the same mesh, made on another machine
 
 
 def problem_of(run: Trajectory) -> Problem:

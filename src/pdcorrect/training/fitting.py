@@ -14,8 +14,7 @@ from pdcorrect.corrector.normaliser import TIME_STEP, RunningMoments
 from pdcorrect.errors import InputError
 from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 
-_AT_ONCE = 32
-"""Windows."""
+_AT_ONCE = 32  # windows
 
 
 @torch.no_grad()

@@ -157,8 +157,7 @@ def rounding(positions: Array) -> float:
 
 Frames = NDArray[np.int64]
 
-_LEAST_FREE = 0.2
-"""Of a GPU's memory, when a group is set up."""
+_LEAST_FREE = 0.2  # of a GPU's memory, when a group is set up
 
 
 class SceneGroup:

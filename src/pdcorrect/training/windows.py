@@ -29,8 +29,7 @@ from pdcorrect.training.scenes import Recording, base_errors
 
 Numbers = NDArray[np.int64]
 
-_SHARE_OF_DEVICE = 0.3
-"""Of a GPU's free memory, which the windows may fill."""
+_SHARE_OF_DEVICE = 0.3  # of a GPU's free memory, which the windows may fill
 _FRAMES = ("positions", "velocities", "predictions", "forces")
 _BODY = ("rest", "free", "mass", "young", "poisson", "density", "cell_size", "time_step")
 _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
