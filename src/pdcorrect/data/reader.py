@@ -73,27 +73,8 @@ class DecodedShard:
 class TrajectoryDataset(Dataset):  # type: ignore[misc]
     """Windows of ``window`` + 1 successive reference frames of a split's simulations.
 
-    Item i is a `MeshSample` of a mesh with n nodes, E directed edges and c cells, for a
-    window of k steps from frame t on:
-
-    ==============================  =========================================================
-    ``positions``                   (n, 3), the reference in frame t, m
-    ``velocities``                  (n, 3), (p_t - p_(t-1)) / h, zero in frame 0, m/s
-    ``targets``                     (n, k, 3), the reference in frames t + 1 .. t + k, m
-    ``predictions``                 (n, k, 3), one step of the base model from the reference
-                                    in frames t .. t + k - 1, not from its own last one, m;
-                                    without ``base`` absent
-    ``forces``                      (n, k, 3), loads of these steps, N
-    ``run_NAME``                    (n, k + 1, 3), the run's own rollout in frames t .. t + k, m
-    ``rest``, ``free``, ``mass``    (n, 3), m; (n, 3) bool; (n,), kg
-    ``young``, ``poisson``,         (n,), means over the cells of a node, Pa, -, kg/m3; with
-    ``density``                     ``cell_`` before the name (c,), for each cell
-    ``edge_index``                  (2, E), each edge of a cell once in both directions
-    ``cells``                       (c, 8), VTK order
-    ``file``, ``mesh``,             (1,), number of the file in `headers`, of the mesh in its
-    ``simulation``, ``frame``       split, of the simulation on the mesh, and t
-    ``time``, ``time_step``         (1,), of frame t, and h, s
-    ==============================  =========================================================
+    Item i is a `MeshSample` whose fields ``docs/datasets.md`` lists, of ``dtype`` but for indices
+    and masks.
 
     Files are decoded when first needed and kept in memory.  No file stays open, so the
     data set may be forked, spawned and pickled; a pickled copy starts with an empty memory.
@@ -112,7 +93,6 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     cache_bytes : int
         Of the decoded files that are kept, by `shard_bytes`; the last one read always is.
     dtype : torch.dtype
-        Of everything but indices and masks.
     skip_damaged : bool
         Leave out files that are damaged; all files are read once to find them.
     without : collection of str

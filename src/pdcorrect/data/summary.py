@@ -43,10 +43,9 @@ class RunInfo:
 class SplitInfo:
     """A split, or the whole data set."""
 
-    # frames over all simulations, without the rest shape
     meshes: int
     simulations: int
-    frames: int
+    frames: int  # over all simulations, without the rest shape
     bytes: int
     # smallest and largest of its meshes; Pa, dimensionless, kg/m3
     nodes: Range
