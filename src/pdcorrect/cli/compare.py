@@ -108,11 +108,8 @@ def _finer(scene: Scene, count: int) -> Trajectory | None:
 
 
 def _print_table(comparison: Comparison) -> None:
-    from rich.box import SIMPLE_HEAD
-
     from pdcorrect.evaluation import report
 
     rows = report.table(comparison)
     cells = [list(row.values()) for row in rows]
-    style = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False}
-    common.print_table(comparison.scene.name, list(rows[0]), cells, **style)
+    common.print_table(comparison.scene.name, list(rows[0]), cells)
