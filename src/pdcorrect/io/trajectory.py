@@ -374,7 +374,7 @@ def _entries(state: State, values: Mapping[str, Any]) -> dict[str, Any]:
 def _file_attributes(trajectory: Trajectory) -> dict[str, Any]:
     """Texts have a fixed length, so that they lie under the checksum of the file's index."""
     own = {"format": FORMAT, "scene_toml": trajectory.scene_toml, "pdcorrect_version": __version__}
-    texts = {name: text.encode() for name, text in (trajectory.attributes | own).items()}
+    texts = {name: text.encode() for name, text in {**trajectory.attributes, **own}.items()}
     fixed = {
         name: np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
         for name, data in texts.items()
