@@ -85,7 +85,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     folder : path
     split : str
     window : int
-        k.
+        k, steps of a window.
     base : str, optional
         Run whose predictions are given, "plain", "best" or "total-mass"; None for data without.
     runs : sequence of str
