@@ -30,8 +30,7 @@ from pdcorrect.corrector.gate import Gate
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import shard_paths
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import REFERENCE
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import REFERENCE, read_shard
 from pdcorrect.data.simulate import models, rebuilt_problems
 from pdcorrect.evaluation.evaluation import saved_candidates
 from pdcorrect.fem.problem import Problem, coarse_model, discretise

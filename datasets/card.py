@@ -9,8 +9,7 @@ from pathlib import Path
 from pdcorrect.data.configuration import EVALUATION, DatasetConfig, MotionRange
 from pdcorrect.data.families import PUBLISHED
 from pdcorrect.data.folder import all_shards
-from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import BEST, CONFIG, CONVERGED, MANIFEST, PLAIN, read_shard
 from pdcorrect.data.summary import DatasetInfo, SplitInfo
 from pdcorrect.errors import FileFormatError, InputError
 

@@ -8,6 +8,7 @@ import pdcorrect as pc
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.plan import draw_scene, make_plan
 from pdcorrect.data.schema import Run, Shard, Simulation, write_shard
+from pdcorrect.data.simulate import arrays_of
 
 CONFIG = {
     "name": "sample",
@@ -36,20 +37,13 @@ def sample_config(**changes):
 def sample_shard(config, mesh):
     """The file of a `MeshPlan`, with the mesh's own streams of random numbers."""
     problem = pc.discretise(draw_scene(config, mesh, 0))
-    count = len(problem.cells)
     return Shard(
         attributes={
             "dataset": config.name, "split": mesh.split, "number": mesh.number,
             "setting": config.setting, "config_hash": config.hash(), "time_step": mesh.step,
             "tolerance": config.tolerance,
         },
-        points=problem.positions,
-        cells=problem.cells,
-        free=problem.free,
-        mass=problem.mass,
-        young=np.full(count, mesh.young),
-        poisson=np.full(count, mesh.poisson),
-        density=np.full(count, mesh.density),
+        **arrays_of(problem),
         simulations=tuple(
             sample_simulation(config, mesh, problem, k) for k in range(mesh.simulations)
         ),

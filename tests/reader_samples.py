@@ -1,7 +1,5 @@
 """Small synthetic data sets: smooth motions of box meshes, without a solver."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from conftest import box_mesh
@@ -80,8 +78,3 @@ def dataset(folder, splits=("training", "validation", "evaluation"), dtype="floa
     for split in splits:
         write(folder, [shard(i, split, cells=c, **changes) for i, c in enumerate(SHAPES)], dtype)
     return folder
-
-
-def changed(one, **changes):
-    """The same shard with other arrays."""
-    return replace(one, **changes)

@@ -19,14 +19,7 @@ from pdcorrect.corrector.gate import Reason
 from pdcorrect.errors import InputError
 from pdcorrect.evaluation import compare as compare_module
 from pdcorrect.evaluation import report
-from pdcorrect.evaluation.compare import case_stepper
-from pdcorrect.evaluation.comparison_cases import (
-    CASES,
-    HEX27,
-    LEARNED,
-    Case,
-    cases_for,
-)
+from pdcorrect.evaluation.compare import CASES, HEX27, LEARNED, Case, case_stepper, cases_for
 from pdcorrect.evaluation.report import notes, refused_corrections
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -16,8 +16,7 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.check_file import same_scene
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import make_plan
-from pdcorrect.data.schema import Run, write_shard
-from pdcorrect.data.shard_reader import read_header, read_shard
+from pdcorrect.data.schema import Run, read_header, read_shard, write_shard
 from pdcorrect.errors import InputError
 
 FIRST = "training/mesh-0000.h5"

@@ -18,8 +18,7 @@ from pdcorrect.data.configuration import CONVERGED_DIVISOR, DatasetConfig
 from pdcorrect.data.export import export_meshgraphnet, export_vtu
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST, write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import MANIFEST, read_shard, write_shard
 from pdcorrect.data.simulate import simulate
 from pdcorrect.data.summary import dataset_info
 from pdcorrect.data.workers import make_engines
@@ -172,7 +171,7 @@ def test_batches_compute_the_same(original):
 
     plan = make_plan(CONFIG)[-1]
     engine = Batched("cpu", CONFIG.tolerance, adds_up=True)
-    (found,) = simulate(CONFIG, [plan], Engines(engine, engine, engine))
+    (found,) = simulate(CONFIG, [plan], Engines(engine, engine))
     wanted = read_shard(original / f"{plan.name}.h5")
     for mine, other in zip(found.simulations, wanted.simulations, strict=True):
         assert mine.runs.keys() == other.runs.keys()
@@ -272,7 +271,7 @@ def test_other_programs_get_it_without_single_steps(original, tmp_path):
 
 def test_a_step_corrector_is_not_trained_on_it(original):
     pytest.importorskip("torch")
-    from pdcorrect.training.recordings import load_recordings
+    from pdcorrect.training.scenes import load_recordings
 
     with pytest.raises(InputError, match="no single steps of run 'best'"):
         load_recordings(original, "training", "best")

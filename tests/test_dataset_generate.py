@@ -21,8 +21,7 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import MANIFEST, read_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.data.workers import Workers, local_scheduler, make_engines
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
@@ -141,7 +140,7 @@ def test_batches_agree_with_one_by_one():
     batched = Batched("cpu", config.tolerance, most=4)
     alone = OneByOne("pd", config.tolerance)
     found = [
-        simulate(config, plans, Engines(engine, engine, engine)) for engine in (batched, alone)
+        simulate(config, plans, Engines(engine, engine)) for engine in (batched, alone)
     ]  # fmt: skip
     for one, other in zip(*found, strict=True):
         for a, b in zip(one.simulations, other.simulations, strict=True):
@@ -174,14 +173,14 @@ def test_a_rejected_load_is_noted_and_drawn_again():
     config = small(frames=1, training={"meshes": 1, "simulations": 2})
     plan = make_plan(config)[0]
     engine = Failing(2)
-    (shard,) = simulate(config, [plan], Engines(engine, engine, engine))
+    (shard,) = simulate(config, [plan], Engines(engine, engine))
     first, second = shard.simulations
     assert (first.attempt, second.attempt) == (2, 0)
     assert first.rejected == ("reference, step 1: broke",) * 2
     assert first.scene_toml == draw_scene(config, plan, 0, attempt=2).to_toml()
     engine = Failing(1000)
     with pytest.raises(ConvergenceError, match="20 loads"):
-        simulate(config, [plan], Engines(engine, engine, engine))
+        simulate(config, [plan], Engines(engine, engine))
 
 
 def test_two_workers_write_the_same_as_one(generated, tmp_path):
@@ -279,7 +278,7 @@ def test_folders_of_other_configurations_and_files_of_others_are_never_overwritt
     (foreign / "config.toml").write_text(other.to_toml())
     with pytest.raises(InputError, match=r"mesh-0000\.h5"):
         generate(other, foreign)
-    monkeypatch.setattr("pdcorrect.data.shard_reader.VERSION", 0)
+    monkeypatch.setattr("pdcorrect.data.schema.VERSION", 0)
     with pytest.raises(FileFormatError, match="version 1"):
         generate(config, folder)
 

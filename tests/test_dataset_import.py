@@ -12,8 +12,7 @@ from conftest import beam
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
 from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
-from pdcorrect.data.schema import write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import read_shard, write_shard
 from pdcorrect.errors import FileFormatError, InputError, MeshError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.scene import trained_coarse
@@ -585,7 +584,7 @@ def test_the_coarse_and_the_best_coarse_model_are_those_of_the_scene(runs):
 def test_models_of_the_best_coarse_model_are_trained_and_judged_on_an_import(runs, tmp_path):
     pytest.importorskip("torch")
     from pdcorrect.evaluation.evaluation import evaluate
-    from pdcorrect.training.recordings import load_recordings, make_problems
+    from pdcorrect.training.scenes import load_recordings, make_problems
 
     path = tmp_path / "evaluation" / "mesh-0000.h5"
     write_shard(path, shard_from_trajectories(*runs, split="evaluation", best=True))

@@ -11,8 +11,7 @@ from dataset_samples import with_run, with_simulation
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import manifest_content
-from pdcorrect.data.schema import write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import read_shard, write_shard
 
 TINY = Path(__file__).parent.parent / "datasets" / "tiny"
 FILE = "training/mesh-0000.h5"

@@ -12,8 +12,7 @@ from conftest import CLAMPED, GRAVITY, box_mesh
 from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import shard_from_trajectories
 from pdcorrect.data.importing import portable
-from pdcorrect.data.schema import write_shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import read_shard, write_shard
 from pdcorrect.data.simulate import discretise_stored, rebuilt_problems
 from pdcorrect.errors import MeshError
 from pdcorrect.scene import trained_coarse

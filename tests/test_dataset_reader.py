@@ -16,7 +16,7 @@ from torch_geometric.loader import DataLoader  # noqa: E402
 
 import reader_samples as samples  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.fem.graph import mesh_edges, node_means  # noqa: E402
 

@@ -14,7 +14,7 @@ pytest.importorskip("torch_geometric")
 
 import pdcorrect as pc  # noqa: E402
 from evaluation_samples import STEP, TINY, as_stored, fake, perfect, untrained  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard  # noqa: E402
 from pdcorrect.data.simulate import rebuilt_problems  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.evaluation import tables  # noqa: E402

@@ -16,8 +16,7 @@ import pdcorrect as pc  # noqa: E402
 from conftest import beam  # noqa: E402
 from evaluation_samples import TINY, Fake, as_stored, fake, perfect, untrained  # noqa: E402
 from pdcorrect.corrector.gate import Gate, Reason  # noqa: E402
-from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard, write_shard  # noqa: E402
 from pdcorrect.errors import ConvergenceError, InputError  # noqa: E402
 from pdcorrect.evaluation.evaluation import (  # noqa: E402
     EvaluatedRun,

@@ -27,7 +27,7 @@ from conftest import beam  # noqa: E402
 from dataset_configs import small  # noqa: E402
 from pdcorrect.cli.program import TERMINATED  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
-from pdcorrect.data.shard_reader import read_header, read_shard  # noqa: E402
+from pdcorrect.data.schema import read_header, read_shard  # noqa: E402
 from pdcorrect.io.trajectory import load_trajectory  # noqa: E402
 
 NAMESPACE = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]

@@ -36,7 +36,7 @@ from pdcorrect.corrector.model_io import (  # noqa: E402
 from pdcorrect.data.check import check_dataset  # noqa: E402
 from pdcorrect.data.configuration import DatasetConfig  # noqa: E402
 from pdcorrect.data.folder import all_shards  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, InputError  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
 from test_corrector_model import assert_same_corrector  # noqa: E402

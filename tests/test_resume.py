@@ -23,7 +23,7 @@ from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
 from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.errors import FileFormatError, InputError, OutputError
 from pdcorrect.evaluation import report
-from pdcorrect.evaluation.comparison_cases import CASES
+from pdcorrect.evaluation.compare import CASES
 from pdcorrect.io import trajectory as files
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory
 from pdcorrect.solvers.rollout import StepLog, continue_from, differences

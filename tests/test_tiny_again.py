@@ -15,8 +15,7 @@ from pdcorrect.data.check_file import same_scene
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.generate import generate
 from pdcorrect.data.plan import draw_scene, make_plan
-from pdcorrect.data.schema import MANIFEST
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import MANIFEST, read_shard
 from pdcorrect.data.simulate import simulate
 from pdcorrect.data.workers import make_engines
 

@@ -97,8 +97,7 @@ def test_files_without_its_runs_are_told_and_made_again(published, tmp_path, pre
     from pdcorrect.data.check import check_dataset
     from pdcorrect.data.configuration import DatasetConfig
     from pdcorrect.data.generate import generate
-    from pdcorrect.data.schema import write_shard
-    from pdcorrect.data.shard_reader import read_shard
+    from pdcorrect.data.schema import read_shard, write_shard
 
     folder = tmp_path / "old"
     shutil.copytree(published, folder)

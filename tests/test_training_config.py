@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard  # noqa: E402
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError  # noqa: E402
 from pdcorrect.training.losses import BaseErrors, body_losses, mean_of  # noqa: E402
 from pdcorrect.training.optimisation import rate_at  # noqa: E402
@@ -20,7 +20,7 @@ from pdcorrect.training.progress import (  # noqa: E402
     write_checkpoint,
 )
 from pdcorrect.training.recipe import Loss, Rate, TrainingConfig  # noqa: E402
-from pdcorrect.training.recordings import _mean_square, load_recordings  # noqa: E402
+from pdcorrect.training.scenes import _mean_square, load_recordings  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 

@@ -9,8 +9,7 @@ pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
 from dataset_samples import with_run, with_simulation  # noqa: E402
-from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard, write_shard  # noqa: E402
 
 
 def without(name):

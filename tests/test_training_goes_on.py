@@ -12,8 +12,7 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.corrector.model_io import load_model, save_model  # noqa: E402
 from pdcorrect.corrector.normaliser import RunningMoments  # noqa: E402
-from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard, write_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from training_samples import weights  # noqa: E402

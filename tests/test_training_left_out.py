@@ -16,8 +16,7 @@ from pdcorrect.data.plan import make_plan  # noqa: E402
 from pdcorrect.data.reader import TrajectoryDataset  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
-from pdcorrect.training.recordings import load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, load_recordings  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402
 

@@ -22,7 +22,7 @@ from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402
 from pdcorrect.training.progress import read_checkpoint  # noqa: E402
 from pdcorrect.training.recipe import TrainingConfig  # noqa: E402
-from pdcorrect.training.recordings import load_recordings  # noqa: E402
+from pdcorrect.training.scenes import load_recordings  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.validation import Scores, Validation  # noqa: E402
 from pdcorrect.training.windows import OneStepBatches, seed_of  # noqa: E402

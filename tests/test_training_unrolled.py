@@ -11,14 +11,12 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("torch_geometric")
 
 import training_samples as samples  # noqa: E402
-from pdcorrect.data.schema import write_shard  # noqa: E402
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard, write_shard  # noqa: E402
 from pdcorrect.errors import InputError  # noqa: E402
 from pdcorrect.metrics import error_corrected  # noqa: E402
 from pdcorrect.scene import Scene  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup, joined  # noqa: E402
-from pdcorrect.training.recordings import base_errors, load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
+from pdcorrect.training.scenes import SceneGroup, SceneGroups, base_errors, load_recordings  # noqa: E402
 from pdcorrect.training.training import Training  # noqa: E402
 from pdcorrect.training.unrolled import Rollouts, UnrolledBatches, unroll  # noqa: E402
 from pdcorrect.training.validation import Validation  # noqa: E402

@@ -16,7 +16,7 @@ from pdcorrect.corrector.features import (  # noqa: E402
     FeatureView,
     values,
 )
-from pdcorrect.data.shard_reader import read_shard  # noqa: E402
+from pdcorrect.data.schema import read_shard  # noqa: E402
 from pdcorrect.training.distributed import ProcessGroup  # noqa: E402
 from pdcorrect.training.fitting import fit_normaliser, widen_ranges  # noqa: E402
 from pdcorrect.training.optimisation import Optimiser  # noqa: E402

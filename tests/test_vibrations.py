@@ -16,8 +16,11 @@ pytest.importorskip("torch_geometric")
 import training_samples as samples  # noqa: E402
 from pdcorrect.training import scenes  # noqa: E402
 from pdcorrect.training.losses import MODES, Vibrations, body_modes  # noqa: E402
-from pdcorrect.training.recordings import load_recordings  # noqa: E402
-from pdcorrect.training.scenes import SceneGroup, SceneGroups  # noqa: E402
+from pdcorrect.training.scenes import (  # noqa: E402
+    SceneGroup,
+    SceneGroups,
+    load_recordings,
+)
 from pdcorrect.training.unrolled import Rollouts, unroll  # noqa: E402
 
 STEP = 0.01  # s

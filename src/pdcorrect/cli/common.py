@@ -108,15 +108,23 @@ def console() -> Any:
 
 
 def print_table(
-    title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], **style: Any
+    title: str,
+    headings: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    names: int = 1,
+    markdown: bool = False,
 ) -> None:
-    """Names in the first column, which is folded where there is little room, then numbers."""
+    """Columns of names, of which the first is folded where there is little room, then numbers."""
+    from rich.box import MARKDOWN, SIMPLE_HEAD
     from rich.table import Table
 
-    table = Table(title=title, **style)
+    table = Table(
+        title=title, title_justify="left", title_style="bold", pad_edge=markdown,
+        box=MARKDOWN if markdown else SIMPLE_HEAD, padding=(0, 1) if markdown else (0, 1, 0, 0),
+    )  # fmt: skip
     table.add_column(headings[0], min_width=12, overflow="fold")
-    for heading in headings[1:]:
-        table.add_column(heading, justify="right", no_wrap=True)
+    for k, heading in enumerate(headings[1:], 1):
+        table.add_column(heading, justify="left" if k < names else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     console().print(table)

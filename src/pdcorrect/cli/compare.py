@@ -53,7 +53,6 @@ def compare(
     from pdcorrect.evaluation import compare as evaluate
     from pdcorrect.evaluation import converged as reference
     from pdcorrect.evaluation import report
-    from pdcorrect.evaluation.comparison_cases import HEX27, cases_for
     from pdcorrect.scene import Scene
 
     if figures:
@@ -62,9 +61,9 @@ def compare(
     common.check_models(model or [], gate)
     loaded = Scene.load(scene)
     converged = converged or converged_error
-    if converged and loaded.solver.element != HEX27.element:
+    if converged and loaded.solver.element != evaluate.HEX27.element:
         hex27 = learned = True
-    cases = cases_for(
+    cases = evaluate.cases_for(
         loaded, model or [], gate=gate, hex27=hex27, learned=learned, second_order=converged
     )
     make_folder(output / report.VTU if vtu else output)
@@ -110,11 +109,8 @@ def _finer(scene: Scene, count: int) -> Trajectory | None:
 
 
 def _print_table(comparison: Comparison) -> None:
-    from rich.box import SIMPLE_HEAD
-
     from pdcorrect.evaluation import report
 
     rows = report.table(comparison)
     cells = [list(row.values()) for row in rows]
-    style = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False}
-    common.print_table(comparison.scene.name, list(rows[0]), cells, **style)
+    common.print_table(comparison.scene.name, list(rows[0]), cells)

@@ -96,7 +96,8 @@ def info(
     count = len(all_shards(folder))
     with common.progress_bar("reading", count, unit="files", apart=True) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
-    common.console().print(*found.tables())
+    for table in found.tables():
+        common.print_table(*table)
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:

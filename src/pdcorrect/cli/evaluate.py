@@ -91,12 +91,10 @@ def _notes(saved: list[SavedCandidate], found: Evaluation) -> list[str]:
 
 
 def _print(found: Evaluation, notes: list[str], seed: int) -> None:
-    from rich.box import MARKDOWN
-
     from pdcorrect.evaluation.tables import tables
 
     for table in tables(found, seed):
-        common.print_table(*table, box=MARKDOWN, title_justify="left", title_style="bold")
+        common.print_table(*table, markdown=True)
     for note in notes:
         typer.echo(f"- {note}")
 

@@ -106,8 +106,7 @@ def _make_stepper(
         from pdcorrect.corrector.hybrid import hybrid_of
 
         return hybrid_of(scene, model, gate=gate).prepare()
-    from pdcorrect.evaluation.compare import make_stepper
-    from pdcorrect.evaluation.comparison_cases import with_learned
+    from pdcorrect.evaluation.compare import make_stepper, with_learned
     from pdcorrect.fem.problem import discretise
 
     problem = discretise(with_learned(scene) if learned else scene, refine=refine)

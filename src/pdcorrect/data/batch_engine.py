@@ -19,22 +19,10 @@ from pdcorrect.state import State
 
 
 class Batched:
-    """Problems side by side, on a GPU or, for tests, on the CPU.
+    """Problems side by side, on a GPU or, for tests, on the CPU; see `OneByOne`.
 
-    Parameters
-    ----------
-    device : str
-        "cuda", "cuda:1", "cpu".
-    tolerance : float
-        Of the coarse cell size.
-    most : int
-        Single steps that are taken together: those of several frames of each problem.
-    adds_up : bool
-        See `OneByOne`.
-
-    Notes
-    -----
-    A rollout of one problem is computed twice, since kernels are compiled anew for a batch of one.
+    At most ``most`` single steps are taken together, of several frames of each problem.  A rollout
+    of one problem is computed twice, since kernels are compiled anew for a batch of one.
     """
 
     def __init__(

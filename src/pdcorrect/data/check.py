@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, step_faults
+from pdcorrect.data.check_file import cell_size, file_faults, plan_faults, reason, step_faults
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content, shard_number
 from pdcorrect.data.plan import MeshPlan, make_plan
@@ -24,13 +24,13 @@ from pdcorrect.data.schema import (
     Array,
     Shard,
     Simulation,
+    read_header,
+    read_shard,
 )
-from pdcorrect.data.shard_reader import read_header, read_shard
 from pdcorrect.errors import InputError, MeshError
 from pdcorrect.fem.mesh import HexMesh
 
-_DIGITS = 6
-"""Decimals, in cells, to which meshes are compared."""
+_DIGITS = 6  # decimals, in cells, to which meshes are compared
 _OTHERS = (CONFIG, MANIFEST, "README.md")
 Severity = Literal["error", "warning"]
 
@@ -62,20 +62,11 @@ def _digest(values: Array) -> str:
 
 @dataclass(frozen=True)
 class Finding:
-    """What is wrong with a data set, and in which file.
-
-    Attributes
-    ----------
-    path : Path
-    severity : {"error", "warning"}
-        Errors make the data unfit for use.
-    message : str
-        One sentence without full stop.
-    """
+    """What is wrong with a data set, and in which file."""
 
     path: Path
-    severity: Severity
-    message: str
+    severity: Severity  # errors make the data unfit for use
+    message: str  # one sentence without full stop
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.path}: {self.message}"
@@ -84,26 +75,12 @@ class Finding:
 def check_dataset(
     folder: str | Path, on_file: Callable[[Path], None] | None = None, repeat: int = 1
 ) -> list[Finding]:
-    """Read everything in a data set's folder and report what is wrong.
+    """Read everything in a data set's folder and report what is wrong; nothing if it is sound.
 
-    Of a generated one forces are computed again, too, and some steps of the coarse models taken
-    again, so that what files say of themselves is not all that is known of them.
-
-    Parameters
-    ----------
-    folder : path
-        With ``config.toml`` and a folder of files for each split.
-    on_file : callable, optional
-        Called with each mesh's file after it was checked.
-    repeat : int
-        Steps of each coarse run, and single steps from the reference, that are taken again in
-        each simulation of a generated data set.
-
-    Returns
-    -------
-    list of Finding
-        Empty for a sound data set.  A file that cannot be read is one finding; the others
-        are checked all the same.
+    A file that cannot be read is one finding; the others are checked all the same.  Of a generated
+    set forces are computed again, too, and in each simulation ``repeat`` steps of each coarse run
+    and single steps from the reference are taken again, so that what files say of themselves is not
+    all that is known of them.  ``on_file`` is called with each mesh's file after it was checked.
 
     Raises
     ------
@@ -154,7 +131,7 @@ class _Check:
             self.config = DatasetConfig.load(path)
             self.plans = {plan.path(self.folder): plan for plan in make_plan(self.config)}
         except InputError as error:
-            self.note(path, _reason(path, error))
+            self.note(path, reason(path, error))
 
     def load_manifest(self) -> None:
         """Read the hashes that the manifest lists; unfinished data sets have none."""
@@ -187,7 +164,7 @@ class _Check:
         try:
             shard = read_shard(path)
         except InputError as error:
-            self.note(path, _reason(path, error))
+            self.note(path, reason(path, error))
             return
         found, wanted = shard.attributes["config_hash"], self.config and self.config.hash()
         if wanted is not None and found != wanted:
@@ -227,14 +204,10 @@ class _Check:
         """Changes of the code and of the device between files, where they tell."""
         for what, told in (("code", "made by other code than {} (SHA-256 {:.12})"),
                            ("device", "computed on another device than {}: {}")):  # fmt: skip
-            own = shard.provenance.get(what)
-            if own is None:
-                continue
-            known = self.origins.setdefault(what, {})
-            if known and own not in known:
+            own, known = shard.provenance.get(what), self.origins.setdefault(what, {})
+            if own is not None and known.setdefault(own, path) == path and len(known) > 1:
                 first = self._short(next(iter(known.values())))
                 self.note(path, told.format(first, own), "warning")
-            known.setdefault(own, path)
 
     def _repetitions(self, path: Path, shard: Shard) -> None:
         """Meshes, materials and loads that came before."""
@@ -268,7 +241,3 @@ def _imported(paths: Sequence[Path]) -> bool:
         with suppress(InputError):
             return not read_header(path).config_hash
     return False
-
-
-def _reason(path: Path, error: InputError) -> str:
-    return str(error).removeprefix(f"{path}: ").removesuffix(".")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pdcorrect.data.configuration import DatasetConfig
-from pdcorrect.data.engines import MOST_ITERATIONS, step_forces
+from pdcorrect.data.engines import OneByOne
 from pdcorrect.data.plan import MeshPlan, draw_scene
 from pdcorrect.data.schema import INTEGRATOR, REFERENCE, Array, Run, Shard
 from pdcorrect.data.simulate import lacking, rebuilt_problems, unlike_arrays, unlike_loads
@@ -23,7 +23,6 @@ from pdcorrect.errors import InputError, SceneError
 from pdcorrect.fem.hexahedron import gauss_points, jacobians, shape_derivatives
 from pdcorrect.fem.problem import BASES, Problem, discretise
 from pdcorrect.scene import Scene
-from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.state import State
 
 _CENTRE = np.full((1, 3), 0.5)
@@ -31,10 +30,8 @@ _STEP_ERROR = 10.0
 """Largest distance from a step that is taken again, in tolerances of the data set."""
 _ROUNDINGS = 16.0
 """The same for rounding, in spacings of the largest coordinate: a step starts from two frames."""
-_SLACK = 1e-6
-"""Relative, for tolerances of numbers that are stored as float32."""
-_LOADS_COMPARED = 8
-"""Steps of each simulation, the first and the last among them."""
+_SLACK = 1e-6  # relative, for tolerances of numbers that are stored as float32
+_LOADS_COMPARED = 8  # steps of each simulation, the first and the last among them
 _LAST_DIGITS = 1e-14
 """Relative: by so much exponentials differ between processors, and with them what is drawn."""
 
@@ -183,70 +180,58 @@ def _same(found: Any, wanted: Any) -> bool:
 def step_faults(path: Path, shard: Shard, count: int, tolerance: float) -> Iterator[str]:
     """Steps of the coarse models that come out otherwise when they are taken again.
 
-    Parameters
-    ----------
-    path : Path
-        Of the shard's file, for messages.
-    shard : Shard
-        Generated, not imported.
-    count : int
-        Single steps and steps of rollouts of each simulation and model.
-    tolerance : float
-        The solver's, m.
+    ``count`` single steps and steps of rollouts of each simulation and model of a generated file;
+    ``tolerance`` is the solver's, m.
     """
     for name in BASES:
         if all(name in simulation.runs for simulation in shard.simulations):
             try:
                 problems = rebuilt_problems(shard, path, name)
             except InputError as error:
-                yield str(error).removeprefix(f"{path}: ").removesuffix(".")
+                yield reason(path, error)
                 return
-            yield from _repeated(shard, name, problems, count, tolerance)
+            for what in ("positions", "predictions"):
+                yield from _repeated(shard, name, what, problems, count, tolerance)
+
+
+def reason(path: Path, error: InputError) -> str:
+    """What an error says of a file, without its name and the full stop."""
+    return str(error).removeprefix(f"{path}: ").removesuffix(".")
 
 
 def _repeated(
-    shard: Shard, name: str, problems: list[Problem], count: int, tolerance: float
+    shard: Shard, name: str, what: str, problems: list[Problem], count: int, tolerance: float
 ) -> Iterator[str]:
-    stepper = ProjectiveDynamics(
-        problems[0].with_loads([]), float(shard.attributes["tolerance"]),
-        max_iterations=MOST_ITERATIONS, recover=False,
-    )  # fmt: skip
-    for k, (simulation, problem) in enumerate(zip(shard.simulations, problems, strict=True)):
-        run, reference = simulation.runs[name], simulation.runs[REFERENCE].positions
-        for what, starts, ends in (
-            ("positions", run.positions, run.positions),
-            ("predictions", reference, run.predictions),
-        ):
-            if starts is None or ends is None:
-                continue
-            spacing = np.finfo(starts.dtype).eps * np.abs(starts).max()
-            limit = float(_STEP_ERROR * tolerance + _ROUNDINGS * spacing)
-            for row, away, times in _again(stepper, problem, starts, ends, k, count):
-                if not away <= times * limit:
-                    yield (
-                        f"simulation {k:04d}: {name}: step {row + 1} of its {what} is {away:.3g} m "
-                        f"off when it is taken again: expected at most {times * limit:.3g} m"
-                    )
-                    break
+    """Steps of backward Euler from rows spread over each simulation; of others the first in a row.
 
-
-def _again(
-    stepper: ProjectiveDynamics, problem: Problem, starts: Array, ends: Array, k: int, count: int
-) -> Iterator[tuple[int, float, int]]:
-    """Steps of simulation k that are taken again: row, distance (m), and how often errors add up.
-
-    Steps of backward Euler from rows of ``starts``, spread over the simulation; of others the
-    first ones in a row, since they remember more than two frames tell.
+    Those remember more than two frames tell, and their errors add up.
     """
-    after = ends[-(len(starts) - 1) :]  # of a rollout all frames but the first
-    state = problem.initial_state()
-    for i in range(min(count, len(after))):
-        row, times = i, i + 1
-        if stepper.integrator == INTEGRATOR:
-            row, times = (31 * k + i * len(after) // count) % len(after), 1
-            state = _start(problem, starts, row)
-        state = stepper(state, step_forces(stepper, problem, state)).state
-        yield row, float(np.abs(state.positions - after[row]).max()), times
+    engine = OneByOne("pd", float(shard.attributes["tolerance"]))
+    euler = problems[0].scene.time.integrator == INTEGRATOR
+    for k, (simulation, problem) in enumerate(zip(shard.simulations, problems, strict=True)):
+        run, reference = simulation.runs[name], simulation.runs[REFERENCE]
+        starts = run.positions if what == "positions" else reference.positions
+        ends = getattr(run, what)
+        if starts is None or ends is None:
+            continue
+        after = ends[-(len(starts) - 1) :]  # of a rollout all frames but the first
+        rows = list(range(min(count, len(after))))
+        if euler:
+            rows = [(31 * k + i * len(after) // count) % len(after) for i in rows]
+            states = [_start(problem, starts, row) for row in rows]
+            (found,) = engine.predictions([problem], [states])
+        else:
+            (found,) = engine.rollouts([problem], len(rows))
+        spacing = np.finfo(starts.dtype).eps * np.abs(starts).max()
+        limit = float(_STEP_ERROR * tolerance + _ROUNDINGS * spacing)
+        for i, (row, positions) in enumerate(zip(rows, found.positions, strict=False)):
+            away, most = np.abs(positions - after[row]).max(), limit * (1 if euler else i + 1)
+            if not away <= most:
+                yield (
+                    f"simulation {k:04d}: {name}: step {row + 1} of its {what} is {away:.3g} m "
+                    f"off when it is taken again: expected at most {most:.3g} m"
+                )
+                break
 
 
 def _start(problem: Problem, frames: Array, row: int) -> State:

@@ -51,68 +51,36 @@ TRAINING, VALIDATION, EVALUATION = "training", "validation", "evaluation"
 
 
 class MaterialRange(Strict):
-    """From what the material of a mesh is drawn; all its simulations share it.
+    """From what the material of a mesh is drawn; all its simulations share it."""
 
-    Attributes
-    ----------
-    young
-        Pa, log-uniform.
-    poisson
-        Uniform.
-    density
-        kg/m3, uniform.
-    """
-
-    young: Range
-    poisson: PoissonRange
-    density: Range
+    young: Range  # Pa, log-uniform
+    poisson: PoissonRange  # uniform
+    density: Range  # kg/m3, uniform
 
 
 class MotionRange(Strict):
-    """From what a simulation's load is drawn.
+    """From what a simulation's load is drawn."""
 
-    Attributes
-    ----------
-    kind
-        "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in
-        time.  "impulse": a force on the body's inflated part (or free end) during the first
-        ``duration`` seconds.  "stretch": a force on that part along the axis away from the
-        clamps, with a transverse share, that rises during ``duration`` seconds and stays.
-        "body-force": an acceleration of the whole body in a random direction that rises so, too.
-    strength
-        Uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over
-        the mass of the loaded part, m/s2.  Impulse: momentum over that mass, m/s.  Body force:
-        m/s2.
-    duration
-        s; not used by torsion.
-    attraction
-        k of eq. 6-1, uniform.
-    stretch
-        alpha of eq. 6-1 over the cell size, uniform.
-    transverse
-        Of stretch: transverse over axial force, uniform.
-    """
-
+    # "torsion": the rotational field of eq. 6-1 to 6-3 about the beam's axis, constant in time.
+    # "impulse": a force on the body's inflated part (or free end) during the first ``duration``
+    # seconds.  "stretch": a force on that part along the axis away from the clamps, with a
+    # transverse share, that rises during ``duration`` seconds and stays.  "body-force": an
+    # acceleration of the whole body in a random direction that rises so, too
     kind: MotionName
+    # uniform.  Torsion: the field's sigma over the density, m/s2.  Stretch: force over the mass of
+    # the loaded part, m/s2.  Impulse: momentum over that mass, m/s.  Body force: m/s2
     strength: Range
-    duration: Positive = 0.01
-    attraction: Span = (0.0, 0.5)
-    stretch: Span = (0.5, 1.5)
-    transverse: Span = (0.0, 0.3)
+    duration: Positive = 0.01  # s; not used by torsion
+    attraction: Span = (0.0, 0.5)  # k of eq. 6-1, uniform
+    stretch: Span = (0.5, 1.5)  # alpha of eq. 6-1 over the cell size, uniform
+    transverse: Span = (0.0, 0.3)  # of stretch: transverse over axial force, uniform
 
 
 class Reference(Strict):
-    """What the data set takes for the truth.
-
-    Attributes
-    ----------
-    solver
-        "pd" or "newton".
-    refine
-        Cells into which each coarse cell is cut, along each axis.
-    """
+    """What the data set takes for the truth."""
 
     solver: Literal["pd", "newton"] = "pd"
+    # cells into which each coarse cell is cut, along each axis
     refine: Annotated[int, Field(strict=True, ge=2, le=16)] = 4
 
 
@@ -130,81 +98,56 @@ class Split(Strict):
 
 
 class ExtraSplit(Split):
-    """An evaluation split that leaves the training distribution in the named respects.
-
-    Attributes
-    ----------
-    family, young, poisson
-        In place of the data set's.
-    strength_factor, step_factor, frames_factor
-        On its loads, its time step and its number of frames.
-    refine
-        Of the reference.
-    """
+    """An evaluation split that leaves the training distribution in the named respects."""
 
     name: Name
+    # in place of the data set's
     family: FamilyName | None = None
     young: Range | None = None
     poisson: PoissonRange | None = None
+    # on its loads, its time step and its number of frames
     strength_factor: Positive = 1.0
     step_factor: Positive = 1.0
     frames_factor: PositiveCount = 1
-    refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None
+    refine: Annotated[int, Field(strict=True, ge=2, le=16)] | None = None  # of the reference
 
 
 class DatasetConfig(TomlConfig):
-    """A data set, up to the machine that computes it.
-
-    Attributes
-    ----------
-    family
-        Bodies, see `pdcorrect.data.families`.
-    setting
-        "as-published": nodal masses rho times cell volume, the published volume weight,
-        forces on the coarse nodes, plain elements on every mesh.  "exact": masses that
-        sum to rho V, the volume weight of the material asked for, loads integrated on each
-        mesh, `pdcorrect.scene.trained_coarse` beside the plain model, its element in the
-        reference.  Both step by backward Euler.  "converged": as exact, with generalised-alpha,
-        `pdcorrect.best_coarse`, and a reference at a quarter of the step; no single steps.
-    coarse_nodes
-        Fewest and most nodes of a coarse mesh; the family's own by default.
-    cell_size, step
-        m and s.
-    tolerance
-        Of each time step, of the coarse cell size.
-    dtype
-        In which positions and forces are stored.
-    motion, mixed
-        One of them.  Of a list of motions each simulation draws one or two.
-    validation_share
-        Of the training meshes.
-    converged_steps
-        Steps by which the time-converged reference of the evaluation split divides
-        ``step``; 0 leaves it out.
-    finest_meshes
-        On so many meshes of the evaluation split, a run with cells half as long as the
-        reference's tells how exact it is.
-    """
+    """A data set, up to the machine that computes it."""
 
     name: Name
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63)]
-    family: FamilyName
+    family: FamilyName  # bodies, see `pdcorrect.data.families`
+    # "as-published": nodal masses rho times cell volume, the published volume weight, forces on the
+    # coarse nodes, plain elements on every mesh.  "exact": masses that sum to rho V, the volume
+    # weight of the material asked for, loads integrated on each mesh,
+    # `pdcorrect.scene.trained_coarse` beside the plain model, its element in the reference.  Both
+    # step by backward Euler.  "converged": as exact, with generalised-alpha,
+    # `pdcorrect.best_coarse`, and a reference at a quarter of the step; no single steps
     setting: Literal["as-published", "exact", "converged"]
+    # fewest and most nodes of a coarse mesh; the family's own by default
     coarse_nodes: NodeCounts | None = None
+    # m and s
     cell_size: Positive = 0.05
     step: Positive = 0.01
     frames: PositiveCount
+    # of each time step, of the coarse cell size
     tolerance: Annotated[float, Field(strict=True, gt=0, lt=0.1)] = 1e-5
-    dtype: Literal["float32", "float64"] = "float32"
+    dtype: Literal["float32", "float64"] = "float32"  # in which positions and forces are stored
     material: MaterialRange
+    # one of them.  Of a list of motions each simulation draws one or two
     motion: MotionRange | None = None
     mixed: tuple[MotionRange, ...] | None = None
     reference: Reference = Reference()
+    # steps by which the time-converged reference of the evaluation split divides ``step``; 0 leaves
+    # it out
     converged_steps: Annotated[int, Field(strict=True, ge=0, le=256)] = 0
+    # on so many meshes of the evaluation split, a run with cells half as long as the reference's
+    # tells how exact it is
     finest_meshes: Count = 0
     training: Split
     evaluation: Split
-    validation_share: Share = 0.1
+    validation_share: Share = 0.1  # of the training meshes
     extra: tuple[ExtraSplit, ...] = ()
 
     @property

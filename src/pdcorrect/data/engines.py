@@ -29,27 +29,17 @@ SolverName = Literal["pd", "newton"]
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What came of T steps, on the N coarse nodes of a problem.
+    """What came of T steps, on the N coarse nodes of a problem."""
 
-    Attributes
-    ----------
-    positions, velocities : (T, N, 3)
-        After each step, m and m/s.  Steps after a failure are missing.
-    iterations, error_estimates, smallest_volume_ratios : (T,)
-        Error estimates in m; det F at quadrature points.
-    failure : str
-        Why the run is of no use, with its first bad step; empty if it is fine.
-    seconds : float
-        The share of the wall-clock time.
-    """
-
+    # (T, N, 3): after each step, m and m/s.  Steps after a failure are missing
     positions: Array
     velocities: Array
+    # (T,): error estimates in m; det F at quadrature points
     iterations: NDArray[np.int64]
     error_estimates: Array
     smallest_volume_ratios: Array
-    failure: str
-    seconds: float
+    failure: str  # why the run is of no use, with its first bad step; empty if it is fine
+    seconds: float  # the share of the wall-clock time
 
 
 def failure_of(status: Status, ratio: float) -> str:
@@ -77,26 +67,12 @@ class Engine(Protocol):
 class OneByOne:
     """One problem after the other, on the CPU.
 
-    Parameters
-    ----------
-    solver : {"pd", "newton"}
-        "pd" without fallbacks and with at most `MOST_ITERATIONS`, unless it may ``recover``.
-        Then, too, cells may be inverted.
-    tolerance : float
-        Of the coarse cell size.
-    adds_up : bool
-        Whether it falls with the square of a rollout's ``divisor``, since errors of more steps
-        add up.
+    Projective dynamics has no fallbacks and at most `MOST_ITERATIONS`.  The tolerance is of the
+    coarse cell size; if errors add up it falls with the square of a rollout's ``divisor``.
     """
 
-    def __init__(
-        self, solver: SolverName, tolerance: float, adds_up: bool = False, *, recover: bool = False
-    ) -> None:
+    def __init__(self, solver: SolverName, tolerance: float, adds_up: bool = False) -> None:
         self._solver, self._tolerance, self._adds_up = solver, tolerance, adds_up
-        self._recover = recover
-        self._options: dict[str, Any] = (
-            {} if recover else {"max_iterations": MOST_ITERATIONS, "recover": False}
-        )
 
     def rollouts(self, problems: Sequence[Problem], steps: int, divisor: int = 1) -> list[Steps]:
         return self._run(problems, [[None] * steps for _ in problems], divisor)
@@ -118,11 +94,7 @@ class OneByOne:
         for problem, states in zip(problems, starts, strict=True):
             began = time.perf_counter()
             stepper = self._stepper(steppers, problem, divisor)
-            frames, failure = _frames(stepper, problem, states, divisor, self._recover)
-            columns: list[Any] = [np.stack(column) for column in zip(*frames, strict=True)]
-            positions, velocities, iterations, errors, ratios = columns
-            seconds = time.perf_counter() - began
-            out.append(Steps(positions, velocities, iterations, errors, ratios, failure, seconds))
+            out.append(_steps(stepper, problem, states, divisor, began))
         return out
 
     def _stepper(self, known: dict[int, Any], problem: Problem, divisor: int) -> Any:
@@ -139,7 +111,10 @@ class OneByOne:
             if self._solver == "newton":
                 known[key] = Newton(stepped, tolerance, time_step=step)
             else:
-                known[key] = ProjectiveDynamics(stepped, tolerance, time_step=step, **self._options)
+                known[key] = ProjectiveDynamics(
+                    stepped, tolerance, time_step=step, max_iterations=MOST_ITERATIONS,
+                    recover=False,
+                )  # fmt: skip
         return known[key]
 
 
@@ -150,17 +125,14 @@ def step_forces(stepper: ImplicitStepper, problem: Problem, state: State) -> Arr
     return problem.external_forces(first, last, state.positions)
 
 
-def _frames(
+def _steps(
     stepper: ImplicitStepper,
     problem: Problem,
     starts: Sequence[State | None],
     divisor: int,
-    inverted: bool,
-) -> tuple[list[tuple[Any, ...]], str]:
-    """The columns of `Steps` frame by frame, up to the first failure, and that one.
-
-    Cells may be ``inverted``, or that is a failure.
-    """
+    began: float,
+) -> Steps:
+    """Frames up to the first failure, of ``divisor`` steps each."""
     frames: list[tuple[Any, ...]] = []
     nodes, state, failure = problem.mesh.coarse_nodes, problem.initial_state(), ""
     for start in starts:
@@ -174,8 +146,10 @@ def _frames(
             iterations += result.iterations
             error = max(error, result.error_estimate)
             ratio = min(ratio, result.stats["smallest_volume_ratio"])
-            failure = failure or failure_of(result.status, np.inf if inverted else ratio)
+            failure = failure or failure_of(result.status, ratio)
         frames.append((state.positions[nodes], state.velocities[nodes], iterations, error, ratio))
         if failure:
-            return frames, f"step {len(frames)}: {failure}"
-    return frames, ""
+            failure = f"step {len(frames)}: {failure}"
+            break
+    x, v, counts, errors, ratios = (np.stack(column) for column in zip(*frames, strict=True))
+    return Steps(x, v, counts, errors, ratios, failure, time.perf_counter() - began)

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import shard_paths, splits_of
-from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation, read_shard
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.fem.graph import node_means, tetrahedra, velocities
 from pdcorrect.io.vtk import write_vtu_series
@@ -158,28 +157,23 @@ def export_vtu(
     *,
     overwrite: bool = False,
 ) -> list[Path]:
-    """Write a simulation's reference and runs as VTU series for ParaView.
+    """Write a simulation's reference and runs as VTU series for ParaView; their PVD files.
 
     Points are the current positions on the coarse mesh.  Point data: ``displacement`` (m),
     ``velocity`` (m/s), ``error`` (to the reference, m; of runs only) and ``force`` (of the step
-    that ends in the frame, N).  Cell data: ``young`` (Pa), ``poisson``, ``density`` (kg/m3).
+    that ends in the frame, N).  Cell data: ``young`` (Pa), ``poisson``, ``density`` (kg/m3). The
+    reference's file comes first; ``SPLIT-MMMM-K-reference.pvd`` is that of mesh MMMM of the split
+    and simulation K on it.
 
     Parameters
     ----------
     folder, target : path
     split : str
     mesh, simulation : int
-        Number of the mesh in the split, and of the simulation on it.
     runs : sequence of str, optional
         With rollouts; "plain" by default, if it has one.
     overwrite : bool
         Replace files of the same names in ``target``.
-
-    Returns
-    -------
-    list of Path
-        PVD files, the reference's first, ``SPLIT-MMMM-K-reference.pvd`` of mesh MMMM and
-        simulation K.
 
     Raises
     ------

@@ -26,27 +26,14 @@ Size = tuple[int, ...]
 
 @dataclass(frozen=True)
 class Design:
-    """One body of a family, in cells: scale by the cell size for metres.
+    """One body of a family, in cells: scale by the cell size for metres."""
 
-    Attributes
-    ----------
-    shape : dict
-        The scene's ``body`` without ``cell_size``.
-    clamps : tuple of Box
-        Flat boxes whose nodes are held.
-    loaded : Box
-        The part that impulse and stretch loads act on.
-    axis : (x, y, z)
-        Away from the clamps, along the beam that carries that part.
-    nodes : int
-        Of the coarse mesh.
-    """
-
-    shape: Shape = field(hash=False)
-    clamps: tuple[Box, ...]
-    loaded: Box
+    shape: Shape = field(hash=False)  # the scene's ``body`` without ``cell_size``
+    clamps: tuple[Box, ...]  # flat boxes whose nodes are held
+    loaded: Box  # the part that impulse and stretch loads act on
+    # x, y, z: away from the clamps, along the beam that carries that part
     axis: tuple[float, float, float]
-    nodes: int
+    nodes: int  # of the coarse mesh
 
     def key(self) -> str:
         """Equal for equal bodies, and for mirrored ones that are held in the same way."""
@@ -96,11 +83,6 @@ def node_levels(family: FamilyName, nodes: tuple[int, int]) -> tuple[tuple[Size,
     """Sizes that a family allows in a range, grouped by their number of nodes, ascending.
 
     In the published range the refined mesh is in its published range too.
-
-    Raises
-    ------
-    InputError
-        If there are none.
     """
     published = PUBLISHED[family]
     fine = published.fine if nodes == published.coarse else (0, sys.maxsize)

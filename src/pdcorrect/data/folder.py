@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -17,27 +16,6 @@ from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 _NAME = re.compile(rf"mesh-\d+{re.escape(SUFFIX)}")
 _FIRST = (TRAINING, VALIDATION, EVALUATION)
-Folders = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
-"""Of one data set, or of several."""
-
-
-def folders_of(data: Folders) -> tuple[Path, ...]:
-    """Folders of data sets whose files are read one after the other.
-
-    Raises
-    ------
-    InputError
-        If there is none, or one comes twice.
-    """
-    if isinstance(data, (str, os.PathLike)):
-        return (Path(data),)
-    found = tuple(map(Path, data))
-    if not found:
-        raise InputError("no data set: expected the folder of one or more.")
-    for k, folder in enumerate(found):
-        if folder.resolve() in [other.resolve() for other in found[:k]]:
-            raise InputError(f"{folder}: expected each data set once.")
-    return found
 
 
 def all_shards(folder: str | Path) -> list[Path]:
@@ -57,13 +35,7 @@ def shard_number(path: Path) -> int:
 
 
 def splits_of(folder: str | Path) -> list[str]:
-    """Names of the splits that there are files of: the usual ones first.
-
-    Raises
-    ------
-    InputError
-        If there are none.
-    """
+    """Names of the splits that there are files of: the usual ones first."""
     found = list(dict.fromkeys(path.parent.name for path in all_shards(folder)))
     if not found:
         raise InputError(
@@ -73,15 +45,7 @@ def splits_of(folder: str | Path) -> list[str]:
 
 
 def shard_paths(folder: str | Path, split: str, without: Collection[str] = ()) -> list[Path]:
-    """Files of a split, by number; not those of some names, such as ``training/mesh-0042``.
-
-    Names of other files do not matter.
-
-    Raises
-    ------
-    InputError
-        If there are none, or none are left.
-    """
+    """Files of a split, by number; not those of some names, such as ``training/mesh-0042``."""
     paths = [path for path in all_shards(folder) if path.parent.name == split]
     if not paths:
         names = ", ".join(splits_of(folder))
@@ -104,19 +68,8 @@ def read_files(
 ) -> list[Found]:
     """What ``read`` makes of each file.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-    read : callable
-    damaged : dict or None
-        Where given, files that are damaged are noted here and left out.
-
-    Raises
-    ------
-    FileFormatError
-        If a file is damaged; with ``damaged`` if all are.
-    FileVersionError
-        If one is of another version, which is no damage.
+    With ``damaged`` files that are damaged are noted there and left out; `FileFormatError` if all
+    are.
     """
     found = []
     for path in paths:
@@ -133,20 +86,9 @@ def read_files(
 
 
 def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
-    """Files that a data set's ``config.toml`` asks for and that are not there.
+    """Files that ``config.toml`` asks for, of all splits or one, and that are not there.
 
     None are missing where there is no configuration, as in imported data sets.
-
-    Parameters
-    ----------
-    folder : path
-    split : str, optional
-        The only one to look at; all by default.
-
-    Raises
-    ------
-    InputError
-        If the configuration cannot be used.
     """
     folder = Path(folder)
     if not (folder / CONFIG).exists():
@@ -157,13 +99,7 @@ def missing_files(folder: str | Path, split: str | None = None) -> list[Path]:
 
 
 def check_whole(folder: str | Path, splits: Iterable[str]) -> None:
-    """Refuse splits of which files are missing.
-
-    Raises
-    ------
-    InputError
-        If some are, with the first one's name, or as of `missing_files`.
-    """
+    """Refuse splits of which files are missing."""
     for split in splits:
         missing = missing_files(folder, split)
         if missing:

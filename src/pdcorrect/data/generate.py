@@ -17,14 +17,12 @@ from pdcorrect._files import clear_parts, make_folder, write_text
 from pdcorrect.data.configuration import DatasetConfig
 from pdcorrect.data.folder import all_shards, manifest_content
 from pdcorrect.data.plan import MeshPlan, make_plan
-from pdcorrect.data.schema import CONFIG, MANIFEST
-from pdcorrect.data.shard_reader import read_header
+from pdcorrect.data.schema import CONFIG, MANIFEST, read_header
 from pdcorrect.data.simulate import lacking, work_per_node
 from pdcorrect.data.workers import ONE_WORKER, Workers, computed
 from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
-_LONGEST = 4
-"""Of the work of a full batch of usual simulations: at most so much is a unit of a GPU."""
+_LONGEST = 4  # most of the work of a full batch of usual simulations that a GPU takes at once
 
 OnBegin = Callable[[int, int, Sequence[str]], None]
 """Called before anything is computed: how many simulations of how many are there, and the names
@@ -38,18 +36,11 @@ many of them are new.
 
 @dataclass(frozen=True)
 class Generated:
-    """What is there of a data set; true if that is all that was asked for.
+    """What is there of a data set; true if that is all that was asked for."""
 
-    Attributes
-    ----------
-    simulations : mapping of str to (int, int)
-        By split: how many simulations of how many are there.
-    asked : tuple of str
-        Splits that were to be computed.
-    """
-
+    # by split: how many simulations of how many are there
     simulations: Mapping[str, tuple[int, int]]
-    asked: tuple[str, ...]
+    asked: tuple[str, ...]  # splits that were to be computed
 
     def __bool__(self) -> bool:
         return all(self.simulations[name][0] == self.simulations[name][1] for name in self.asked)
@@ -84,7 +75,7 @@ def generate(
     seconds : float, optional
         Begin nothing new after so much time; what is under way is finished.
     on_begin, on_file : callable, optional
-        For progress.
+        For progress, see `OnBegin` and `OnFile`.
 
     Returns
     -------
@@ -97,10 +88,8 @@ def generate(
     InputError
         If the folder holds another data set, a split is unknown, the family has fewer bodies
         than the configuration asks for, or no scheduler or worker answers.
-    ConvergenceError
-        If the loads are so strong that no draw is accepted.
-    OutputError
-        If a file cannot be written.
+    ConvergenceError, OutputError
+        If the loads are so strong that no draw is accepted, or a file cannot be written.
     """
     folder = Path(folder)
     plans = make_plan(config)
@@ -137,11 +126,6 @@ def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
 
     That is one that is damaged, or lacks a run or the single steps of one, as files of earlier
     versions of the code may.
-
-    Raises
-    ------
-    InputError
-        If there is a whole file of something else.
     """
     path = plan.path(folder)
     if not path.exists():

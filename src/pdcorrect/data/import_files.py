@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdcorrect.data.importing import (
     ImportedMotion,
@@ -17,7 +16,7 @@ from pdcorrect.data.importing import (
     shard_from_arrays,
     shard_of,
 )
-from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Shard, write_shard
+from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Array, Shard, write_shard
 from pdcorrect.data.simulate import arrays_of
 from pdcorrect.errors import FileFormatError, InputError
 from pdcorrect.fem.problem import Problem
@@ -26,79 +25,10 @@ from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
 from pdcorrect.trajectory import Trajectory
 
-Array = NDArray[Any]
-
-
-def shard_from_trajectories(
-    reference: Trajectory | Sequence[Trajectory],
-    coarse: Trajectory | Sequence[Trajectory] | None = None,
-    *,
-    dataset: str = "imported",
-    split: str = "training",
-    number: int = 0,
-    best: bool = False,
-) -> Shard:
-    """A file of a data set from runs of ``pdcorrect simulate`` on one mesh, checked.
-
-    The scenes in the runs give mesh, material, clamps and loads, and the coarse runs' where
-    there are any, else the references', element and masses of the coarse model.  References
-    are restricted to the coarse nodes; predictions are computed with `ProjectiveDynamics` on
-    the coarse mesh.
-
-    Parameters
-    ----------
-    reference : Trajectory or sequence of Trajectory
-        Of refined meshes, with their scenes.
-    coarse : Trajectory or sequence of Trajectory, optional
-        Rollouts of the coarse model, as many.
-    dataset, split, number, best
-        See `shard_from_arrays`.
-
-    Raises
-    ------
-    InputError
-        If a run has no scene, another material than it, another integrator than backward
-        Euler or does not start at rest, the coarse model has an element with nodes besides the
-        corners of the cells, the runs' scenes differ in a section but the loads of different
-        simulations, or in times, or a check of `shard_from_arrays` fails.
-    """
-    references = [reference] if isinstance(reference, Trajectory) else list(reference)
-    rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())
-    if rollouts and len(rollouts) != len(references):
-        raise InputError(
-            f"{len(references)} references and {len(rollouts)} coarse runs: expected as many."
-        )
-    if not references:
-        raise InputError("no simulations: expected at least one reference.")
-    name = "the coarse run" if rollouts else "the reference"
-    scenes = [_scene("the reference", run) for run in references]
-    for k, run in enumerate(rollouts):
-        own = _scene(name, run)
-        _check_same("the reference and the coarse run", scenes[k], own, (*_BODY, "loads"))
-        _check_times(run, references[k])
-        scenes[k] = own
-    problem = coarse_problem(name, scenes[0], _step(references[0]))
-    problems, motions = [], []
-    for k, (run, scene) in enumerate(zip(references, scenes, strict=True)):
-        _check_same(f"simulations 0 and {k}", scenes[0], scene, (*_BODY, "solver"))
-        if not np.isclose(_step(run), problem.time_step, rtol=1e-6):
-            raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")
-        loaded = problem.with_loads(scene.loads)
-        told = loaded.scene.with_changes(name=scene.name, time={"frames": scene.time.frames})
-        problems.append(replace(loaded, scene=told))
-        rollout = _restricted(rollouts[k], problem) if rollouts else None
-        motions.append(ImportedMotion(restrict(run, problem).positions, coarse=rollout))
-    step = problem.time_step
-    return shard_of(arrays_of(problem), motions, problems, step, dataset, split, number, best)
-
-
-def _restricted(coarse: Trajectory, problem: Problem) -> Array:
-    if len(coarse.points) != len(problem.positions):
-        raise InputError(
-            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
-            f"{len(problem.positions)}: expected a run with --refine 1."
-        )
-    return restrict(coarse, problem).positions
+_NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
+_MOTION = ("reference", "forces", "coarse", "predictions")
+_BODY = ("body", "material", "materials", "clamps", "damping")
+"""Sections of a scene in which all simulations of a file agree."""
 
 
 def import_trajectories(
@@ -106,12 +36,11 @@ def import_trajectories(
     folder: str | Path,
     *,
     coarse: Sequence[str | Path] = (),
-    dataset: str | None = None,
     split: str = "training",
     number: int = 0,
     best: bool = False,
 ) -> Path:
-    """Write a file of a data set from trajectory files or from an ``.npz`` file.
+    """Write a file of a data set from trajectory files or from an ``.npz`` file; its path.
 
     Parameters
     ----------
@@ -120,18 +49,11 @@ def import_trajectories(
         of `shard_from_arrays` by their names and one simulation ``reference``, or several as
         ``reference_0``, ``reference_1``, …; likewise ``forces``, ``coarse``, ``predictions``.
     folder : path
-        Of the data set; created if missing.
+        Of the data set, which has its name; created if missing.
     coarse : sequence of path
         Trajectories of the coarse model, as many as sources.
-    dataset : str, optional
-        Its name; the folder's by default.
     split, number, best
-        See `shard_from_arrays`; ``best`` of trajectories only.
-
-    Returns
-    -------
-    Path
-        What was written.
+        See `shard_from_arrays`.
 
     Raises
     ------
@@ -147,30 +69,25 @@ def import_trajectories(
     path = Path(folder) / split / f"mesh-{number:04d}{SUFFIX}"
     if path.exists():
         raise InputError(f"{path} exists already: choose another number, or delete it first.")
-    name = dataset or Path(folder).resolve().name
+    about: dict[str, Any] = {
+        "dataset": Path(folder).resolve().name, "split": split, "number": number,
+        "best": best,
+    }  # fmt: skip
     files = [Path(source) for source in sources]
     if any(file.suffix == ".npz" for file in files):
         if len(files) != 1 or coarse:
             raise InputError(
                 f"{len(files)} sources and {len(coarse)} coarse runs: expected one .npz alone."
             )
-        shard = _shard_of_npz(files[0], name, split, number, best)
+        shard = _shard_of_npz(files[0], about)
     else:
         runs, others = ([load_trajectory(f) for f in each] for each in (files, coarse))
-        shard = shard_from_trajectories(
-            runs, others, dataset=name, split=split, number=number, best=best
-        )
+        shard = shard_from_trajectories(runs, others, **about)
     write_shard(path, replace(shard, provenance={"sources": ", ".join(map(str, files))}))
     return path
 
 
-_NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
-_MOTION = ("reference", "forces", "coarse", "predictions")
-_BODY = ("body", "material", "materials", "clamps", "damping")
-"""Sections of a scene in which all simulations of a file agree."""
-
-
-def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool) -> Shard:
+def _shard_of_npz(path: Path, about: Mapping[str, Any]) -> Shard:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
@@ -190,10 +107,7 @@ def _shard_of_npz(path: Path, dataset: str, split: str, number: int, best: bool)
             "for several 'reference_0', 'forces_0' and so on."
         )
     try:
-        return shard_from_arrays(
-            motions=motions, mass=mass, dataset=dataset, split=split, number=number, best=best,
-            **arrays,
-        )  # fmt: skip
+        return shard_from_arrays(motions=motions, mass=mass, **about, **arrays)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
 
@@ -204,6 +118,58 @@ def _names_of(number: int, arrays: Mapping[str, Array]) -> dict[str, str]:
         if f"reference{end}" in arrays:
             return {name: f"{name}{end}" for name in _MOTION if f"{name}{end}" in arrays}
     return {}
+
+
+def shard_from_trajectories(
+    reference: Trajectory | Sequence[Trajectory],
+    coarse: Trajectory | Sequence[Trajectory] | None = None,
+    *,
+    dataset: str = "imported",
+    split: str = "training",
+    number: int = 0,
+    best: bool = False,
+) -> Shard:
+    """A file of a data set from runs of ``pdcorrect simulate`` on one mesh, checked.
+
+    The scenes in the runs give mesh, material, clamps and loads, and the coarse runs' where there
+    are any, as many as references, else the references', element and masses of the coarse model.
+    References, of refined meshes, are restricted to the coarse nodes; predictions are computed with
+    `ProjectiveDynamics` on the coarse mesh.  For the other arguments see `shard_from_arrays`.
+
+    Raises
+    ------
+    InputError
+        If a run has no scene, another material than it, another integrator than backward Euler or
+        does not start at rest, the runs' scenes differ in a section but the loads of different
+        simulations, or in times, or as of `shard_from_arrays`.
+    """
+    references = [reference] if isinstance(reference, Trajectory) else list(reference)
+    rollouts = [coarse] if isinstance(coarse, Trajectory) else list(coarse or ())
+    if not references or len(rollouts) not in (0, len(references)):
+        raise InputError(
+            f"{len(references)} references and {len(rollouts)} coarse runs: expected one reference "
+            "or more, and as many coarse runs or none."
+        )
+    name = "the coarse run" if rollouts else "the reference"
+    scenes = [_scene("the reference", run) for run in references]
+    for k, run in enumerate(rollouts):
+        own = _scene(name, run)
+        _check_same("the reference and the coarse run", scenes[k], own, (*_BODY, "loads"))
+        _check_times(run, references[k])
+        scenes[k] = own
+    problem = coarse_problem(name, scenes[0], _step(references[0]))
+    problems, motions = [], []
+    for k, (run, scene) in enumerate(zip(references, scenes, strict=True)):
+        _check_same(f"simulations 0 and {k}", scenes[0], scene, (*_BODY, "solver"))
+        if not np.isclose(_step(run), problem.time_step, rtol=1e-6):
+            raise InputError(f"simulations 0 and {k} have unlike time steps: expected equal ones.")
+        loaded = problem.with_loads(scene.loads)
+        told = loaded.scene.with_changes(name=scene.name, time={"frames": scene.time.frames})
+        problems.append(replace(loaded, scene=told))
+        other = _restricted(rollouts[k], problem) if rollouts else None
+        motions.append(ImportedMotion(restrict(run, problem).positions, coarse=other))
+    about = {"dataset": dataset, "split": split, "number": number}
+    return shard_of(arrays_of(problem), motions, problems, problem.time_step, about, best)
 
 
 def _scene(name: str, run: Trajectory) -> Scene:
@@ -219,8 +185,8 @@ def _scene(name: str, run: Trajectory) -> Scene:
             "the scene's; for others use shard_from_arrays."
         )
     scene = Scene.from_toml(run.scene_toml)
-    check_integrator(name, scene.time.integrator)
-    check_integrator(name, str(run.attributes.get("integrator", INTEGRATOR)))
+    for found in (scene.time.integrator, str(run.attributes.get("integrator", INTEGRATOR))):
+        check_integrator(name, found)
     if run.times[0] != 0 or run.velocities[0].any():
         raise InputError(
             f"{name} starts at {run.times[0]:g} s with velocities up to "
@@ -233,6 +199,15 @@ def _check_same(names: str, one: Scene, other: Scene, sections: Sequence[str]) -
     for section in sections:
         if getattr(one, section) != getattr(other, section):
             raise InputError(f"the scenes of {names} differ in {section}: expected equal ones.")
+
+
+def _restricted(coarse: Trajectory, problem: Problem) -> Array:
+    if len(coarse.points) != len(problem.positions):
+        raise InputError(
+            f"the coarse run has {len(coarse.points)} nodes, the coarse mesh of its scene "
+            f"{len(problem.positions)}: expected a run with --refine 1."
+        )
+    return restrict(coarse, problem).positions
 
 
 def _check_times(coarse: Trajectory, run: Trajectory) -> None:

@@ -1,4 +1,4 @@
-"""Trajectories of any solver as arrays, made a file of a data set."""
+"""Trajectories of any solver, as arrays or in files, made files of a data set."""
 
 from __future__ import annotations
 
@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from pdcorrect.data.check_file import file_faults
-from pdcorrect.data.engines import OneByOne, Steps
-from pdcorrect.data.schema import BEST, INTEGRATOR, PLAIN, REFERENCE, Array, Run, Shard, Simulation
+from pdcorrect.data.schema import (
+    BEST,
+    INTEGRATOR,
+    PLAIN,
+    REFERENCE,
+    Array,
+    Run,
+    Shard,
+    Simulation,
+)
 from pdcorrect.data.simulate import unlike_arrays
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities
@@ -21,34 +29,24 @@ from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.operators import Space, lumped
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.scene import MeshFile, Scene, check_scene, trained_coarse
+from pdcorrect.solvers.projective import ProjectiveDynamics
+from pdcorrect.solvers.rollout import rollout
 from pdcorrect.state import State
 
 SETTING = "imported"
-_AT_REST = 1e-6
-"""Of a cell's shortest edge: how far what rests may be from the rest shape."""
+_AT_REST = 1e-6  # of a cell's shortest edge: how far what rests may be from the rest shape
 _ROUNDING = 4 * float(np.finfo(np.float32).eps)
 """Of the largest coordinate: the same, of positions that were stored as float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedMotion:
-    """One simulation of another solver, on the nodes of the coarse mesh.
+    """One simulation of another solver, on the nodes of the coarse mesh."""
 
-    Attributes
-    ----------
-    reference : (T+1, N, 3)
-        What the network is to reach, m; frame 0 is the rest shape.
-    forces : (T, N, 3), optional
-        Nodal forces of each step, N; zero by default.
-    coarse : (T+1, N, 3), optional
-        Rollout of the coarse model, m.
-    predictions : (T, N, 3), optional
-        One step of the coarse model from each frame of the reference but the last, m.
-    """
-
-    reference: ArrayLike
-    forces: ArrayLike | None = None
-    coarse: ArrayLike | None = None
+    reference: ArrayLike  # (T+1, N, 3): what the network is to reach, m; frame 0 is the rest shape
+    forces: ArrayLike | None = None  # (T, N, 3): nodal forces of each step, N; zero by default
+    coarse: ArrayLike | None = None  # (T+1, N, 3): rollout of the coarse model, m
+    # (T, N, 3): one step of the coarse model from each frame of the reference but the last, m
     predictions: ArrayLike | None = None
 
 
@@ -69,7 +67,7 @@ def shard_from_arrays(
     scene: Scene | None = None,
     best: bool = False,
 ) -> Shard:
-    """A file of a data set from the arrays of any solver, checked.
+    """A file of a data set from the arrays of any solver, checked, for `write_shard`.
 
     Parameters
     ----------
@@ -92,16 +90,10 @@ def shard_from_arrays(
     scene : Scene, optional
         Of the coarse model, by backward Euler and with nodes at the corners of cells only,
         whose mesh, material and clamps must be these.  With it, missing forces are its loads
-        and missing predictions are computed with `ProjectiveDynamics`.  Its time step is
-        replaced by this one.
+        and missing predictions are computed with `ProjectiveDynamics`, at this time step.
     best : bool
         Also compute the run "best": rollout and predictions of `pdcorrect.scene.trained_coarse` of
         the scene, so that models which correct it can be trained and evaluated on this file.
-
-    Returns
-    -------
-    Shard
-        For `write_shard`.
 
     Raises
     ------
@@ -112,6 +104,8 @@ def shard_from_arrays(
         inverted, `file_faults` finds what the check of a data set would find, the scene is
         another, or ``best`` is wanted without a scene or of one that is its own best coarse
         model.
+    ConvergenceError
+        If a rollout of the best coarse model fails.
     """
     mesh = HexMesh.create(
         _array("points", points, (None, 3)), _array("cells", cells, (None, 8), np.int64)
@@ -140,11 +134,11 @@ def shard_from_arrays(
         arrays["mass"] = lumped(Space(mesh).mass(moduli["density"]))
     every = [motions] if isinstance(motions, ImportedMotion) else list(motions)
     problems = [] if problem is None else [problem] * len(every)
-    return shard_of(arrays, every, problems, step, dataset, split, number, best)
+    about = {"dataset": dataset, "split": split, "number": number}
+    return shard_of(arrays, every, problems, step, about, best)
 
 
 def check_integrator(name: str, found: str) -> None:
-    """Refuse others than backward Euler."""
     if found != INTEGRATOR:
         raise InputError(
             f"{name} has the integrator {found!r}: expected {INTEGRATOR!r}, for the velocities "
@@ -153,13 +147,7 @@ def check_integrator(name: str, found: str) -> None:
 
 
 def coarse_problem(name: str, scene: Scene, step: float) -> Problem:
-    """A scene's coarse model with one step of this length (s) in a frame.
-
-    Raises
-    ------
-    InputError
-        If it has nodes besides the corners of the cells.
-    """
+    """A scene's coarse model with one step of this length (s) in a frame."""
     step = scene.time.step if math.isclose(step, scene.time.step, rel_tol=1e-6) else step
     problem = discretise(scene.with_changes(time={"step": step, "substeps": 1}))
     if len(problem.positions) > len(problem.mesh.positions):
@@ -170,39 +158,23 @@ def coarse_problem(name: str, scene: Scene, step: float) -> Problem:
     return problem
 
 
-def portable(scene: Scene) -> Scene:
-    """The scene as a data set holds it: of the path of a mesh file the name alone."""
-    if not isinstance(scene.body, MeshFile):
-        return scene
-    return scene.with_changes(body={"path": scene.body.path.name})
-
-
 def shard_of(
     arrays: Mapping[str, Any],
     motions: Sequence[ImportedMotion],
     problems: Sequence[Problem],
     time_step: float,
-    dataset: str,
-    split: str,
-    number: int,
+    about: Mapping[str, Any],
     best: bool,
 ) -> Shard:
-    """A checked file of simulations on one mesh, see `shard_from_arrays`.
+    """A checked file from arrays of mesh and material, by their names in a `Shard`.
 
-    Parameters
-    ----------
-    arrays : mapping of str to array
-        Of mesh and material, by their names in a `Shard`.
-    motions : sequence of ImportedMotion
-    problems : sequence of Problem
-        The coarse model under each simulation's loads; none where there is no scene.
+    ``problems`` are the coarse model under each simulation's loads; none without a scene.
     """
     if not motions:
         raise InputError("no simulations: expected at least one.")
     shard = Shard(
         attributes={
-            "dataset": dataset, "split": split, "number": number, "setting": SETTING,
-            "config_hash": "", "time_step": time_step,
+            **about, "setting": SETTING, "config_hash": "", "time_step": time_step,
             "tolerance": problems[0].scene.solver.tolerance if problems else 0.0,
         },
         **arrays,
@@ -211,28 +183,34 @@ def shard_of(
     for name in unlike_arrays(problems[0], shard) if problems else ():
         if name != "mass":  # which may be another
             raise InputError(f"the scene: its {name} is not the one given: expected equal values.")
+    better = _best_problem(problems) if best else None
     given = [_given(f"simulation {k}", motion, shard) for k, motion in enumerate(motions)]
-    _refuse_faults(shard, given)  # before steps are taken from them
-    if problems:
-        _add_steps_and_loads(given, problems)
-    if best:
-        _add_best(given, problems)
-    shard = _refuse_faults(shard, given)
-    texts = [portable(problem.scene).to_toml() for problem in problems] or [""] * len(given)
-    told = zip(shard.simulations, texts, strict=True)
-    return replace(shard, simulations=tuple(replace(s, scene_toml=text) for s, text in told))
+    _with_simulations(shard, given)  # before steps are taken from them
+    for k, problem in enumerate(problems):
+        _add_coarse_runs(f"simulation {k}", given[k], problem, better)
+    texts = [portable(problem.scene).to_toml() for problem in problems]
+    return _with_simulations(shard, given, texts)
 
 
-def _refuse_faults(shard: Shard, given: Sequence[Mapping[str, Array]]) -> Shard:
-    """The shard with its simulations, in which the check of a data set would find nothing.
+def _best_problem(problems: Sequence[Problem]) -> Problem:
+    """The best coarse model, whose loads are the first simulation's."""
+    if not problems:
+        raise InputError('the run "best" without a scene: expected the scene of the coarse model.')
+    scene = problems[0].scene
+    better = trained_coarse(scene)
+    if better.solver == scene.solver:
+        raise InputError(
+            f"the scene has the best coarse model's element {scene.solver.element!r} already: "
+            "expected the plain coarse model's, which Omega is against."
+        )
+    return discretise(better)
 
-    Besides inverted cells of coarse models.
-    """
-    step = float(shard.attributes["time_step"])
-    shard = replace(shard, simulations=tuple(_simulation(each, step) for each in given))
-    for message in file_faults(shard, inverted=True):
-        raise InputError(f"{message}.")
-    return shard
+
+def portable(scene: Scene) -> Scene:
+    """The scene as a data set holds it: of the path of a mesh file the name alone."""
+    if not isinstance(scene.body, MeshFile):
+        return scene
+    return scene.with_changes(body={"path": scene.body.path.name})
 
 
 def _given(where: str, motion: ImportedMotion, shard: Shard) -> dict[str, Array]:
@@ -264,70 +242,56 @@ def _given(where: str, motion: ImportedMotion, shard: Shard) -> dict[str, Array]
     return found
 
 
-def _add_steps_and_loads(given: Sequence[dict[str, Array]], problems: Sequence[Problem]) -> None:
-    """Those of the coarse model where they are not given."""
-    bare = [k for k, each in enumerate(given) if "predictions" not in each]
-    for k, steps in zip(bare, _single_steps(given, problems, bare), strict=True):
-        given[k]["predictions"] = steps
-    for each, problem in zip(given, problems, strict=True):
-        if "forces" not in each:
-            h, frames = problem.time_step, enumerate(each["reference"][:-1])
-            loads = [problem.external_forces(t * h, (t + 1) * h, x) for t, x in frames]
-            each["forces"] = np.stack(loads)
+def _add_coarse_runs(
+    where: str, given: dict[str, Array], problem: Problem, best: Problem | None
+) -> None:
+    """Loads and single steps of the coarse model where there are none, and the best one's run."""
+    reference, h = given["reference"], problem.time_step
+    if "predictions" not in given:
+        given["predictions"] = _single_steps(where, reference, problem)
+    if "forces" not in given:
+        spans = ((t * h, (t + 1) * h, x) for t, x in enumerate(reference[:-1]))
+        given["forces"] = np.stack([problem.external_forces(*span) for span in spans])
+    if best is not None:
+        loaded = best.with_loads(problem.scene.loads)
+        given["best"] = rollout(ProjectiveDynamics(loaded), len(reference) - 1).positions
+        given["best steps"] = _single_steps(where, reference, loaded)
 
 
-def _add_best(given: Sequence[dict[str, Array]], problems: Sequence[Problem]) -> None:
-    """Rollouts and single steps of the best coarse model."""
-    if not problems:
-        raise InputError('the run "best" without a scene: expected the scene of the coarse model.')
-    scene = problems[0].scene
-    better = trained_coarse(scene)
-    if better.solver == scene.solver:
-        raise InputError(
-            f"the scene has the best coarse model's element {scene.solver.element!r} already: "
-            "expected the plain coarse model's, which Omega is against."
-        )
-    problem = discretise(better)
-    loaded = [problem.with_loads(p.scene.loads) for p in problems]
-    numbers = range(len(given))
-    for k, steps in zip(numbers, _single_steps(given, loaded, numbers), strict=True):
-        run = _engine(problem).rollouts([loaded[k]], len(given[k]["reference"]) - 1)
-        frames = [problem.positions[None], *_moved(run, [k])]
-        given[k] |= {"best": np.concatenate(frames), "best steps": steps}
+def _single_steps(where: str, reference: Array, problem: Problem) -> Array:
+    """One step from each frame of the reference but the last, (T, N, 3), m."""
+    stepper, h = ProjectiveDynamics(problem), problem.time_step
+    found = []
+    for t, (x, v) in enumerate(zip(reference[:-1], velocities(reference, h), strict=False)):
+        result = stepper(State(x, v, t * h))
+        if not result.status.ok:
+            raise InputError(
+                f"{where}: step {t + 1}: {result.status.value} of the coarse model: expected a "
+                "reference from which it can step."
+            )
+        found.append(result.state.positions)
+    return np.stack(found)
 
 
-def _engine(problem: Problem) -> OneByOne:
-    return OneByOne("pd", problem.scene.solver.tolerance, recover=True)
-
-
-def _single_steps(
-    given: Sequence[Mapping[str, Array]], problems: Sequence[Problem], numbers: Sequence[int]
-) -> list[Array]:
-    """Of chosen simulations one step from each frame of the reference but the last."""
-    h, starts = problems[0].time_step, []
-    for reference in (given[k]["reference"] for k in numbers):
-        frames = enumerate(zip(reference, velocities(reference, h), strict=True))
-        starts.append([State(x, v, t * h) for t, (x, v) in frames][:-1])
-    found = _engine(problems[0]).predictions([problems[k] for k in numbers], starts)
-    return _moved(found, numbers)
-
-
-def _moved(found: Sequence[Steps], numbers: Sequence[int]) -> list[Array]:
-    """The positions of steps that all succeeded."""
-    for k, steps in zip(numbers, found, strict=True):
-        if steps.failure:
-            raise InputError(f"simulation {k}: {steps.failure} of the coarse model.")
-    return [steps.positions for steps in found]
-
-
-def _simulation(given: Mapping[str, Array], step: float) -> Simulation:
-    reference, told = given["reference"], {"time_step": step}
-    runs = {REFERENCE: Run(reference, attributes={"solver": "imported", **told})}
-    if "coarse" in given or "predictions" in given:
-        runs[PLAIN] = Run(given.get("coarse"), given.get("predictions"), attributes=told)
-    if "best" in given:
-        runs[BEST] = Run(given["best"], given["best steps"], attributes=told)
-    return Simulation(given.get("forces", np.zeros_like(reference[1:])), runs)
+def _with_simulations(
+    shard: Shard, given: Sequence[Mapping[str, Array]], scenes: Sequence[str] = ()
+) -> Shard:
+    """The shard with its simulations; the check would find nothing but inverted cells in it."""
+    told = {"time_step": shard.attributes["time_step"]}
+    simulations = []
+    for each, scene in zip(given, scenes or [""] * len(given), strict=True):
+        reference = each["reference"]
+        runs = {REFERENCE: Run(reference, attributes={"solver": "imported", **told})}
+        if "coarse" in each or "predictions" in each:
+            runs[PLAIN] = Run(each.get("coarse"), each.get("predictions"), attributes=told)
+        if "best" in each:
+            runs[BEST] = Run(each["best"], each["best steps"], attributes=told)
+        forces = each.get("forces", np.zeros_like(reference[1:]))
+        simulations.append(Simulation(forces, runs, scene))
+    shard = replace(shard, simulations=tuple(simulations))
+    for message in file_faults(shard, inverted=True):
+        raise InputError(f"{message}.")
+    return shard
 
 
 def _array(

@@ -30,42 +30,26 @@ from pdcorrect.data.schema import SUFFIX
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Scene
 
-_DRAWS = 10_000
-"""Bodies that are drawn for a mesh before giving up on one that is not there yet."""
+_DRAWS = 10_000  # bodies that are drawn for a mesh before giving up on one that is not there yet
 
 
 @dataclass(frozen=True)
 class MeshPlan:
-    """One mesh with its material: the unit of generation, and one file of the data set.
-
-    Attributes
-    ----------
-    number : int
-        Of the mesh in its split.
-    design : Design
-        In cells.
-    young, poisson, density : float
-        Pa, dimensionless, kg/m3.
-    step : float
-        s.
-    refine : int
-        Of the reference.
-    stream : tuple of int
-        Name of the mesh's stream of random numbers.
-    """
+    """One mesh with its material: the unit of generation, and one file of the data set."""
 
     split: str
-    number: int
-    design: Design
+    number: int  # of the mesh in its split
+    design: Design  # in cells
+    # Pa, dimensionless, kg/m3
     young: float
     poisson: float
     density: float
     simulations: int
-    step: float
+    step: float  # s
     frames: int
-    refine: int
+    refine: int  # of the reference
     strength_factor: float
-    stream: tuple[int, ...]
+    stream: tuple[int, ...]  # name of the mesh's stream of random numbers
 
     @property
     def name(self) -> str:
@@ -82,11 +66,6 @@ def make_plan(config: DatasetConfig) -> list[MeshPlan]:
 
     The first mesh of the training split has the fewest and the second one the most nodes of
     the family's range, where there are two or more.
-
-    Raises
-    ------
-    InputError
-        If the family has fewer bodies than the data set wants.
     """
     plans: list[MeshPlan] = []
     known: set[str] = set()
@@ -150,17 +129,7 @@ def _with_validation(meshes: list[MeshPlan], share: float) -> list[MeshPlan]:
 
 
 def draw_scene(config: DatasetConfig, mesh: MeshPlan, simulation: int, attempt: int = 0) -> Scene:
-    """A simulation's scene, for the plain coarse model.
-
-    Parameters
-    ----------
-    config : DatasetConfig
-    mesh : MeshPlan
-    simulation : int
-        Its number on the mesh.
-    attempt : int
-        Counts the draws of this simulation's load: those before were rejected.
-    """
+    """A simulation's scene, for the plain coarse model, after ``attempt`` rejected draws."""
     rng = np.random.default_rng((*mesh.stream, 1 + simulation, attempt))
     published = config.setting == "as-published"
     cell = config.cell_size

@@ -6,14 +6,14 @@ from collections import OrderedDict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.data.folder import Damage, Folders, folders_of, read_files, shard_paths
-from pdcorrect.data.schema import REFERENCE, Simulation
-from pdcorrect.data.shard_reader import ShardHeader, read_header, read_shard
+from pdcorrect.data.folder import Damage, read_files, shard_paths
+from pdcorrect.data.schema import REFERENCE, ShardHeader, Simulation, read_header, read_shard
 from pdcorrect.errors import InputError, require_extra
 from pdcorrect.fem.graph import mesh_edges, node_means, velocities
 
@@ -28,8 +28,7 @@ CACHE_BYTES = 4 * 2**30
 """Default bound of the decoded files that a process keeps, bytes."""
 _MODULI = ("young", "poisson", "density")
 _WHOLE = ("file", "mesh", "simulation", "frame")
-_OF_WINDOWS = (*_WHOLE, "time", "time_step")
-"""One number a window."""
+_OF_WINDOWS = (*_WHOLE, "time", "time_step")  # one number a window
 _INDICES = ("cells", "edge_index")
 
 
@@ -74,40 +73,19 @@ class DecodedShard:
 class TrajectoryDataset(Dataset):  # type: ignore[misc]
     """Windows of ``window`` + 1 successive reference frames of a split's simulations.
 
-    Item i is a `MeshSample` of a mesh with n nodes, E directed edges and c cells, for a
-    window of k steps from frame t on:
-
-    ==============================  =========================================================
-    ``positions``                   (n, 3), the reference in frame t, m
-    ``velocities``                  (n, 3), (p_t - p_(t-1)) / h, zero in frame 0, m/s
-    ``targets``                     (n, k, 3), the reference in frames t + 1 .. t + k, m
-    ``predictions``                 (n, k, 3), one step of the base model from the reference
-                                    in frames t .. t + k - 1, not from its own last one, m;
-                                    without ``base`` absent
-    ``forces``                      (n, k, 3), loads of these steps, N
-    ``run_NAME``                    (n, k + 1, 3), the run's own rollout in frames t .. t + k, m
-    ``rest``, ``free``, ``mass``    (n, 3), m; (n, 3) bool; (n,), kg
-    ``young``, ``poisson``,         (n,), means over the cells of a node, Pa, -, kg/m3; with
-    ``density``                     ``cell_`` before the name (c,), for each cell
-    ``edge_index``                  (2, E), each edge of a cell once in both directions
-    ``cells``                       (c, 8), VTK order
-    ``file``, ``mesh``,             (1,), number of the file in `headers`, of the mesh in its
-    ``simulation``, ``frame``       split, of the simulation on the mesh, and t
-    ``time``, ``time_step``         (1,), of frame t, and h, s
-    ==============================  =========================================================
+    Item i is a `MeshSample` whose fields ``docs/datasets.md`` lists, of ``dtype`` but for indices
+    and masks.
 
     Files are decoded when first needed and kept in memory.  No file stays open, so the
     data set may be forked, spawned and pickled; a pickled copy starts with an empty memory.
-    `batch` assembles many windows at once and is much quicker than
-    ``Batch.from_data_list``; `TrajectoryLoader` uses it.
+    `batch`, which `TrajectoryLoader` uses, is much quicker than ``Batch.from_data_list``.
 
     Parameters
     ----------
-    folder : path, or sequence of paths
-        Of the data set; of several, whose files follow one another.
+    folder : path
     split : str
     window : int
-        k.
+        k, steps of a window.
     base : str, optional
         Run whose predictions are given, "plain", "best" or "total-mass"; None for data without.
     runs : sequence of str
@@ -115,16 +93,13 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     cache_bytes : int
         Of the decoded files that are kept, by `shard_bytes`; the last one read always is.
     dtype : torch.dtype
-        Of everything but indices and masks.
     skip_damaged : bool
         Leave out files that are damaged; all files are read once to find them.
     without : collection of str
-        Files of each data set that are left out, such as ``training/mesh-0042``.
+        Files that are left out, such as ``training/mesh-0042``.
 
     Attributes
     ----------
-    folders : tuple of Path
-        Of the data sets.
     headers : list of ShardHeader
         Of the files.
     damaged : dict of Path to str
@@ -133,15 +108,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
     Raises
     ------
     InputError
-        If there is no such split, its simulations lack a run, or all are shorter than k; if a
-        folder comes twice.
+        If there is no such split, its simulations lack a run, or all are shorter than k.
     FileFormatError
         If a file is damaged; with ``skip_damaged`` if all are.
     """
 
     def __init__(
         self,
-        folder: Folders,
+        folder: str | Path,
         split: str,
         *,
         window: int = 1,
@@ -155,14 +129,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         super().__init__()
         if not isinstance(window, (int, np.integer)) or window < 1:
             raise InputError(f"window = {window}: expected 1 step or more, a whole number.")
-        self.folders, self.split = folders_of(folder), split
+        self.split = split
         self.window, self.base, self.runs, self.dtype = window, base, tuple(runs), dtype
         self.cache_bytes = cache_bytes
         self.damaged: Damage = {}
-        paths = [path for each in self.folders for path in shard_paths(each, split, without)]
         self.headers = read_files(
-            paths, partial(read_header, verify=skip_damaged), self.damaged if skip_damaged else None
-        )
+            shard_paths(folder, split, without), partial(read_header, verify=skip_damaged),
+            self.damaged if skip_damaged else None,
+        )  # fmt: skip
         for header in self.headers:
             _check_runs(header, base, self.runs)
         counts = [max(0, steps - window + 1) for h in self.headers for steps in h.steps]
@@ -173,9 +147,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         self._starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         if not self._starts[-1]:
             longest = max((steps for h in self.headers for steps in h.steps), default=0)
-            names = ", ".join(map(str, self.folders))
             raise InputError(
-                f"{names}, {split}: no simulation has {window} steps, the longest {longest}: "
+                f"{folder}, {split}: no simulation has {window} steps, the longest {longest}: "
                 "expected a smaller window."
             )
         self._kept: OrderedDict[int, DecodedShard] = OrderedDict()
@@ -189,21 +162,14 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
 
     def get(self, idx: int) -> MeshSample:
         """Window ``idx``; its tensors are copies."""
-        ((file, simulation, frame),) = zip(*self._places(np.array([idx])), strict=True)
-        fields = self._window(int(file), int(simulation), int(frame))
-        return MeshSample(
-            num_nodes=len(fields["rest"]),
-            **{
-                name: self._numbers(name, [value]) if name in _OF_WINDOWS
-                else value.clone(memory_format=torch.contiguous_format)
-                for name, value in fields.items()
-            },
-        )  # fmt: skip
+        return self._batch(self._places(np.array([idx]))).get_example(0)
 
     def batch(self, indices: Sequence[int] | Numbers) -> Batch:
         """The windows at ``indices`` as one graph, equal to ``Batch.from_data_list``."""
-        places = zip(*(values.tolist() for values in self.places(indices)), strict=True)
-        windows = [self._window(*place) for place in places]
+        return self._batch(self.places(indices))
+
+    def _batch(self, places: tuple[Numbers, Numbers, Numbers]) -> Batch:
+        windows = [self._window(*map(int, place)) for place in zip(*places, strict=True)]
         nodes, cells, edges = (
             _ends([w[name].shape[-1] for w in windows])
             for name in ("mass", "cell_young", "edge_index")
@@ -215,7 +181,8 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             parts = [w[name] for w in windows]
             slices[name], raised[name] = nodes, torch.zeros_like(offsets)
             if name in _OF_WINDOWS:
-                batch[name], slices[name] = self._numbers(name, parts), graphs
+                dtype = torch.int64 if name in _WHOLE else self.dtype
+                batch[name], slices[name] = torch.tensor(parts, dtype=dtype), graphs
                 continue
             if name in _INDICES:
                 parts = [x + first for x, first in zip(parts, offsets.tolist(), strict=True)]
@@ -233,13 +200,7 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
         return batch
 
     def places(self, indices: Sequence[int] | Numbers) -> tuple[Numbers, Numbers, Numbers]:
-        """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,).
-
-        Raises
-        ------
-        IndexError
-            If there is no such window.
-        """
+        """Of the windows at ``indices``: file of the split, simulation of the file, frame, (B,)."""
         numbers, chosen = np.asarray(indices, dtype=np.int64), self.indices()
         if not isinstance(chosen, range):
             numbers = np.asarray(chosen, dtype=np.int64)[numbers]
@@ -287,9 +248,6 @@ class TrajectoryDataset(Dataset):  # type: ignore[misc]
             "file": file, "mesh": header.number, "simulation": simulation, "frame": frame,
             "time": frame * header.time_step, "time_step": header.time_step,
         }  # fmt: skip
-
-    def _numbers(self, name: str, values: Sequence[float]) -> Tensor:
-        return torch.tensor(values, dtype=torch.int64 if name in _WHOLE else self.dtype)
 
     def _load(self, number: int) -> DecodedShard:
         wanted: dict[str, Collection[str]] = dict.fromkeys(self.runs, ("positions",))
@@ -351,19 +309,10 @@ def _check_runs(header: ShardHeader, base: str | None, runs: Sequence[str]) -> N
 class TrajectoryLoader:
     """Batches of windows in random order, epoch after epoch.
 
-    Each epoch shuffles the files, gives every rank an equal share of their windows (the
-    last few, fewer than ranks, are left out), and shuffles the windows within blocks of
-    ``block`` successive files.  Order depends on seed, epoch, rank and ``world_size`` alone.
-
-    Parameters
-    ----------
-    dataset : TrajectoryDataset
-    batch_size : int
-    seed : int
-    block : int, optional
-        Files; by default as many as fit into the data set's cache.
-    rank, world_size : int
-        Of distributed training.
+    Each epoch shuffles the files, gives every rank of ``world_size`` an equal share of their
+    windows (the last few, fewer than ranks, are left out), and shuffles the windows within blocks
+    of ``block`` successive files, by default as many as fit into the data set's cache.  Order
+    depends on seed, epoch, rank and ``world_size`` alone.
 
     Attributes
     ----------
@@ -436,13 +385,7 @@ class TrajectoryLoader:
         return {name: getattr(self, name) for name in names} | {"windows": len(self._owners)}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Go on from where ``state`` was taken.
-
-        Raises
-        ------
-        InputError
-            If it was taken with other windows, seed, block or ranks, whose order differs.
-        """
+        """Go on from where ``state`` was taken."""
         here = self.state_dict()
         for name in here.keys() - {"epoch", "position"}:
             if state.get(name) != here[name]:

@@ -1,55 +1,35 @@
-"""What a file of a data set holds: one mesh with its material, and its simulations.
+"""Files of a data set, each of one mesh with its material and its simulations: write and read.
 
-The layout of the HDF5 file, version 1 (``docs/datasets.md``)::
-
-    /                     attributes: format, version, dataset, split, number, setting,
-                          config_hash, time_step, tolerance, content_hash
-    mesh/points           (N, 3) float64   rest positions of the coarse mesh, m
-    mesh/cells            (C, 8) int32     nodes of each cell, VTK order
-    mesh/free             (N, 3) bool      components that may move
-    mesh/mass             (N,) float64     lumped masses of the plain coarse model, kg
-    material/young        (C,) float64     Pa
-    material/poisson      (C,) float64
-    material/density      (C,) float64     kg/m3
-    simulations/KKKK/     attributes: attempt, scene (TOML), rejected (list of str)
-      forces              (T, N, 3)        nodal forces of the plain coarse model, N, step by step
-      runs/NAME/          attributes: what the run is (solver, refine, element, mass, ...)
-        positions         (T+1, N, 3)      on the coarse nodes, m; frame 0 is the rest shape
-        velocities        (T+1, N, 3)      m/s, of references in the setting "converged"
-        predictions       (T, N, 3)        one step from each frame of the reference, m
-        iterations, error_estimates (m), smallest_volume_ratios   (T,)
-    provenance/           attributes: code version, hardware, date; not part of the hash
-    cost/KKKK             attributes: seconds by run; not part of the hash
-
-Arrays without a type are float32 or, by choice, float64.  A run has positions,
-predictions or both.  In front, in the room that HDF5 leaves to others, the user block, are
-three lines of text, padded with zeros::
+`docs/datasets.md` has the layout of the HDF5 file, version 1.  In front, in the room that HDF5
+leaves to others, the user block, are three lines of text, padded with zeros::
 
     pdcorrect-dataset 1
     bytes 10485760
     sha256 0f3c...
 
-the format's version, the size of the whole file, and the SHA-256 of the first two lines
-and of everything after the user block.  A damaged file is thus found out before HDF5,
-which some damage makes crash, sees any of it.
+the format's version, the size of the whole file, and the SHA-256 of the first two lines and of
+everything after the user block.  A damaged file is thus found out before HDF5, which some damage
+makes crash, sees any of it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import part_of_process, replacing
-from pdcorrect.errors import InputError, OutputError
+from pdcorrect._files import make_folder, write_bytes
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError, OutputError
 
 FORMAT, VERSION = "pdcorrect-dataset", 1
 USER_BLOCK = 512
@@ -72,51 +52,28 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One model's answer on the coarse nodes, see the layout.
+    """One model's answer on the coarse nodes, see the layout."""
 
-    Attributes
-    ----------
-    positions : (T+1, N, 3) or None
-        Free rollout from rest, m.
-    predictions : (T, N, 3) or None
-        Positions after one step from each frame of the reference but the last, m.
-    statistics : mapping of str to (T,) arrays
-        Of the rollout, or of the predictions where there is none, see `STATISTICS`.
-    attributes : mapping of str to str, int or float
-    velocities : (T+1, N, 3) or None
-        Of the rollout, m/s, where they are not the differences of its positions.
-    """
-
-    positions: Array | None = None
+    positions: Array | None = None  # (T+1, N, 3): free rollout from rest, m
+    # (T, N, 3): positions after one step from each frame of the reference but the last, m
     predictions: Array | None = None
+    # (T,): of the rollout, or of the predictions where there is none, see `STATISTICS`
     statistics: Mapping[str, Array] = field(default_factory=dict)
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+    # (T+1, N, 3): of the rollout, m/s, where they are not the differences of its positions
     velocities: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """One load on a mesh and what the models make of it.
+    """One load on a mesh and what the models make of it."""
 
-    Attributes
-    ----------
-    forces : (T, N, 3)
-        Nodal forces of the plain coarse model, N.
-    runs : mapping of str to Run
-    scene_toml : str
-        Of the plain coarse model; empty for imported data.
-    attempt : int
-        How many draws were rejected before, and ``rejected`` why.
-    seconds : mapping of str to float
-        Cost by run.
-    """
-
-    forces: Array
+    forces: Array  # (T, N, 3): nodal forces of the plain coarse model, N
     runs: Mapping[str, Run]
-    scene_toml: str = ""
-    attempt: int = 0
+    scene_toml: str = ""  # of the plain coarse model; empty for imported data
+    attempt: int = 0  # how many draws were rejected before, and ``rejected`` why
     rejected: tuple[str, ...] = ()
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)  # cost by run
 
     @property
     def steps(self) -> int:
@@ -178,15 +135,7 @@ def write_shard(
 ) -> str:
     """Write a file whole or not at all; returns the hash of its content.
 
-    Parameters
-    ----------
-    path : path
-        In a folder that need not exist.
-    shard : Shard
-    dtype : {"float32", "float64"}
-        Of forces and positions.
-    overwrite : bool
-        Replace an existing file.
+    ``dtype``, "float32" or "float64", is that of forces, positions and velocities.
 
     Raises
     ------
@@ -204,18 +153,12 @@ def write_shard(
         )
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK) as file:
-        _fill(file, shard, np.dtype(dtype))
+        _write(file, shard, np.dtype(dtype))
         found = content_hash(file)
         file.attrs[HASH] = found
     seal(image.getbuffer())
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path, part_of_process(path)) as part, open(part, "wb") as stream:
-            stream.write(image.getbuffer())
-            stream.flush()
-            os.fsync(stream.fileno())
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({error.strerror}).") from None
+    make_folder(path.parent)
+    write_bytes(path, image.getvalue())
     return found
 
 
@@ -228,35 +171,35 @@ def seal(image: memoryview) -> None:
     image[:USER_BLOCK] = text.ljust(USER_BLOCK, b"\0")
 
 
-def _fill(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
+def _write(file: h5py.File, shard: Shard, dtype: np.dtype[Any]) -> None:
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
     for name, wanted in ATTRIBUTES.items():
         file.attrs[name] = wanted(shard.attributes[name])
     for name, (place, kind, _) in MESH.items():
-        _array(file, place, np.asarray(getattr(shard, name)), np.dtype(kind))
+        _write_array(file, place, np.asarray(getattr(shard, name)), np.dtype(kind))
     for k, simulation in enumerate(shard.simulations):
         group = file.create_group(f"simulations/{k:04d}")
         group.attrs["attempt"] = simulation.attempt
         group.attrs["scene"] = simulation.scene_toml
         group.attrs["rejected"] = np.array(simulation.rejected, dtype=h5py.string_dtype())
-        _array(group, "forces", simulation.forces, dtype)
+        _write_array(group, "forces", simulation.forces, dtype)
         for name, run in simulation.runs.items():
-            _fill_run(group.create_group(f"runs/{name}"), run, dtype)
+            _write_run(group.create_group(f"runs/{name}"), run, dtype)
         cost = file.create_group(f"cost/{k:04d}")
         cost.attrs.update(dict(simulation.seconds))
     file.create_group("provenance").attrs.update(dict(shard.provenance))
 
 
-def _fill_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
+def _write_run(group: h5py.Group, run: Run, dtype: np.dtype[Any]) -> None:
     group.attrs.update(dict(run.attributes))
     for name in MOTION:
         if getattr(run, name) is not None:
-            _array(group, name, getattr(run, name), dtype)
+            _write_array(group, name, getattr(run, name), dtype)
     for name, values in run.statistics.items():
-        _array(group, name, np.asarray(values), np.dtype(STATISTICS[name]))
+        _write_array(group, name, np.asarray(values), np.dtype(STATISTICS[name]))
 
 
-def _array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) -> None:
+def _write_array(group: h5py.Group, name: str, values: Array, dtype: np.dtype[Any]) -> None:
     """One compressed chunk; its checksum is for programs that do not know the file's."""
     group.create_dataset(
         name, data=np.asarray(values, dtype=dtype), chunks=values.shape, compression="gzip",
@@ -283,3 +226,181 @@ def content_hash(file: h5py.File) -> str:
             if key != HASH:
                 digest.update(f"{key}={np.asarray(item.attrs[key]).tolist()!r}\n".encode())
     return digest.hexdigest()
+
+
+# --- reading -----------------------------------------------------------------------------
+
+Lengths = dict[int | str, int]
+"""Of the axes that were met so far: N, C, and of a simulation T and T+1."""
+
+
+@dataclass(frozen=True)
+class ShardHeader:
+    """What a file holds, found without reading its arrays."""
+
+    path: Path
+    number: int  # of the mesh in its split
+    nodes: int
+    cells: int
+    steps: tuple[int, ...]  # T of each simulation
+    # for each simulation: names of runs with positions, and of those with predictions
+    runs: tuple[tuple[frozenset[str], frozenset[str]], ...]
+    time_step: float  # s
+    config_hash: str
+    content_hash: str
+
+
+def read_header(path: str | Path, *, verify: bool = False) -> ShardHeader:
+    """Sizes and names of a file of a data set; ``verify`` compares all of it with its checksum."""
+    with _opened(Path(path), verify) as file:
+        groups = [file["simulations"][key] for key in sorted(file["simulations"])]
+        return ShardHeader(
+            path=Path(path),
+            number=int(file.attrs["number"]),
+            nodes=len(file[MESH["points"][0]]),
+            cells=len(file[MESH["cells"][0]]),
+            steps=tuple(len(group["forces"]) for group in groups),
+            runs=tuple((_with(g, "positions"), _with(g, "predictions")) for g in groups),
+            time_step=float(file.attrs["time_step"]),
+            config_hash=str(file.attrs["config_hash"]),
+            content_hash=str(file.attrs[HASH]),
+        )
+
+
+def _with(simulation: h5py.Group, name: str) -> frozenset[str]:
+    return frozenset(run for run, group in simulation["runs"].items() if name in group)
+
+
+def read_shard(
+    path: str | Path,
+    *,
+    runs: Collection[str] | Mapping[str, Collection[str]] | None = None,
+) -> Shard:
+    """Read a file of a data set, and find every changed byte by its checksum.
+
+    ``runs`` are names of those to read, as far as they are there; with names of arrays, such as
+    "predictions", only these of each.  `FileFormatError` names the file and the reason if it cannot
+    be read, is damaged or something else.
+    """
+    with _opened(Path(path), verify=True) as file:
+        lengths: Lengths = {}
+        arrays = {
+            name: _read_array(file, at, shape, lengths) for name, (at, _, shape) in MESH.items()
+        }
+        low, high, nodes = arrays["cells"].min(), arrays["cells"].max(), lengths["N"]
+        if low < 0 or high >= nodes:
+            told = f"mesh/cells refers to nodes {low} to {high}: expected 0 to {nodes - 1}"
+            raise FileFormatError(told)
+        return Shard(
+            attributes={name: kind(file.attrs[name]) for name, kind in ATTRIBUTES.items()},
+            **arrays,
+            simulations=tuple(
+                _read_simulation(file, f"{k:04d}", runs, dict(lengths))
+                for k in range(len(file["simulations"]))
+            ),
+            provenance={name: str(text) for name, text in file["provenance"].attrs.items()},
+            content_hash=str(file.attrs[HASH]),
+        )
+
+
+@contextlib.contextmanager
+def _opened(path: Path, verify: bool) -> Iterator[h5py.File]:
+    """A file of a data set, open; whatever fails in it is a `FileFormatError`."""
+    if not path.is_file():
+        raise FileFormatError(f"{path}: there is no such file.")
+    try:
+        with path.open("rb") as stream:
+            _check_seal(stream, verify)
+            with h5py.File(stream, "r") as file:
+                yield file
+    except FileFormatError as error:
+        raise type(error)(f"{path}: {error}.") from None
+    except Exception as error:  # HDF5 raises nearly every type on damaged bytes
+        reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
+        raise FileFormatError(f"{path}: cannot be read ({reason}).") from error
+
+
+_SEAL = re.compile(
+    rb"(?P<lead>pdcorrect-dataset (?P<version>\d{1,9})\nbytes (?P<size>\d{1,18})\n)"
+    rb"sha256 (?P<sum>[0-9a-f]{64})\n\0*"
+)
+
+
+def _check_seal(file: IO[bytes], verify: bool) -> None:
+    """Compare an open file's size and version with its user block, if asked to all its bytes."""
+    block, size = file.read(USER_BLOCK), os.fstat(file.fileno()).st_size
+    found = _SEAL.fullmatch(block) if len(block) == USER_BLOCK else None
+    if found is None:
+        cut = 0 < size < USER_BLOCK and block.startswith(FORMAT.encode()[:size])
+        what = "truncated" if cut else "no file of a data set, or damaged at its beginning"
+        raise FileFormatError(f"{what}: expected {FORMAT!r} and a checksum in front")
+    if int(found["size"]) != size:
+        what = "truncated" if size < int(found["size"]) else "damaged"
+        raise FileFormatError(f"{what}: expected {int(found['size'])} bytes, got {size}")
+    if verify:
+        digest = hashlib.file_digest(file, lambda: hashlib.sha256(found["lead"]))  # type: ignore[arg-type]
+        if digest.hexdigest() != found["sum"].decode():
+            raise FileFormatError(
+                "damaged: its checksum (SHA-256) is not the one in front; copy or generate it again"
+            )
+    if int(found["version"]) != VERSION:
+        raise FileVersionError(
+            f"format version {int(found['version'])}: this pdcorrect reads version {VERSION}"
+        )
+
+
+def _read_simulation(
+    file: h5py.File,
+    key: str,
+    wanted: Collection[str] | Mapping[str, Collection[str]] | None,
+    lengths: Lengths,
+) -> Simulation:
+    group, cost = file["simulations"][key], file["cost"][key]
+    forces = _read_array(group, "forces", ("T", "N", 3), lengths)
+    lengths["T+1"] = len(forces) + 1
+    runs = {}
+    for name, run in group["runs"].items():
+        if wanted is None or name in wanted:
+            arrays = wanted[name] if isinstance(wanted, Mapping) else (*MOTION, *STATISTICS)
+            runs[name] = _read_run(run, arrays, lengths)
+    return Simulation(
+        forces=forces,
+        runs=runs,
+        scene_toml=str(group.attrs["scene"]),
+        attempt=int(group.attrs["attempt"]),
+        rejected=tuple(group.attrs["rejected"]),
+        seconds={name: float(value) for name, value in cost.attrs.items()},
+    )
+
+
+def _read_run(group: h5py.Group, wanted: Collection[str], lengths: Lengths) -> Run:
+    found = {
+        name: _read_array(group, name, MOTION.get(name, ("T",)), lengths)
+        for name in wanted
+        if name in group
+    }
+    return Run(
+        **{name: found.get(name) for name in MOTION},
+        statistics={name: values for name, values in found.items() if name in STATISTICS},
+        attributes={
+            name: value if isinstance(value, str) else value.item()
+            for name, value in group.attrs.items()
+        },
+    )
+
+
+def _read_array(
+    group: h5py.Group, name: str, shape: tuple[int | str, ...], lengths: Lengths
+) -> Array:
+    """A dataset, finite and of a given shape, in which a new letter stands for any length."""
+    dataset = group[name]
+    place = dataset.name.lstrip("/")
+    values = np.asarray(dataset[()])
+    if values.ndim == len(shape):
+        lengths |= {n: m for n, m in zip(shape, values.shape, strict=True) if n not in lengths}
+    expected = tuple(lengths.get(n, n) if isinstance(n, str) else n for n in shape)
+    if values.shape != expected:
+        raise FileFormatError(f"{place} has shape {values.shape}: expected {shape} = {expected}")
+    if not np.isfinite(values).all():
+        raise FileFormatError(f"{place} has infinite or NaN entries")
+    return values

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,32 +40,15 @@ from pdcorrect.state import State
 
 @dataclass(frozen=True)
 class Model:
-    """How a simulation is discretised and stepped.
-
-    Attributes
-    ----------
-    refine : int
-    best : bool
-        With the setting's better element and mass, see `_better`.
-    predict : bool
-        Whether to take single steps from the reference, too.
-    divisor : int
-        Parts of each time step.
-    heavy : bool
-        Density scaled so that the mass is the reference's.
-    truth : bool
-        Stepped by the reference's solver.
-    sample : bool
-        For the first simulation of the mesh only.
-    """
+    """How a simulation is discretised and stepped."""
 
     refine: int
-    best: bool = False
-    predict: bool = False
-    divisor: int = 1
-    heavy: bool = False
-    truth: bool = False
-    sample: bool = False
+    best: bool = False  # with the setting's better element and mass, see `_better`
+    predict: bool = False  # whether to take single steps from the reference, too
+    divisor: int = 1  # parts of each time step
+    heavy: bool = False  # density scaled so that the mass is the reference's
+    truth: bool = False  # stepped by the reference's solver
+    sample: bool = False  # for the first simulation of the mesh only
 
 
 def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
@@ -128,26 +110,14 @@ MOST_ATTEMPTS = 20
 """Draws of a simulation's load before the data set is given up."""
 
 
-@dataclass(frozen=True)
-class Engines:
-    """What steps the models, the reference, and meshes that are too large for either.
-
-    Attributes
-    ----------
-    models, truth, large : Engine
-    largest : int
-        Nodes beyond which a mesh is ``large``'s.
-    """
+class Engines(NamedTuple):
+    """What steps the models, and the reference."""
 
     models: Engine
     truth: Engine
-    large: Engine
-    largest: int = sys.maxsize
 
-    def of(self, model: Model, problem: Problem) -> Engine:
+    def of(self, model: Model) -> Engine:
         """The engine for a run."""
-        if len(problem.positions) > self.largest:
-            return self.large
         return self.truth if model.truth else self.models
 
 
@@ -201,19 +171,8 @@ class _Draft:
 def simulate(config: DatasetConfig, plans: Sequence[MeshPlan], engines: Engines) -> list[Shard]:
     """All simulations of some meshes of one split, computed together.
 
-    A drawn load under which a run fails or inverts a cell is rejected and drawn again.
-
-    Parameters
-    ----------
-    config : DatasetConfig
-    plans : sequence of MeshPlan
-        Of one split.
-    engines : Engines
-
-    Raises
-    ------
-    ConvergenceError
-        If a simulation is rejected `MOST_ATTEMPTS` times.
+    A drawn load under which a run fails or inverts a cell is rejected and drawn again, and
+    `ConvergenceError` is raised after `MOST_ATTEMPTS` draws.
     """
     waiting: list[_Draft] = []
     for plan in plans:
@@ -258,28 +217,18 @@ def _attempt(drafts: Sequence[_Draft], engines: Engines) -> None:
         return [d for d in drafts if d.alive and d.wants(name)]
 
     for name in sorted(names, key=lambda n: (names[n].refine, names[n].divisor)):
-        chosen = wanted(name)
-        for draft, steps in zip(chosen, _rollouts(chosen, name, names[name], engines), strict=True):
-            draft.keep(draft.steps, name, steps)
+        if chosen := wanted(name):
+            model, problems = names[name], [draft.loaded(name) for draft in chosen]
+            frames = chosen[0].plan.frames
+            found = engines.of(model).rollouts(problems, frames, model.divisor)
+            for draft, steps in zip(chosen, found, strict=True):
+                draft.keep(draft.steps, name, steps)
     for name in (n for n, model in names.items() if model.predict):
         if chosen := wanted(name):
             problems, states = [d.loaded(name) for d in chosen], [_states(d) for d in chosen]
             found = engines.models.predictions(problems, states)
             for draft, steps in zip(chosen, found, strict=True):
                 draft.keep(draft.predictions, name, steps)
-
-
-def _rollouts(drafts: Sequence[_Draft], name: str, model: Model, engines: Engines) -> list[Steps]:
-    """One run of some drafts; each by the engine that its mesh needs."""
-    problems = [draft.loaded(name) for draft in drafts]
-    chosen = [engines.of(model, problem) for problem in problems]
-    found: dict[int, Steps] = {}
-    for engine in {id(each): each for each in chosen}.values():
-        own = [i for i, each in enumerate(chosen) if each is engine]
-        frames = drafts[0].plan.frames
-        steps = engine.rollouts([problems[i] for i in own], frames, model.divisor)
-        found |= dict(zip(own, steps, strict=True))
-    return [found[i] for i in range(len(problems))]
 
 
 def _states(draft: _Draft) -> list[State]:
@@ -329,7 +278,7 @@ def _run(draft: _Draft, name: str, engines: Engines, setting: str) -> Run:
         predictions=None if predictions is None else predictions.positions,
         statistics={key: getattr(steps, key) for key in STATISTICS},
         attributes={
-            **engines.of(model, problem).describe(),
+            **engines.of(model).describe(),
             "refine": model.refine,
             "nodes": len(problem.positions),
             "element": problem.element,
@@ -356,21 +305,9 @@ def discretise_stored(scene: Scene, shard: Shard, refine: int = 1) -> Problem:
 def rebuilt_problems(shard: Shard, path: Path, run: str = PLAIN) -> list[Problem]:
     """The problem of each simulation of a file, discretised as one of its runs was.
 
-    They share mesh, operators and masses.
-
-    Parameters
-    ----------
-    shard : Shard
-    path : Path
-        Of its file, for messages.
-    run : str
-        One of `pdcorrect.fem.problem.BASES`, or "reference".
-
-    Raises
-    ------
-    InputError
-        If a simulation has no scene, as imported ones, lacks the run, or what its scene
-        leads to is not what the file holds.
+    They share mesh, operators and masses.  ``path`` is the file's, for messages, and ``run`` one of
+    `pdcorrect.fem.problem.BASES`, or "reference".  `InputError` if a simulation has no scene, as
+    imported ones, lacks the run, or what its scene leads to is not what the file holds.
     """
     stored = shard.simulations[0].runs.get(run)
     if stored is None or run not in (*BASES, REFERENCE):

@@ -8,140 +8,99 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pdcorrect.data.folder import Damage, all_shards, read_files, splits_of
-from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import PLAIN, REFERENCE, Shard, Simulation, read_shard
 from pdcorrect.errors import InputError
 from pdcorrect.metrics import error_corrected, largest_displacement, mean_squared_error, rms_error
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class RunInfo:
-    """One run over the simulations that have it; None where nothing tells.
-
-    Attributes
-    ----------
-    simulations : int
-    iterations : float or None
-        Mean of a step.
-    relative_error : float or None
-        Of the rollout from the reference's, over that one's RMS displacement, mean over
-        simulations; beside a converged reference the error that counts.
-    rms_error : float or None
-        The same in m.
-    step_error : float or None
-        RMS distance from the reference after one step from each of its frames, mean, m.
-    omega : float or None
-        Share of the plain run's squared error that it removes, per cent, mean.
-    seconds : float
-        Cost, of single steps too.
-    """
+    """One run over the simulations that have it; None where nothing tells."""
 
     simulations: int
-    iterations: float | None
+    iterations: float | None  # mean of a step
+    # of the rollout from the reference's, over that one's RMS displacement, mean over simulations;
+    # beside a converged reference the error that counts
     relative_error: float | None
-    rms_error: float | None
+    rms_error: float | None  # the same in m
+    # RMS distance from the reference after one step from each of its frames, mean, m
     step_error: float | None
-    omega: float | None
-    seconds: float
+    omega: float | None  # share of the plain run's squared error that it removes, per cent, mean
+    seconds: float  # cost, of single steps too
 
 
 @dataclass(frozen=True)
 class SplitInfo:
-    """A split, or the whole data set.
-
-    Attributes
-    ----------
-    meshes, simulations, frames, bytes : int
-        Frames over all simulations, without the rest shape.
-    nodes, young, poisson, density : (smallest, largest)
-        Of its meshes; Pa, dimensionless, kg/m3.
-    displacement : (smallest, largest)
-        Of the simulations' largest ones, m.
-    rejection_rate : float
-        Rejected draws over all draws.
-    rejections : mapping of str to int
-        Rejected draws by "run, reason".
-    runs : mapping of str to RunInfo
-    seconds : float
-        Cost of all runs.
-    """
+    """A split, or the whole data set."""
 
     meshes: int
     simulations: int
-    frames: int
+    frames: int  # over all simulations, without the rest shape
     bytes: int
+    # smallest and largest of its meshes; Pa, dimensionless, kg/m3
     nodes: Range
     young: Range
     poisson: Range
     density: Range
-    displacement: Range
-    rejection_rate: float
-    rejections: Mapping[str, int]
+    displacement: Range  # smallest and largest of the simulations' largest ones, m
+    rejection_rate: float  # rejected draws over all draws
+    rejections: Mapping[str, int]  # rejected draws by "run, reason"
     runs: Mapping[str, RunInfo]
-    seconds: float
+    seconds: float  # cost of all runs
 
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """A data set in numbers, as a whole and by split.
-
-    Attributes
-    ----------
-    name : str
-    whole : SplitInfo
-    splits : mapping of str to SplitInfo
-    damaged : mapping of str to str
-        Files that were left out, and what is wrong with them.
-    """
+    """A data set in numbers, as a whole and by split."""
 
     name: str
     whole: SplitInfo
     splits: Mapping[str, SplitInfo]
+    # files that were left out, and what is wrong with them
     damaged: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> str:
         """All numbers, in SI units and per cent."""
         return json.dumps(asdict(self), indent=2, allow_nan=False)
 
-    def tables(self) -> Iterable[Table]:
-        """Sizes, runs and rejected loads, for rich's console."""
+    def tables(self) -> Iterable[tuple[str, Sequence[str], list[Sequence[str]], int]]:
+        """Of sizes, runs and rejected loads title, headings, rows, and columns that are names."""
         several = [("all", self.whole)] if len(self.splits) > 1 else []
         splits = [*self.splits.items(), *several]
-        yield _table(
+        yield (
             f"{self.name}: sizes, materials, and largest displacements of the simulations",
             ("split", "meshes", "simulations", "frames", "MB", "nodes", "E, kPa", "ν",
              "density, kg/m3", "displacement, mm", "loads rejected, %"),
-            ((
+            [(
                 name, *map(str, (split.meshes, split.simulations, split.frames)),
                 _text(split.bytes, 1e-6), _between(split.nodes), _between(split.young, 1e-3),
                 _between(split.poisson), _between(split.density),
                 _between(split.displacement, 1e3), _text(split.rejection_rate, 100.0),
-            ) for name, split in splits),
+            ) for name, split in splits], 1,
         )  # fmt: skip
-        yield _table(
+        yield (
             "runs: mean distance from the reference; Omega, % of the plain run's squared error; "
             "cost",
             ("split", "run", "simulations", "error, %", "RMS, mm", "one step, mm", "Omega",
              "iterations", "s"),
-            ((
+            [(
                 name, label, str(run.simulations), _text(run.relative_error, 100.0),
                 _text(run.rms_error, 1e3), _text(run.step_error, 1e3), _text(run.omega),
                 _text(run.iterations), _text(run.seconds or None),
-            ) for name, split in splits for label, run in split.runs.items()),
+            ) for name, split in splits for label, run in split.runs.items()], 2,
         )  # fmt: skip
         if self.whole.rejections:
-            rows = ((n, why, str(k)) for n, s in splits for why, k in s.rejections.items())
-            yield _table("loads rejected", ("split", "reason", "draws"), rows)
+            rows: list[Sequence[str]] = [
+                (n, why, str(k)) for n, s in splits for why, k in s.rejections.items()
+            ]
+            yield "loads rejected", ("split", "reason", "draws"), rows, 2
 
 
 def dataset_info(
@@ -150,15 +109,9 @@ def dataset_info(
     *,
     skip_damaged: bool = False,
 ) -> DatasetInfo:
-    """Read a data set and summarise it.
+    """Read a data set and summarise it; ``on_file`` is called with each file after it was read.
 
-    Parameters
-    ----------
-    folder : path
-    on_file : callable, optional
-        Called with each file after it was read.
-    skip_damaged : bool
-        Whether damaged files are left out, and listed in the result.
+    With ``skip_damaged`` damaged files are left out, and listed in the result.
 
     Raises
     ------
@@ -266,22 +219,6 @@ def _run_info(name: str, motions: Sequence[_Numbers]) -> RunInfo:
     keys = (name, f"{name} steps")
     seconds = sum(motion["seconds"].get(key, 0.0) for motion in motions for key in keys)
     return RunInfo(simulations=len(runs), seconds=seconds, **means)
-
-
-def _table(title: str, headings: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD,
-        padding=(0, 1, 0, 0), pad_edge=False,
-    )  # fmt: skip
-    for heading in headings:
-        left = heading in ("split", "run", "reason")
-        table.add_column(heading, justify="left" if left else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    return table
 
 
 def _between(values: Range, factor: float = 1.0) -> str:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +19,11 @@ import numba
 from pdcorrect._environment import code_digest, environment
 from pdcorrect._files import ctrl_c_ignored
 from pdcorrect.data.configuration import DatasetConfig
-from pdcorrect.data.engines import OneByOne
+from pdcorrect.data.engines import Engine, OneByOne
 from pdcorrect.data.plan import MeshPlan
 from pdcorrect.data.schema import write_shard
 from pdcorrect.data.simulate import Engines, simulate
 from pdcorrect.errors import InputError, require_extra
-
-LARGEST_BATCHED = 150_000
-"""Nodes of the largest mesh that is stepped in batches.
-
-A step takes about 11 kB a node of hex8-bubble-mean (docs/differentiable.md), so a batch of 32
-such meshes takes 56 GB.  The published meshes cut into 8 x 8 x 8 have 138 000 nodes.
-"""
 
 
 def produce(
@@ -47,22 +41,16 @@ def produce(
 
 
 def make_engines(config: DatasetConfig, device: str) -> Engines:
-    """The engines for a device.
-
-    Newton, and on a GPU meshes of more than `LARGEST_BATCHED` nodes, of which a batch might
-    not fit, step one problem after the other on the CPU.
-    """
+    """The engines for a device; Newton steps one problem after the other on the CPU."""
     adds_up = config.setting == "converged"
-    alone = OneByOne("pd", config.tolerance, adds_up)
-    newton = config.reference.solver == "newton"
-    truth = OneByOne("newton", config.tolerance, adds_up) if newton else None
-    if device == "cpu":
-        return Engines(alone, truth or alone, truth or alone)
-    require_extra("torch", "learn")
-    from pdcorrect.data.batch_engine import Batched
+    models: Engine = OneByOne("pd", config.tolerance, adds_up)
+    if device != "cpu":
+        require_extra("torch", "learn")
+        from pdcorrect.data.batch_engine import Batched
 
-    batched = Batched(device, config.tolerance, adds_up=adds_up)
-    return Engines(batched, truth or batched, truth or alone, LARGEST_BATCHED)
+        models = Batched(device, config.tolerance, adds_up=adds_up)
+    newton = config.reference.solver == "newton"
+    return Engines(models, OneByOne("newton", config.tolerance, adds_up) if newton else models)
 
 
 @contextlib.contextmanager
@@ -99,28 +87,18 @@ _PATIENCE, _ANSWER = 600, 10
 class Workers:
     """Who computes.
 
-    Attributes
-    ----------
-    count : int
-        Processes on this machine, each with one thread.
-    scheduler : str or None
-        Address of a Dask scheduler whose workers are used instead.
-    device : str
-        "cpu": one simulation at a time.  "cuda": batches; with several workers on this
-        machine each takes a GPU of its own.
-    batch : int
-        Simulations that are computed together on a GPU.
-
     Raises
     ------
     InputError
         If ``count`` or ``batch`` is less than 1, or the device is another.
     """
 
-    count: int = 1
-    scheduler: str | None = None
+    count: int = 1  # processes on this machine, each with one thread
+    scheduler: str | None = None  # address of a Dask scheduler whose workers are used instead
+    # "cpu": one simulation at a time.  "cuda": batches; with several workers on this machine each
+    # takes a GPU of its own
     device: str = "cpu"
-    batch: int = 32
+    batch: int = 32  # simulations that are computed together on a GPU
 
     def __post_init__(self) -> None:
         for name, value in (("count", self.count), ("batch", self.batch)):
@@ -141,20 +119,13 @@ def computed(
     workers: Workers,
     deadline: float | None,
 ) -> Iterator[list[MeshPlan]]:
-    """Units in order of completion."""
-
-    def waiting() -> Iterator[list[MeshPlan]]:
-        """Units, until time is up."""
-        for unit in units:
-            if deadline is not None and time.monotonic() > deadline:
-                return
-            yield unit
-
+    """Units in order of completion; none is begun after the deadline."""
+    waiting = takewhile(lambda _: deadline is None or time.monotonic() <= deadline, units)
     if workers.scheduler is None and min(workers.count, len(units)) < 2:
-        for unit in waiting():
+        for unit in waiting:
             yield produce(config, folder, unit, workers.device)
         return
-    yield from _distributed(partial(_work, config, folder.resolve()), waiting(), workers)
+    yield from _distributed(partial(_work, config, folder.resolve()), waiting, workers)
 
 
 def _distributed(

@@ -31,12 +31,10 @@ TIME_ERROR, MESH_ERROR, MESH_CHECK = "time_error", "mesh_error", "mesh_error_fro
 """Attributes of runs whose own error was asked for."""
 
 INTEGRATOR = {"integrator": "generalised-alpha", "spectral_radius": 0.8}
-_MOST_CELLS = 60_000
-"""Of a mesh that is only for the estimate of another's error."""
+_MOST_CELLS = 60_000  # of a mesh that is only for the estimate of another's error
 FINER = 2
 """Times as many cells along each axis, and substeps, as a run whose error is estimated."""
-_SAME = 1e-9
-"""Of the cell size, for states that are the same."""
+_SAME = 1e-9  # of the cell size, for states that are the same
 
 OnRun = Callable[[str, int, int], None]
 """Called with what is computed, its frame, and their number."""
@@ -216,12 +214,7 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> NDArray
 def finer_run(
     scene: Scene, frames: int, refine: int = 1, *, on_step: OnStep | None = None
 ) -> Trajectory:
-    """The run from which `error_estimate` measures those with ``refine`` cells for each coarse one.
-
-    Raises
-    ------
-    ConvergenceError
-    """
+    """What `error_estimate` measures runs from, of ``refine`` cells for each coarse one."""
     # weights tuned to a body do not know finer cells
     scene = scene.with_changes(solver={"weights": None})
     if scene.time.integrator != "quasi-static":

@@ -55,24 +55,14 @@ OnCases = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A corrector to be evaluated.
+    """A corrector to be evaluated."""
 
-    Attributes
-    ----------
-    name : str
-        Unlike the other candidates' and the stored runs'.
-    base : str
-        Run of the coarse model that it corrects: "plain", "best" or "total-mass".
-    hybrid : callable
-        From a stepper of that model's problems to their corrected step.
-    alone : callable or None
-        From one problem of that model to its corrected step, which a CPU takes in the place of
-        ``hybrid``; None: batches there, too.
-    """
-
-    name: str
-    base: str
+    name: str  # unlike the other candidates' and the stored runs'
+    base: str  # run of the coarse model that it corrects: "plain", "best" or "total-mass"
+    # from a stepper of that model's problems to their corrected step
     hybrid: Callable[[BatchStepper], Hybrid]
+    # from one problem of that model to its corrected step, which a CPU takes in the place of
+    # ``hybrid``; None: batches there, too
     alone: Callable[[Problem], HybridStepper] | None = None
 
 
@@ -123,13 +113,6 @@ def saved_candidates(
     Which coarse model one corrects, and how velocities follow, is what its training says; "plain"
     and "recomputed" where it says nothing.  Without a gate only corrections that are not finite
     are refused.
-
-    Raises
-    ------
-    InputError
-        If a model is missing or comes twice.
-    FileFormatError
-        If one is damaged.
     """
     names = unlike_ends([model_folder(path).resolve() for path in paths])
     return [_saved(path, name, device, gate) for path, name in zip(paths, names, strict=True)]
@@ -154,18 +137,10 @@ def _saved(path: str | Path, name: str, device: str, gate: Gate | None) -> Saved
 
 @dataclass(frozen=True, eq=False)
 class EvaluatedRun:
-    """One run over the trajectories that have it.
-
-    Attributes
-    ----------
-    name : str
-    base : str or None
-        Of a `Candidate`.
-    trajectories : tuple of MeasuredRollout
-    """
+    """One run over the trajectories that have it."""
 
     name: str
-    base: str | None
+    base: str | None  # of a `Candidate`
     trajectories: tuple[MeasuredRollout, ...]
 
     def values(self, measure: str) -> tuple[list[float], list[int]]:
@@ -187,29 +162,17 @@ class EvaluatedRun:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Runs of a split.
-
-    Attributes
-    ----------
-    dataset, split, setting, config_hash : str
-    time_step : float
-        s.
-    runs : mapping of str to EvaluatedRun
-        Candidates, then stored runs, "reference" last: of the latter only energies are of
-        interest.
-    shards : mapping of str to str
-        Content hash of each file, by its name.
-    missing : tuple of Path
-        Files that the data set's configuration asks for and that are not there.
-    """
+    """Runs of a split."""
 
     dataset: str
     split: str
     setting: str
     config_hash: str
-    time_step: float
+    time_step: float  # s
+    # candidates, then stored runs, "reference" last: of the latter only energies are of interest
     runs: Mapping[str, EvaluatedRun]
-    shards: Mapping[str, str]
+    shards: Mapping[str, str]  # content hash of each file, by its name
+    # files that the data set's configuration asks for and that are not there
     missing: tuple[Path, ...] = ()
 
 
@@ -226,9 +189,9 @@ def evaluate(
 ) -> Evaluation:
     """Free rollouts and single steps of candidates, and of the stored runs, measured.
 
-    Every simulation is stepped again from rest, in all of the reference's frames, as the
-    data set's coarse runs were; see `measures` for what is measured and `roll_out` for what
-    becomes of simulations that fail.
+    Every simulation is stepped again from rest, in all of the reference's frames, as the data set's
+    coarse runs were; see `measures` for what is measured and `roll_out` for what becomes of
+    simulations that fail.
 
     Parameters
     ----------
@@ -249,10 +212,10 @@ def evaluate(
     Raises
     ------
     InputError
-        If names are not unlike, a base is none, files of the split are missing, or as of
-        `read_cases`.
+        If names are not unlike, files of the split are missing or of several data sets, or its
+        problems, or those of a base, cannot be rebuilt.
     FileFormatError
-        As of `read_cases`.
+        If a file is damaged.
     """
     if batch < 1 or workers < 1:
         raise InputError(f"batch = {batch}, workers = {workers}: expected 1 or more.")

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.data.configuration import EVALUATION
 from pdcorrect.data.folder import shard_paths
-from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard
-from pdcorrect.data.shard_reader import read_shard
+from pdcorrect.data.schema import CONVERGED, PLAIN, REFERENCE, Shard, read_shard
 from pdcorrect.data.simulate import rebuilt_problems
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.evaluation.rollouts import Outcome
@@ -37,24 +36,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class EvaluationCase:
-    """A simulation of a split and what is known of it.
+    """A simulation of a split and what is known of it."""
 
-    Attributes
-    ----------
-    mesh, simulation : int
-        Numbers of the mesh in its split and of the simulation on it.
-    problems : mapping of str to Problem
-        Coarse models by the run they made, "plain" among them.
-    reference : (T+1, N, 3)
-        m.
-    runs, predictions : mappings of str to (T+1, N, 3) and (T, N, 3)
-        Stored rollouts, and single steps from the reference's frames, m.
-    """
-
+    # numbers of the mesh in its split and of the simulation on it
     mesh: int
     simulation: int
-    problems: Mapping[str, Problem]
-    reference: Array
+    problems: Mapping[str, Problem]  # coarse models by the run they made, "plain" among them
+    reference: Array  # (T+1, N, 3), m
+    # (T+1, N, 3) and (T, N, 3), m: stored rollouts, and single steps from the reference's frames
     runs: Mapping[str, Array]
     predictions: Mapping[str, Array]
     _energies: dict[str, EnergyBalance] = field(default_factory=dict, repr=False)
@@ -82,15 +71,7 @@ class SplitCases(NamedTuple):
 def read_cases(
     folder: str | Path, split: str = EVALUATION, bases: Iterable[str] = ()
 ) -> SplitCases:
-    """All simulations of a split, and problems of the plain coarse model and of ``bases``.
-
-    Raises
-    ------
-    InputError
-        If the split is missing, of several data sets, or its problems cannot be rebuilt.
-    FileFormatError
-        If a file is damaged.
-    """
+    """All simulations of a split, and problems of the plain coarse model and of ``bases``."""
     attributes: list[Mapping[str, str | int | float]] = []
     cases: list[EvaluationCase] = []
     shards: dict[str, str] = {}
@@ -178,89 +159,55 @@ def stress_error(problem: Problem, positions: Array, reference: Array) -> float 
 
 @dataclass(frozen=True)
 class TrajectoryMeasures:
-    """Of one run of one case; None where something needed is not there.
-
-    Attributes
-    ----------
-    mesh, simulation : int
-    omega : float
-        Share of the plain run's squared error that is removed (eq. 7-2), per cent.
-    omega_base : float
-        The same of the run's own coarse model.
-    rms_error, worst_node : float
-        RMS and largest distance of nodes over frames 1..T, m.
-    step_omega, step_rms_error : float
-        As ``omega`` and ``rms_error``, of single steps from the reference's frames.
-    energy_error : float
-        RMS over frames of the difference of kinetic and elastic energy from the
-        reference's, over the reference's largest.
-    energy_loss : float
-        Energy that is missing at the end (`EnergyBalance.dissipation`), over the largest of
-        the run; negative if it has gained some.
-    linear_momentum_error, angular_momentum_error : float
-        RMS over frames of the difference from the reference's, over the reference's largest.
-        Clamps take up momentum, so there is no drift of a conserved quantity to look at.
-    stress_error : float
-        RMS difference of Cauchy stress at the quadrature points of the plain coarse model
-        from that of the reference's positions, over the RMS of the latter.
-    smallest_volume_ratio : float
-        Smallest det F at quadrature points of the plain coarse model.
-    relative_error : float
-        RMS distance from the time-converged reference over that one's RMS displacement, per cent.
-    converged_rms_error : float
-        ``rms_error`` (m) against the time-converged reference.
-    gate_rate : float
-        Share of the steps that a gate left uncorrected, per cent.
-    failed : int
-        First step that failed.
-    """
+    """Of one run of one case; None where something needed is not there."""
 
     mesh: int
     simulation: int
+    # RMS distance from the time-converged reference over that one's RMS displacement, per cent
     relative_error: float | None = None
+    # share of the plain run's squared error that is removed (eq. 7-2), per cent
     omega: float | None = None
-    omega_base: float | None = None
+    omega_base: float | None = None  # the same of the run's own coarse model
+    # RMS and largest distance of nodes over frames 1..T, m
     rms_error: float | None = None
     worst_node: float | None = None
+    # as ``omega`` and ``rms_error``, of single steps from the reference's frames
     step_omega: float | None = None
     step_rms_error: float | None = None
+    # RMS over frames of the difference of kinetic and elastic energy from the reference's, over the
+    # reference's largest
     energy_error: float | None = None
+    # energy that is missing at the end (`EnergyBalance.dissipation`), over the largest of the run;
+    # negative if it has gained some
     energy_loss: float | None = None
+    # RMS over frames of the difference from the reference's, over the reference's largest. Clamps
+    # take up momentum, so there is no drift of a conserved quantity to look at
     linear_momentum_error: float | None = None
     angular_momentum_error: float | None = None
+    # RMS difference of Cauchy stress at the quadrature points of the plain coarse model from that
+    # of the reference's positions, over the RMS of the latter
     stress_error: float | None = None
+    # smallest det F at quadrature points of the plain coarse model
     smallest_volume_ratio: float | None = None
+    # ``rms_error`` (m) against the time-converged reference
     converged_rms_error: float | None = None
-    gate_rate: float | None = None
-    failed: int | None = None
+    gate_rate: float | None = None  # share of the steps that a gate left uncorrected, per cent
+    failed: int | None = None  # first step that failed
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredRollout:
-    """What was measured of a trajectory.
-
-    Attributes
-    ----------
-    measures : TrajectoryMeasures
-    errors : (T+1,)
-        RMS distance from the reference over time, m.
-    reasons : (T,) int64
-        Why a gate left its steps uncorrected, see `Outcome`; those until it failed.
-    """
+    """What was measured of a trajectory."""
 
     measures: TrajectoryMeasures
+    # (T+1,): RMS distance from the reference over time, m
     errors: Array = field(default_factory=lambda: np.zeros(0))
+    # (T,) int64: why a gate left its steps uncorrected, see `Outcome`; those until it failed
     reasons: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 def measure(case: EvaluationCase, outcome: Outcome) -> MeasuredRollout:
-    """Measure a run of a case.
-
-    Raises
-    ------
-    ConvergenceError
-        If the run is so far away that a measure is not finite: means cannot leave it out.
-    """
+    """Measure a run of a case."""
     found: dict[str, float | None] = {}
     if outcome.predictions is not None:
         found |= _of_steps(case, outcome.predictions)

@@ -137,18 +137,7 @@ def to_json(comparison: Comparison) -> str:
 
 
 def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) -> Path:
-    """Write report.md, report.csv, report.json and, if ``draw``, the figures.
-
-    Returns
-    -------
-    Path
-        Of the Markdown file.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be written.
-    """
+    """Write report.md, report.csv, report.json and, if ``draw``, figures; path of the first."""
     folder = make_folder(folder)
     write_text(folder / "report.csv", to_csv(comparison))
     write_text(folder / "report.json", to_json(comparison))
@@ -160,19 +149,10 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
 
 
 def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
-    """Write every run for ParaView, with stress, into ``vtu`` inside a report's folder.
+    """Write every run for ParaView, with stress, into ``vtu`` inside a report's folder; PVD files.
 
-    Series of an earlier report there, of rows that this one does not have, are deleted.
-
-    Returns
-    -------
-    list of Path
-        PVD files, in the order of the rows, with the rows' labels in small letters and dashes.
-
-    Raises
-    ------
-    OutputError
-        If they cannot be written.
+    They are called by the rows' labels in small letters and dashes.  Series of an earlier report,
+    of rows that this one does not have, are deleted.
     """
     target = make_folder(Path(folder) / VTU)
     runs: dict[str, Trajectory] = {}

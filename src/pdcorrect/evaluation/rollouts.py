@@ -32,28 +32,17 @@ class Hybrid(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What a run makes of a simulation.
+    """What a run makes of a simulation."""
 
-    Attributes
-    ----------
-    positions : (T+1, N, 3) or None
-        Free rollout from rest, m.
-    predictions : (T, N, 3) or None
-        Single steps from the reference's frames, m.
-    base : str or None
-        Coarse model that was stepped, with a corrector or without; None for other models.
-    reasons : (T,) int64 or None
-        Why steps of the rollout are without correction, numbers of `Reason`; 0 where they have
-        one, and after a failure.
-    failed : int or None
-        First step of the rollout that did not converge, or gave numbers that are not finite or a
-        node that is `LOST`.  The body is held from there on where it was before.
-    """
-
-    positions: Array | None = None
-    predictions: Array | None = None
+    positions: Array | None = None  # (T+1, N, 3): free rollout from rest, m
+    predictions: Array | None = None  # (T, N, 3): single steps from the reference's frames, m
+    # coarse model that was stepped, with a corrector or without; None for other models
     base: str | None = None
+    # (T,) int64: why steps of the rollout are without correction, numbers of `Reason`; 0 where they
+    # have one, and after a failure
     reasons: NDArray[np.int64] | None = None
+    # first step of the rollout that did not converge, or gave numbers that are not finite or a node
+    # that is `LOST`.  The body is held from there on where it was before
     failed: int | None = None
 
 

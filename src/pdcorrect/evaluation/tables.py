@@ -34,17 +34,9 @@ RESAMPLES, LEVEL = 2000, 0.95
 
 @dataclass(frozen=True)
 class Summary:
-    """How a measure is distributed over trajectories.
+    """How a measure is distributed over trajectories."""
 
-    Attributes
-    ----------
-    count, meshes : int
-        Trajectories that have the measure, and meshes that these are on.
-    mean, median, q05, q95, smallest, largest : float
-    interval : (float, float) or None
-        Of the mean, see `mean_interval`.
-    """
-
+    # trajectories that have the measure, and meshes that these are on
     count: int
     meshes: int
     mean: float
@@ -53,7 +45,7 @@ class Summary:
     q95: float
     smallest: float
     largest: float
-    interval: tuple[float, float] | None
+    interval: tuple[float, float] | None  # of the mean, see `mean_interval`
 
 
 def summarise(values: Sequence[float], meshes: Sequence[int], seed: int = 0) -> Summary:
@@ -75,15 +67,11 @@ def mean_interval(
 ) -> tuple[float, float] | None:
     """Expanded percentile bootstrap interval of the mean (Hesterberg 2015, section 5.2).
 
-    Clusters are drawn with replacement, not values: trajectories on one mesh share its
-    shape and material, so they tell less than as many on different meshes.  With n clusters
-    the percentiles are those at which a normal variable with the deviation of a resample,
-    too small by sqrt((n - 1) / n), is Student's t with n - 1 degrees of freedom: 0.9 and
-    99.1 instead of 2.5 and 97.5 for ten clusters.
-
-    Returns
-    -------
-    (low, high), or None if there is one cluster only, which tells nothing of others
+    Clusters are drawn with replacement, not values: trajectories on one mesh share its shape and
+    material, so they tell less than as many on different meshes.  With n clusters the percentiles
+    are those at which a normal variable with the deviation of a resample, too small by sqrt((n - 1)
+    / n), is Student's t with n - 1 degrees of freedom: 0.9 and 99.1 instead of 2.5 and 97.5 for ten
+    clusters. None if there is one cluster only, which tells nothing of others.
     """
     found = np.asarray(values, dtype=np.float64)
     names, owner = np.unique(np.asarray(clusters), return_inverse=True)
@@ -262,13 +250,7 @@ def write_evaluation(
     notes: Sequence[str] = (),
     seed: int = 0,
 ) -> list[Path]:
-    """Write all files of an evaluation into a folder.
-
-    Raises
-    ------
-    OutputError
-        If one cannot be written.
-    """
+    """Write all files of an evaluation into a folder."""
     folder = make_folder(folder)
     contents = {
         TRAJECTORIES: trajectories_csv(evaluation),

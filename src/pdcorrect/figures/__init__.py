@@ -65,10 +65,8 @@ _OVERLAID = (
     ("#cccccc", "#555555"),
 )
 """Of faces and edges: blue, green, red, and three more."""
-_STILL, _FILM = 1600, 1000
-"""Default widths of pictures and films, pixels."""
-_ROW = 5
-"""Panels side by side in a picture, at most."""
+_STILL, _FILM = 1600, 1000  # default widths of pictures and films, pixels
+_ROW = 5  # panels side by side in a picture, at most
 
 
 def render(
@@ -173,21 +171,10 @@ def render_overlay(
     frame: int = -1,
     window: int = 1200,
 ) -> Path:
-    """Draw runs over each other in one picture, each in a colour of its own.
+    """Draw runs over each other in one picture, each in a colour of its own; returns ``output``.
 
-    All are drawn with the cells of the coarsest run, so that the same cells compare.
-
-    Parameters
-    ----------
-    trajectories : sequence of Trajectory
-        Two to six, on meshes that hold the nodes of the coarsest.
-    output, labels, frame, window
-        See `render`; one frame, ``.png`` only.
-
-    Returns
-    -------
-    Path
-        ``output``.
+    Two to six runs, on meshes that hold the nodes of the coarsest, are drawn with its cells, so
+    that the same cells compare.  For the other arguments see `render`; one frame, ``.png`` only.
 
     Raises
     ------

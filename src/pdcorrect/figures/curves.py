@@ -15,10 +15,8 @@ from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-_MARKS = "osD^"
-"""Of the first round of colours, the second, ..."""
-_FONT = 9
-"""Of legends, points."""
+_MARKS = "osD^"  # of the first round of colours, the second and so on
+_FONT = 9  # of legends, points
 
 _STYLES = ("-", "--", "-.", ":")
 

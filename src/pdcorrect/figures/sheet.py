@@ -126,9 +126,10 @@ class Sheet:
         self._line([left, left + length * pixels], [y, y], _INK, 0.16 * self._font)
         for x in (left, left + length * pixels):
             self._line([x, x], [y - 0.3 * self._font, y + 0.3 * self._font], _INK, 1.5)
+        factor, unit = length_unit(length)
         self._text(
-            left + 0.5 * length * pixels, y - 0.5 * self._font, length_text(length), self._font,
-            ha="center", va="bottom",
+            left + 0.5 * length * pixels, y - 0.5 * self._font, f"{factor * length:.6g} {unit}",
+            self._font, ha="center", va="bottom",
         )  # fmt: skip
 
     def _add_axes(self) -> None:
@@ -197,12 +198,6 @@ def time_text(time: float, longest: float) -> str:
     """A time (s) with three decimals, in the unit in which the longest time reads best."""
     units = (1.0, "s") if longest >= 0.02 else (1e3, "ms") if longest >= 2e-5 else (1e6, "µs")
     return f"{units[0] * time:.3f} {units[1]}"
-
-
-def length_text(length: float) -> str:
-    """A length in m, mm or µm, whichever reads best."""
-    factor, unit = length_unit(length)
-    return f"{factor * length:.6g} {unit}"
 
 
 def length_unit(length: float) -> tuple[float, str]:

@@ -79,11 +79,6 @@ class TrajectoryWriter:
         If arrays contradict each other.
     OutputError
         If the file cannot be created.
-
-    Examples
-    --------
-    >>> with TrajectoryWriter("run.h5", points, cells, state) as writer:  # doctest: +SKIP
-    ...     writer.append(result, seconds=0.01)
     """
 
     def __init__(
@@ -117,8 +112,7 @@ class TrajectoryWriter:
         self._broken, self._reserved = False, 0
         with io.BytesIO() as memory:  # HDF5 may crash where a disk is full
             with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
-                for name, value in _file_attributes(first).items():
-                    self._file.attrs[name] = _of_fixed_length(value)
+                self._file.attrs.update(_file_attributes(first))
                 for name, mesh in {"points": first.points, "cells": first.cells}.items():
                     self._file.create_dataset(
                         f"mesh/{name}", data=mesh, chunks=mesh.shape, fletcher32=True
@@ -132,16 +126,9 @@ class TrajectoryWriter:
     def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
         """Continue a finished or interrupted file after its last complete frame.
 
-        The file is first rewritten, without what is damaged or half written; until that is done
-        the old one stays.
-
-        Parameters
-        ----------
-        path : path
-            No other process may be writing it.
-        run : Trajectory, optional
-            What the file is to hold before the next frame; by default what
-            ``load_trajectory(path, salvage=True)`` reads from it.
+        The file, to which no other process may write, is first rewritten, without what is damaged
+        or half written; until that is done the old one stays.  ``run`` is what it is to hold before
+        the next frame; by default what ``load_trajectory(path, salvage=True)`` reads from it.
 
         Raises
         ------
@@ -288,7 +275,8 @@ class TrajectoryWriter:
     def _add(self, entries: Mapping[str, Any]) -> None:
         """Create growing datasets, with the fill value for the frames before."""
         for name, value in entries.items():
-            dtype, shape, before = _stored_type(value), np.shape(value), self._place(name)
+            kind, shape, before = np.asarray(value).dtype.kind, np.shape(value), self._place(name)
+            dtype = np.dtype(_STATUS if kind == "U" else np.float64 if kind == "f" else np.int64)
             dataset = self._file.create_dataset(
                 name, (before, *shape), dtype, maxshape=(None, *shape), chunks=(1, *shape),
                 fillvalue=_FILL[dtype.kind], fletcher32=True,
@@ -383,28 +371,15 @@ def _entries(state: State, values: Mapping[str, Any]) -> dict[str, Any]:
     return stats | memory | nodal | {"times": state.time}
 
 
-def _stored_type(value: Any) -> np.dtype[Any]:
-    """Text, 64-bit integers or floats."""
-    kind = np.asarray(value).dtype.kind
-    return np.dtype(_STATUS if kind == "U" else np.float64 if kind == "f" else np.int64)
-
-
-def _file_attributes(trajectory: Trajectory) -> dict[str, str | int]:
-    return {
-        **trajectory.attributes,
-        "format": FORMAT,
-        "format_version": VERSION,
-        "scene_toml": trajectory.scene_toml,
-        "pdcorrect_version": __version__,
+def _file_attributes(trajectory: Trajectory) -> dict[str, Any]:
+    """Texts have a fixed length, so that they lie under the checksum of the file's index."""
+    own = {"format": FORMAT, "scene_toml": trajectory.scene_toml, "pdcorrect_version": __version__}
+    texts = {name: text.encode() for name, text in {**trajectory.attributes, **own}.items()}
+    fixed = {
+        name: np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+        for name, data in texts.items()
     }
-
-
-def _of_fixed_length(value: str | int) -> Any:
-    """Text as it lies under the checksum of the file's index."""
-    if not isinstance(value, str):
-        return value
-    data = value.encode()
-    return np.array(data, dtype=h5py.string_dtype("utf-8", max(1, len(data))))
+    return fixed | {"format_version": VERSION}
 
 
 def _abandon(file: Any, path: Path) -> None:

@@ -27,23 +27,16 @@ RESERVED = frozenset({"format", "format_version", "scene_toml", "pdcorrect_versi
 
 
 def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
-    """Read a trajectory file, finished or not.
+    """Read a trajectory file of `TrajectoryWriter`, finished or not.
 
-    A file that is still being written, or whose writer was killed, is read up
-    to its last complete frame.
-
-    Parameters
-    ----------
-    path : path
-        A file of `TrajectoryWriter`.
-    salvage : bool
-        Of a truncated or damaged file, return the frames before the damage.
+    A file that is still being written, or whose writer was killed, is read up to its last complete
+    frame.  ``salvage``: of a truncated or damaged file, return the frames before the damage.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is not a trajectory, or is damaged; says
-        which, and how many frames could be salvaged.
+        If the file cannot be read, is not a trajectory, or is damaged; says which, and how many
+        frames could be salvaged.
     """
     with _opened(Path(path)) as (file, extent):
         return _read(file, extent, salvage)
@@ -311,8 +304,7 @@ def _is_intact(dataset: Any, index: int) -> bool:
         return False
 
 
-_ROUNDING = 1e-9
-"""Of a cell size: the same mesh, made on another machine."""
+_ROUNDING = 1e-9  # of a cell size: the same mesh, made on another machine
 
 
 def problem_of(run: Trajectory) -> Problem:

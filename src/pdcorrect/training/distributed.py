@@ -60,13 +60,7 @@ class ProcessGroup:
 
 @contextlib.contextmanager
 def joined(device: str) -> Iterator[tuple[ProcessGroup, str]]:
-    """The world that ``torchrun`` describes in the environment, and this process's device.
-
-    Raises
-    ------
-    InputError
-        If there are more processes than GPUs of this machine, or all are to share one.
-    """
+    """The world that ``torchrun`` describes in the environment, and this process's device."""
     size = int(os.environ.get("WORLD_SIZE", "1"))
     if size == 1:
         yield ProcessGroup(), device

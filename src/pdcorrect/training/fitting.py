@@ -14,8 +14,7 @@ from pdcorrect.corrector.normaliser import TIME_STEP, RunningMoments
 from pdcorrect.errors import InputError
 from pdcorrect.training.windows import Numbers, StepBatch, StepWindows
 
-_AT_ONCE = 32
-"""Windows."""
+_AT_ONCE = 32  # windows
 
 
 @torch.no_grad()
@@ -48,13 +47,7 @@ def widen_ranges(corrector: Corrector, windows: StepWindows, most: int, seed: in
 
 
 def check_time_steps(corrector: Corrector, windows: StepWindows) -> None:
-    """Refuse data whose time step a default gate refuses, by the ranges of a corrector that stay.
-
-    Raises
-    ------
-    InputError
-        If some have such a time step: the gate would refuse every step of these bodies.
-    """
+    """Refuse data whose time step a default gate refuses by a corrector's ranges, which stay."""
     found = _at_rest(windows)["time_step"]
     steps = torch.cat([found.low, found.high])
     if not (corrector.envelope.time_step_excess(steps) > TIME_STEP).any():

@@ -74,17 +74,9 @@ def body_losses(
 ) -> Tensor:
     """The loss of each body, (B,).
 
-    Parameters
-    ----------
-    loss : Loss
-    errors : (..., 3)
-        Distances at nodes, m.
-    total : callable
-        Sums of values (...) over the nodes of each body, (B,), which has ``counts`` (B,).
-    scale : (B,)
-        d(j), m2.
-    added : (B,)
-        To relative losses, before they are bent.
+    ``errors`` (..., 3) are distances at nodes, m; ``total`` sums values (...) over the nodes of
+    each body, of which it has ``counts`` (B,); ``scale`` (B,) is d(j), m2.  ``added`` (B,) comes to
+    relative losses before they are bent.
     """
     if loss.kind == "relative":
         ratios = total(errors.square().sum(dim=-1)) / (counts * scale) + added
@@ -136,13 +128,7 @@ class BodyModes(NamedTuple):
 
 
 def body_modes(problem: Problem, count: int = MODES) -> BodyModes:
-    """The lowest modes of a body at rest, of the problem's own mass and stiffness.
-
-    Raises
-    ------
-    ConvergenceError
-        As of `pdcorrect.modes`.
-    """
+    """The lowest modes of a body at rest, of the problem's own mass and stiffness."""
     nodes = len(problem.positions)
     count = min(count, int(problem.free.sum()) - 1)
     if count < 1:
@@ -168,19 +154,11 @@ class Vibrations:
         sum_{n = 1..T} (a_n x + b_n y)^2 |phi|^2 / (N T),
 
     without what unlike modes have in common, and wherever in the simulation it is, for users let
-    theirs go on.  A soft mode takes a second to show an error of its velocity, where derivatives
-    of training reach back over some hundredths of one.
+    theirs go on.  A soft mode takes a second to show an error of its velocity, where derivatives of
+    training reach back over some hundredths of one.
 
-    Parameters
-    ----------
-    bodies : sequence of BodyModes
-        Unlike ones; ``owners`` says which of them each body is, (B,).
-    steps : (B,) int
-        T of each body's simulation.
-    time_step : float
-        h, s.
-    nodes : int
-        Of padded tensors.
+    ``owners`` (B,) says which of the unlike ``bodies`` each is, ``steps`` (B,) are T, ``time_step``
+    is h, s, and ``nodes`` the number of padded tensors.
     """
 
     def __init__(

@@ -53,32 +53,19 @@ class Mark:
 
 @dataclass
 class Progress:
-    """Where a training is.
+    """Where a training is."""
 
-    Attributes
-    ----------
-    stage, iteration : int
-        Number of the stage, and iterations done in it.
-    total : int
-        Iterations in all stages.
-    stage_seconds, seconds : float
-        Time spent in the stage and in all, interruptions not counted.
-    validated, saved : Mark
-    best : float or None
-        Mean Omega of the best weights so far, per cent.
-    metrics : dict
-        Of the best weights.
-    """
-
+    # number of the stage, and iterations done in it
     stage: int = 0
     iteration: int = 0
-    total: int = 0
+    total: int = 0  # iterations in all stages
+    # time spent in the stage and in all, interruptions not counted
     stage_seconds: float = 0.0
     seconds: float = 0.0
     validated: Mark = field(default_factory=Mark)
     saved: Mark = field(default_factory=Mark)
-    best: float | None = None
-    metrics: dict[str, float] = field(default_factory=dict)
+    best: float | None = None  # mean Omega of the best weights so far, per cent
+    metrics: dict[str, float] = field(default_factory=dict)  # of the best weights
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Progress:
@@ -115,10 +102,6 @@ def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
     """Refuse to go on with other settings, naming the first that differs.
 
     A key that is not there counts as one of None.
-
-    Raises
-    ------
-    InputError
     """
     if isinstance(found, dict) and isinstance(expected, dict):
         for name in sorted(found.keys() | expected.keys()):
@@ -138,13 +121,7 @@ def check_same(found: Any, expected: Any, where: str, key: str = "") -> None:
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
-    """Replace a checkpoint by JSON, whose floats keep all their digits, and tensors by name.
-
-    Raises
-    ------
-    OutputError
-        If it cannot be written.
-    """
+    """Replace a checkpoint by JSON, whose floats keep all their digits, and tensors by name."""
     held = {name: t.detach().to("cpu").contiguous().clone() for name, t in tensors.items()}
     text = json.dumps(content, sort_keys=True)
     head = {"format": FORMAT, "version": str(VERSION), "content": text, "hash": _hash(text, held)}
@@ -152,15 +129,7 @@ def write_checkpoint(path: Path, content: Mapping[str, Any], tensors: Mapping[st
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Content and tensors of a checkpoint, on the CPU.
-
-    Raises
-    ------
-    FileFormatError
-        If it cannot be read, is damaged or something else.
-    FileVersionError
-        If it was written in another version of the format.
-    """
+    """Content and tensors of a checkpoint, on the CPU."""
     try:
         with safe_open(path, framework="pt") as file:
             head = file.metadata() or {}
@@ -193,15 +162,10 @@ def _hash(text: str, tensors: Mapping[str, Tensor]) -> str:
 
 
 class HistoryFile:
-    """Rows of numbers by iteration, written at once.
+    """Rows of numbers by iteration, in ``history.csv`` and for TensorBoard, written at once.
 
-    Parameters
-    ----------
-    folder : Path
-    length : int
-        Bytes of ``history.csv`` that are kept: what came later is repeated.
-    iteration : int
-        From which on TensorBoard forgets what it has.
+    Of what is there ``length`` bytes are kept, and what TensorBoard has of iterations before
+    ``iteration``: what came later is repeated.
     """
 
     def __init__(self, folder: Path, length: int = 0, iteration: int = 0) -> None:

@@ -63,26 +63,17 @@ class Architecture(Strict):
 
 
 class Loss(Strict):
-    """What is minimised; see `pdcorrect.training.losses`.
+    """What is minimised; see `pdcorrect.training.losses`."""
 
-    Attributes
-    ----------
-    kind
-        "relative": mean squared distance over that of the base model on the same trajectory.
-        "absolute": of positions in units of 1 / ``scale`` metres (thesis: 1000).
-    power
-        Of "absolute": 1 sums distances over nodes, 2 their squares.
-    bend
-        Of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``); None: as x.
-    ahead
-        Of "relative", in unrolled stages: weight of what the error of a state will come to in the
-        frames ahead.
-    """
-
+    # "relative": mean squared distance over that of the base model on the same trajectory.
+    # "absolute": of positions in units of 1 / ``scale`` metres (thesis: 1000)
     kind: Literal["relative", "absolute"] = "relative"
-    power: Literal[1, 2] = 2
+    power: Literal[1, 2] = 2  # of "absolute": 1 sums distances over nodes, 2 their squares
     scale: Positive = 1000.0
+    # of "relative": a body's loss x counts as ``bend`` log(1 + x / ``bend``); None: as x
     bend: Positive | None = None
+    # of "relative", in unrolled stages: weight of what the error of a state will come to in the
+    # frames ahead
     ahead: Positive | None = None
 
     @model_validator(mode="after")
@@ -128,49 +119,32 @@ class Every(Strict):
 
 
 class Stage(Strict):
-    """A part of training; Adam starts afresh in each.
+    """A part of training; Adam starts afresh in each."""
 
-    Attributes
-    ----------
-    kind
-        "one-step": on the stored predictions of the base model, without the simulator.
-        "unrolled": steps of the hybrid, simulator included.
-    steps
-        Of "unrolled"; several numbers share the stage equally, in order.
-    through_solver
-        Of "unrolled": whether derivatives go through the coarse solver.
-    start
-        Of "unrolled": states of the reference, or of a pool of the model's own rollouts.  Those
-        go back to the reference with probability ``restart`` after each use, and where their mean
-        squared distance from it is more than that of the base model's rollout.
-    at_rest
-        Of "unrolled": share of the states of the reference that are those before the first step;
-        the others are of any frame.  For loads that act in the first steps only, as kicks.
-    seconds, iterations, epochs
-        Exactly one; epochs only of "one-step".
-    batch
-        Windows or scenes, for each process.
-    ema
-        Decay a step of the averaged weights that are validated and kept; None: no average.
-    amp
-        "bf16": matrix products of the network in bfloat16.
-    """
-
+    # "one-step": on the stored predictions of the base model, without the simulator.  "unrolled":
+    # steps of the hybrid, simulator included
     kind: Literal["one-step", "unrolled"]
-    steps: Horizon = (1,)
-    through_solver: Flag = False
+    steps: Horizon = (1,)  # of "unrolled"; several numbers share the stage equally, in order
+    through_solver: Flag = False  # of "unrolled": whether derivatives go through the coarse solver
+    # of "unrolled": states of the reference, or of a pool of the model's own rollouts.  Those go
+    # back to the reference with probability ``restart`` after each use, and where their mean
+    # squared distance from it is more than that of the base model's rollout
     start: Literal["reference", "pool"] = "reference"
     restart: Share = 0.2
+    # of "unrolled": share of the states of the reference that are those before the first step; the
+    # others are of any frame.  For loads that act in the first steps only, as kicks
     at_rest: Share = 0.0
+    # exactly one; epochs only of "one-step"
     seconds: Positive | None = None
     iterations: PositiveCount | None = None
     epochs: PositiveCount | None = None
-    batch: PositiveCount = 16
+    batch: PositiveCount = 16  # windows or scenes, for each process
     rate: Rate = Rate()
     loss: Loss = Loss()
     noise: Noise = Noise()
+    # decay a step of the averaged weights that are validated and kept; None: no average
     ema: Decay | None = None
-    amp: Literal["none", "bf16"] = "none"
+    amp: Literal["none", "bf16"] = "none"  # "bf16": matrix products of the network in bfloat16
 
     @model_validator(mode="after")
     def _possible(self) -> Stage:
@@ -202,45 +176,30 @@ class Stage(Strict):
 
 
 class Fitting(Strict):
-    """Of the normalisation.
+    """Of the normalisation."""
 
-    Attributes
-    ----------
-    windows
-        Most that are taken from the training split.
-    widen
-        Whether a training that goes on with another model widens that one's ranges of known
-        inputs and bodies to what it learns; weights do not depend on it.  If not, the data's time
-        step has to be one that the other model's gate lets pass.
-    """
-
-    windows: PositiveCount = 10_000
+    windows: PositiveCount = 10_000  # most that are taken from the training split
+    # whether a training that goes on with another model widens that one's ranges of known inputs
+    # and bodies to what it learns; weights do not depend on it.  If not, the data's time step has
+    # to be one that the other model's gate lets pass
     widen: Flag = True
 
 
 class TrainingConfig(TomlConfig):
-    """A training.
-
-    Attributes
-    ----------
-    start_from
-        Folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
-        training begins with; ``corrector`` must describe its architecture.
-    without
-        Files of the data set that are left out, such as "training/mesh-0042".
-    base
-        Whose steps are corrected, see `pdcorrect.coarse_model`.
-    validate_every, checkpoint_every, report_every
-        The last in iterations.
-    """
+    """A training."""
 
     corrector: Architecture = Architecture()
+    # folder or name of a model (`pdcorrect.load_model`) whose weights and normalisation the
+    # training begins with; ``corrector`` must describe its architecture
     start_from: ModelName | None = None
+    # files of the data set that are left out, such as "training/mesh-0042"
     without: tuple[FileName, ...] = ()
+    # whose steps are corrected, see `pdcorrect.coarse_model`
     base: Literal["plain", "best"] = "plain"
     seed: Count = 0
     fitting: Fitting = Fitting()
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
+    # the last in iterations
     validate_every: Every = Every(seconds=60.0)
     checkpoint_every: Every = Every(seconds=60.0)
     report_every: PositiveCount = 50

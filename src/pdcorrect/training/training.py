@@ -41,8 +41,7 @@ from pdcorrect.training.progress import (
     write_checkpoint,
 )
 from pdcorrect.training.recipe import Stage, TrainingConfig
-from pdcorrect.training.recordings import Recording, data_hash, load_recordings
-from pdcorrect.training.scenes import SceneGroups
+from pdcorrect.training.scenes import Recording, SceneGroups, data_hash, load_recordings
 from pdcorrect.training.unrolled import UnrolledBatches
 from pdcorrect.training.validation import Validation
 from pdcorrect.training.windows import OneStepBatches, StepWindows, seed_of
@@ -60,28 +59,11 @@ Report = Callable[[Progress, Mapping[str, Any]], None]
 class Training:
     """A training in a folder.
 
-    Parameters
-    ----------
-    config : TrainingConfig
-    data : path
-        Folder of the data set.
-    output : path
-        For ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard`` and
-        the best ``model``.
-    device : str
-    resume : bool
-        Go on from the checkpoint, if there is one.
-    incomplete : bool
-        Take the files that are there, if the data set's configuration asks for more.
-    world : ProcessGroup
-    on_report : callable, optional
-        Called with each row of the history.
-
-    Attributes
-    ----------
-    corrector : Corrector
-        In its present state; the best one is in the folder.
-    progress : Progress
+    The folder gets ``config.toml``, ``checkpoint.safetensors``, ``history.csv``, ``tensorboard``
+    and the best ``model``.  ``resume`` goes on from its checkpoint, if there is one; ``incomplete``
+    takes the data set's files that are there, if its configuration asks for more; ``on_report`` is
+    called with each row of the history.  ``corrector`` is in its present state, ``progress`` says
+    where it is.
 
     Raises
     ------
@@ -163,10 +145,7 @@ class Training:
     def run(self, seconds: float | None = None) -> bool:
         """Train until the end, or for about so many seconds; whether it is finished.
 
-        Raises
-        ------
-        ConvergenceError
-            If too many batches in a row had no finite gradient.
+        `ConvergenceError` if too many batches in a row had no finite gradient.
         """
         self._limit = math.inf if seconds is None else self.progress.seconds + seconds
         self._ticked = time.perf_counter()
@@ -357,16 +336,7 @@ class Training:
 
 
 def load_start(config: TrainingConfig, device: torch.device) -> LoadedModel | None:
-    """The model that a training goes on with, if there is one.
-
-    Raises
-    ------
-    InputError
-        If there is no such model, or its architecture, base model or velocity is another one
-        than the training's.
-    FileFormatError
-        If a file is damaged.
-    """
+    """The model that a training goes on with, if there is one."""
     if config.start_from is None:
         return None
     model = load_model(config.start_from, device)

@@ -22,21 +22,13 @@ Flags = NDArray[np.bool_]
 
 @dataclass(eq=False)
 class Rollouts:
-    """Where the scenes of a group are.
+    """Where the scenes of a group are."""
 
-    Attributes
-    ----------
-    positions, velocities : (B, N, 3) tensors
-        m and m/s.
-    correction : (n, 3) tensor
-        Of the last step, m; zero if there was none.
-    frames, ages : (B,) int
-        Frame of each scene, and steps since it was on the reference; -1 if it is to go back.
-    """
-
+    # (B, N, 3) tensors: m and m/s
     positions: Tensor
     velocities: Tensor
-    correction: Tensor
+    correction: Tensor  # (n, 3) tensor: of the last step, m; zero if there was none
+    # (B,) int: frame of each scene, and steps since it was on the reference; -1 if it is to go back
     frames: Frames
     ages: Frames
 
@@ -58,11 +50,6 @@ class UnrolledBatches:
     ----------
     failed : int
         Scenes that were left out because a step failed.
-
-    Raises
-    ------
-    InputError
-        If no simulation is long enough for the stage.
     """
 
     def __init__(self, groups: SceneGroups, stage: Stage, *, seed: int = 0) -> None:

@@ -20,8 +20,7 @@ from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.evaluation.rollouts import roll_out
 from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
-from pdcorrect.training.recordings import Recording, rounding
-from pdcorrect.training.scenes import SceneGroup
+from pdcorrect.training.scenes import Recording, SceneGroup, rounding
 
 LEAST = -100.0
 """Omega of a simulation whose rollout failed or is worse than this, per cent."""

@@ -25,12 +25,11 @@ from pdcorrect.fem.problem import Base
 from pdcorrect.training.distributed import ProcessGroup
 from pdcorrect.training.losses import body_losses, network_precision
 from pdcorrect.training.recipe import Stage
-from pdcorrect.training.recordings import Recording, base_errors
+from pdcorrect.training.scenes import Recording, base_errors
 
 Numbers = NDArray[np.int64]
 
-_SHARE_OF_DEVICE = 0.3
-"""Of a GPU's free memory, which the windows may fill."""
+_SHARE_OF_DEVICE = 0.3  # of a GPU's free memory, which the windows may fill
 _FRAMES = ("positions", "velocities", "predictions", "forces")
 _BODY = ("rest", "free", "mass", "young", "poisson", "density", "cell_size", "time_step")
 _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
@@ -38,22 +37,12 @@ _AT_REST = ("node_counts", *REST_OF_NODES, *REST_OF_EDGES, *REST_OF_CELLS)
 
 @dataclass(frozen=True, eq=False)
 class StepBatch:
-    """A step of B bodies with n nodes.
-
-    Attributes
-    ----------
-    bodies : BodyGraph
-    snapshot : Snapshot
-    target : (n, 3)
-        The correction that leads to the reference, m.
-    scale : (B,)
-        Mean squared one-step error of the base model on each trajectory, m2.
-    """
+    """A step of B bodies with n nodes."""
 
     bodies: BodyGraph
     snapshot: Snapshot
-    target: Tensor
-    scale: Tensor
+    target: Tensor  # (n, 3): the correction that leads to the reference, m
+    scale: Tensor  # (B,): mean squared one-step error of the base model on each trajectory, m2
 
     def with_noise(self, tau: float, generator: torch.Generator) -> StepBatch:
         """The same with Gaussian noise on the proposal, which the target takes back.
