@@ -221,7 +221,7 @@ def test_nothing_that_is_recorded_asks_for_a_value(made):
     with FakeTensorMode(allow_non_fake_inputs=True) as fake, torch.no_grad():
         snapshot = Snapshot(*(fake.from_tensor(x) for x in vars(view.snapshot).values()))
         found = FeatureView(view.bodies, snapshot)
-        vars(found)["turns"] = fake.from_tensor(view.turns)  # compiled loops on the CPU
+        vars(found)["turns"] = fake.from_tensor(view.turns)  # a loop on the CPU
         corrections = made.of_view(found)
         assert corrections.shape == view.bodies.rest.shape
         assert made.score(found).shape == (2,)

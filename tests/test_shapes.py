@@ -217,7 +217,6 @@ def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it
     assert "smallest radius" not in found
     assert max(found.values()) == pytest.approx(excess(corrector, longer)[0])
     hybrid = HybridStepper(pc.ProjectiveDynamics(longer), corrector, gate=Gate()).prepare()
-    assert hybrid.compiled
     assert hybrid(longer.rest_state()).stats["gate"] == Reason.OUTSIDE
 
 

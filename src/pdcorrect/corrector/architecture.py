@@ -126,7 +126,7 @@ class MLP(nn.Sequential):
         sizes = [inputs, *[width] * (layers - 1), outputs]
         parts: list[nn.Module] = []
         for before, after in pairwise(sizes):
-            parts += [nn.Linear(before, after), nn.ReLU()]
+            parts += [nn.Linear(before, after), nn.ReLU(inplace=True)]
         parts.pop()
         if norm:
             parts.append(nn.LayerNorm(outputs))
@@ -146,7 +146,8 @@ class MessageLayer(nn.Module):
         self.of_edge = nn.Linear(width, width)
         self.of_receiver = nn.Linear(width, width, bias=False)
         self.of_sender = nn.Linear(width, width, bias=False)
-        self.edge_rest = nn.Sequential(nn.ReLU(), *MLP(width, width, width, layers - 1, True))
+        rest = MLP(width, width, width, layers - 1, True)
+        self.edge_rest = nn.Sequential(nn.ReLU(inplace=True), *rest)
         self.node = MLP(2 * width, width, width, layers, True)
         bound = (3 * width) ** -0.5  # as one map from all three
         for part in (self.of_edge, self.of_receiver, self.of_sender):
@@ -157,11 +158,10 @@ class MessageLayer(nn.Module):
         """New values of nodes (n, w) and edges (E, w)."""
         receiver, sender = edge_index
         to, start = self.of_receiver(x), self.of_sender(x)
-        e = e + self.edge_rest(
-            self.of_edge(e) + to.index_select(0, receiver) + start.index_select(0, sender)
-        )
-        summed = torch.zeros_like(x).index_add(0, receiver, e)
-        return x + self.node(torch.cat([x, summed], dim=1)), e
+        both = self.of_edge(e).add_(to.index_select(0, receiver))
+        e = self.edge_rest(both.add_(start.index_select(0, sender))).add_(e)
+        summed = torch.zeros_like(x).index_add_(0, receiver, e)
+        return self.node(torch.cat([x, summed], dim=1)).add_(x), e
 
 
 class MeshGraphNetwork(nn.Module):
