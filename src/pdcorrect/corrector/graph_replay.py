@@ -25,11 +25,6 @@ from pdcorrect.corrector.frames import unrolled_products
 from pdcorrect.corrector.gate import GateMeasures
 from pdcorrect.errors import InputError
 
-UNRECORDABLE = (
-    "recorded = True with a corrector of another class, with hooks, with a network that was "
-    "changed or with momentum_neutral: what it does would not be recorded. Expected False."
-)
-
 
 def recordable(corrector: Corrector) -> bool:
     """Whether a corrector's answers can be recorded.
@@ -40,6 +35,17 @@ def recordable(corrector: Corrector) -> bool:
     own = any(callable(value) for value in vars(corrector).values())
     plain = type(corrector) is Corrector and not own and usual(corrector)
     return plain and not corrector.config.momentum_neutral
+
+
+def check_recordable(corrector: Corrector) -> Corrector:
+    """A corrector that can be recorded; others are refused with an `InputError`."""
+    if not recordable(corrector):
+        raise InputError(
+            "recorded = True with a corrector of another class, with hooks, with a network that "
+            "was changed or with momentum_neutral: what it does would not be recorded. Expected "
+            "False."
+        )
+    return corrector
 
 
 def usual(corrector: Corrector) -> bool:
@@ -98,7 +104,7 @@ class RecordedCorrector:
     """
 
     def __init__(self, corrector: Corrector) -> None:
-        self._corrector, self.config = corrector, corrector.config
+        self._corrector, self.config = check_recordable(corrector), corrector.config
         self._forget()
 
     def _forget(self) -> None:
@@ -139,9 +145,7 @@ class RecordedCorrector:
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""
         self._forget()
-        corrector, rest = self._corrector, bodies.rest
-        if not recordable(corrector):
-            raise InputError(UNRECORDABLE)
+        corrector, rest = check_recordable(self._corrector), bodies.rest
         with torch.inference_mode(False), torch.no_grad():
             self.config, self._contents = corrector.config, Contents(corrector)
             self._snapshot = Snapshot(*(rest.clone() for _ in fields(Snapshot)))
