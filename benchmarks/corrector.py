@@ -31,9 +31,8 @@ from network_cost import flops
 
 import pdcorrect as pc
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import PRESETS
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import PRESETS, Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.scene import trained_coarse

@@ -23,9 +23,8 @@ from hybrid_samples import (
     soft_beam,
 )
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer, _TimesMass
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.gate import Gate, moved
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.errors import InputError
