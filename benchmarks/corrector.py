@@ -3,9 +3,7 @@
     python benchmarks/corrector.py [--quick]
 
 Each preset with random weights, a beam of 135 and a cross of 405 nodes, both bent; states in
-float64, network in float32, without gradients, on one and two threads of torch and of the compiled
-loops.  ``features_ms``, ``network_ms`` and ``call_ms`` are torch's, ``compiled_...`` those of
-`CompiledCorrector`, which presets in node frames have.
+float64, network in float32, without gradients, on one and two threads.
 
 Beside them steps of the same body from the same state: ``coarse_ms`` plain, ``best_coarse_ms``
 by the best coarse model, and ``correction_ms`` and ``best_correction_ms``, what `HybridStepper`
@@ -33,10 +31,8 @@ from network_cost import flops
 
 import pdcorrect as pc
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import PRESETS
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import PRESETS, Corrector
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.scene import trained_coarse
@@ -103,20 +99,13 @@ def measure(name: str, body: str, threads: int, calls: int, warm: int) -> dict[s
     bodies, step = sample(BODIES[body])
     corrector = fitted(name, FeatureView(bodies, step))
     n, e = len(bodies.rest), bodies.edge_index.shape[1]
-    with torch.no_grad():
+    with torch.inference_mode():
         nodes, edges = (x.float() for x in corrector.inputs(FeatureView(bodies, step)))
         taken: dict[str, Callable[[], object]] = {
             "features_ms": lambda: corrector.inputs(FeatureView(bodies, step)),
             "network_ms": lambda: corrector.network(nodes, edges, bodies.edge_index),
             "call_ms": lambda: corrector(bodies, step),
         }
-        if compilable(corrector, bodies):
-            compiled = CompiledCorrector(corrector, bodies)
-            taken |= {
-                "compiled_features_ms": lambda: compiled.features(step),
-                "compiled_network_ms": lambda: compiled.network(),
-                "compiled_ms": lambda: compiled.of_view(FeatureView(bodies, step)),
-            }
         times = {key: timed(function, calls, warm) for key, function in taken.items()}
     times |= steps(corrector, body, step, calls, warm)
     operations = flops(corrector.config, n, e)

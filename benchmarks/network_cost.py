@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import CorrectorConfig
+from pdcorrect.corrector.corrector import CorrectorConfig
 
 OUTPUTS = 3
 """Components of the network's output."""

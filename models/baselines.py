@@ -56,7 +56,7 @@ class Uncorrected:
         """One step."""
         coarse = self._steps(state)
         none = torch.zeros(len(coarse.statuses), dtype=torch.int64, device=self._nothing.device)
-        return BatchHybridResult(coarse.state, self._nothing, coarse, none)
+        return BatchHybridResult(coarse, coarse, self._nothing, none)
 
 
 def with_solver(**options: str) -> Change:

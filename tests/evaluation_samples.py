@@ -7,9 +7,8 @@ import numpy as np
 import torch
 
 from pdcorrect.batch.states import BatchState
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.bodies import SHAPE_MEASURES
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.gate import Reason
 from pdcorrect.corrector.model_io import ModelRecord, save_model
 from pdcorrect.corrector.normaliser import RunningMoments

@@ -7,9 +7,8 @@ import torch
 
 import pdcorrect as pc
 from conftest import beam, box_mesh, disturbed, problem_on
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchBodies
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES
 from pdcorrect.corrector.model_io import ModelRecord, save_model
 from pdcorrect.corrector.normaliser import RunningMoments

@@ -7,9 +7,8 @@ import torch
 
 from conftest import box_mesh
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.features import EDGE_FEATURES, NODE_FEATURES, FeatureView, Snapshot
 from pdcorrect.corrector.normaliser import RunningMoments
 from pdcorrect.fem.graph import mesh_edges

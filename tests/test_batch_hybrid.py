@@ -16,7 +16,6 @@ from hybrid_samples import (
     silent,
     soft_beam,
 )
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import (
     BatchBodies,
     BatchHybrid,
@@ -24,6 +23,7 @@ from pdcorrect.corrector.batch_hybrid import (
     external_forces,
 )
 from pdcorrect.corrector.bodies import BodyGraph
+from pdcorrect.corrector.corrector import preset
 from pdcorrect.corrector.gate import Gate
 from pdcorrect.corrector.hybrid import HybridStepper
 

@@ -23,9 +23,8 @@ from hybrid_samples import (
     soft_beam,
 )
 from pdcorrect.corrector import features
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer, _TimesMass
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.gate import Gate, moved
 from pdcorrect.corrector.hybrid import MEMORY, HybridStepper
 from pdcorrect.errors import InputError
@@ -51,7 +50,7 @@ def test_a_network_that_gives_nothing_leaves_the_coarse_rollout_bit_for_bit(elem
 
 def test_network_and_gate_look_at_the_same_features(monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
-    names = (*preset("compact").node_features, "velocity")  # not compiled
+    names = (*preset("compact").node_features, "velocity")
     corrector = fitted([problem], node_features=names)
     hybrid = HybridStepper(pc.ProjectiveDynamics(problem), corrector, gate=Gate())
     computed = []

@@ -21,8 +21,7 @@ import pdcorrect as pc  # noqa: E402
 from pdcorrect import _environment  # noqa: E402
 from pdcorrect._environment import code_digest  # noqa: E402
 from pdcorrect.corrector import model_io  # noqa: E402
-from pdcorrect.corrector.architecture import preset  # noqa: E402
-from pdcorrect.corrector.corrector import Corrector  # noqa: E402
+from pdcorrect.corrector.corrector import Corrector, preset  # noqa: E402
 from pdcorrect.corrector.model_io import (  # noqa: E402
     ModelRecord,
     content_digest,

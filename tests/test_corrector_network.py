@@ -16,8 +16,15 @@ import network_samples as samples  # noqa: E402
 from block_meshes import o_grid  # noqa: E402
 from conftest import rotation  # noqa: E402
 from network_samples import SIZE, STEP, tensor  # noqa: E402
-from pdcorrect.corrector.architecture import MLP, PRESETS, MeshGraphNetwork, MessageLayer, preset  # noqa: E402
-from pdcorrect.corrector.corrector import Corrector, without_momentum  # noqa: E402
+from pdcorrect.corrector.corrector import (  # noqa: E402  # noqa: E402
+    MLP,
+    PRESETS,
+    Corrector,
+    MeshGraphNetwork,
+    MessageLayer,
+    preset,
+    without_momentum,
+)
 from pdcorrect.corrector.features import (  # noqa: E402
     FeatureView,
     Snapshot,

@@ -23,7 +23,7 @@ from hybrid_samples import (
     soft_beam,
     wild,
 )
-from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchHybrid, BatchParts
+from pdcorrect.corrector.batch_hybrid import BatchBodies, BatchCoarseStep, BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.gate import Gate, GateMeasures, Reason, Refusal, refusals
 from pdcorrect.corrector.hybrid import HybridStepper, SingleCoarseStep
@@ -266,12 +266,10 @@ def test_a_kick_s_right_answer_passes_where_the_coarse_mass_is_four_times_too_he
 @pytest.mark.parametrize("integrator", ["backward-euler", "midpoint"])
 def test_a_batch_s_gate_measures_what_a_single_scene_s_does(integrator, element):
     scenes = [pc.discretise(p.scene, element=element) for p in problems((3, 1, 1), (2, 2, 1))]
-    corrector, shifts = fitted(scenes), [bumped(p) for p in scenes]
+    shifts = [bumped(p) for p in scenes]
     stepper = pc.BatchStepper(scenes, 1e-12, integrator=integrator)
     states = [pc.State(disturbed(p, 0.1), shaken(p).velocities) for p in scenes]
-    many = BatchCoarseStep(
-        BatchParts(stepper, corrector, "recomputed"), stepper.state(states), None
-    )
+    many = BatchCoarseStep(BatchBodies(stepper), stepper.state(states), None)
     answer = many.solved()
     many.view(answer)
     moved = many.moved(answer, torch.tensor(np.concatenate(shifts)))

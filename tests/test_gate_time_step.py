@@ -9,10 +9,9 @@ import torch
 
 import pdcorrect as pc
 from hybrid_samples import TORSION, Watched, fitted, problems, seen, soft_beam
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.gate import Gate, Reason, Refusal, refusals
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.normaliser import RunningMoments

@@ -13,8 +13,8 @@ from hybrid_samples import (
     problems,
     soft_beam,
 )
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
+from pdcorrect.corrector.corrector import preset
 
 
 class Unrolled:

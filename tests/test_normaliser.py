@@ -13,8 +13,8 @@ from conftest import beam, problem_on  # noqa: E402
 from network_samples import SIZE, tensor  # noqa: E402
 from pdcorrect import discretise  # noqa: E402
 from pdcorrect.corrector import features  # noqa: E402
-from pdcorrect.corrector.architecture import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.bodies import BodyGraph  # noqa: E402
+from pdcorrect.corrector.corrector import PRESETS, CorrectorConfig, preset  # noqa: E402
 from pdcorrect.corrector.features import (  # noqa: E402
     NODE_FEATURES,
     FeatureView,

@@ -16,7 +16,7 @@ from torch._subclasses.fake_tensor import (  # noqa: E402
 import pdcorrect as pc  # noqa: E402
 from hybrid_samples import fitted, problems  # noqa: E402
 from pdcorrect.corrector import graph_replay  # noqa: E402
-from pdcorrect.corrector.batch_hybrid import BatchCoarseStep, BatchParts  # noqa: E402
+from pdcorrect.corrector.batch_hybrid import BatchBodies, BatchCoarseStep  # noqa: E402
 from pdcorrect.corrector.features import FeatureView, Snapshot  # noqa: E402
 from pdcorrect.corrector.gate import Reason  # noqa: E402
 from pdcorrect.corrector.graph_replay import RecordedCorrector, recordable  # noqa: E402
@@ -50,7 +50,7 @@ class Motion:
 
     def __init__(self, device, corrector, steps=4):
         self.stepper = pc.BatchStepper(problems(*CELLS), device=device)
-        self.parts = BatchParts(self.stepper, corrector, "recomputed", recorded=True)
+        self.parts = BatchBodies(self.stepper, recorded=True)
         state, self.steps = self.stepper.rest_state(), []
         for number in range(steps):
             previous = None
@@ -221,7 +221,7 @@ def test_nothing_that_is_recorded_asks_for_a_value(made):
     with FakeTensorMode(allow_non_fake_inputs=True) as fake, torch.no_grad():
         snapshot = Snapshot(*(fake.from_tensor(x) for x in vars(view.snapshot).values()))
         found = FeatureView(view.bodies, snapshot)
-        vars(found)["turns"] = fake.from_tensor(view.turns)  # compiled loops on the CPU
+        vars(found)["turns"] = fake.from_tensor(view.turns)  # a loop on the CPU
         corrections = made.of_view(found)
         assert corrections.shape == view.bodies.rest.shape
         assert made.score(found).shape == (2,)

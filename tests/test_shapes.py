@@ -9,10 +9,9 @@ import torch
 import pdcorrect as pc
 from conftest import beam, box_mesh, held, problem_on, rotation
 from hybrid_samples import TORSION, Watched, fitted, problems, soft_beam
-from pdcorrect.corrector.architecture import preset
 from pdcorrect.corrector.batch_hybrid import BatchHybrid
 from pdcorrect.corrector.bodies import SHAPE_MEASURES, BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, preset
 from pdcorrect.corrector.gate import Gate, Reason
 from pdcorrect.corrector.hybrid import HybridStepper
 from pdcorrect.corrector.normaliser import RunningMoments
@@ -217,7 +216,6 @@ def test_a_longer_body_is_beyond_the_range_by_its_size_and_its_hybrid_refuses_it
     assert "smallest radius" not in found
     assert max(found.values()) == pytest.approx(excess(corrector, longer)[0])
     hybrid = HybridStepper(pc.ProjectiveDynamics(longer), corrector, gate=Gate()).prepare()
-    assert hybrid.compiled
     assert hybrid(longer.rest_state()).stats["gate"] == Reason.OUTSIDE
 
 

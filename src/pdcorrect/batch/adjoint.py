@@ -9,11 +9,17 @@ import torch
 from torch import Tensor
 
 from pdcorrect.batch.adjoint_terms import RayleighTerm, ViscousTerm, Written
-from pdcorrect.batch.checks import check_nodal, check_state
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
 from pdcorrect.batch.minimise import Mixing
 from pdcorrect.batch.objective import largest_displacement
-from pdcorrect.batch.states import BatchResult, BatchState, Solved, in_one
+from pdcorrect.batch.states import (
+    BatchResult,
+    BatchState,
+    Solved,
+    check_nodal,
+    check_state,
+    in_one,
+)
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import InputError
 from pdcorrect.scene import Material

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from torch import Tensor
 from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.points import Points, Tangent
+from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 
@@ -336,3 +338,68 @@ def table_rows(rows: Numbers, values: Numbers, count: int, fill: int) -> tuple[N
     out = np.full((count, counts.max()), fill, dtype=np.int64)
     out[rows, places] = values
     return out, places
+
+
+# --- scenes that are together ---------------------------------------------------------------------
+
+
+def scene_name(problems: Sequence[Problem], i: int) -> str:
+    """A scene's number and name."""
+    return f"{i} ({problems[i].scene.name!r})"
+
+
+def check_problems(
+    problems: Sequence[Problem], time_step: float | None, integrator: str | None
+) -> tuple[Problem, ...]:
+    """The problems; scenes that cannot step together are refused, naming one and what differs.
+
+    ``time_step`` and ``integrator`` are those asked for, or None for the scenes' own.
+    """
+    problems = tuple(problems)
+    if not problems:
+        raise InputError("no problems: expected one or more scenes.")
+    first = problems[0].scene
+    names = ["solver.element", "material.energy", "material.volume_weight"]
+    names += ["damping.viscosity", "damping.mass", "damping.stiffness"]
+    if time_step is None:
+        names += ["time.step", "time.substeps"]
+    if integrator is None:
+        names.append("time.integrator")
+    if (integrator or first.time.integrator) == "generalised-alpha":
+        names.append("time.spectral_radius")
+    for i, problem in enumerate(problems):
+        for found, what in (
+            (problem.contact, "obstacles"),
+            (problem.fibres, "actuators"),
+            (problem.rollers, "oblique rollers"),
+        ):
+            if found is not None:
+                raise InputError(
+                    f"scene {scene_name(problems, i)} has {what}, which batches do not know: "
+                    "expected none. Step it by ProjectiveDynamics or Newton."
+                )
+        for name in names:
+            mine, theirs = (attrgetter(name)(scene) for scene in (problem.scene, first))
+            if mine != theirs:
+                raise InputError(
+                    f"scene {scene_name(problems, i)}: {name} = {mine!r}, the first one's is "
+                    f"{theirs!r}: expected the same. Make a batch of each kind."
+                )
+    return problems
+
+
+def usable_device(device: str | torch.device) -> torch.device:
+    """A device that torch has here."""
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        found = torch.device("meta")
+    if found.type not in ("cpu", "cuda"):
+        raise InputError(f"device = {device!r}: expected 'cpu', 'cuda', 'cuda:1', ...")
+    count = torch.cuda.device_count()
+    if found.type == "cuda" and (found.index or 0) >= count:
+        raise InputError(
+            f"device = {str(found)!r}: torch finds {count} CUDA devices here; expected one of "
+            "those, or 'cpu'."
+        )
+    return found

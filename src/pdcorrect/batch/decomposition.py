@@ -40,13 +40,18 @@ def _diagonal(A: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     return S[:3], V
 
 
-def _rotate(S: list[Tensor], V: list[Tensor], p: int, q: int, pq: int, pr: int, qr: int) -> None:
-    """Jacobi rotation that zeroes entry (p, q) of S = [00 11 22 01 02 12]."""
-    gap, d = S[q] - S[p], S[pq]
+def _jacobi(gap: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Cosine, sine and tangent of the rotation that makes [[a, d], [d, a + gap]] diagonal."""
     tangent = torch.where(gap < 0, -2.0, 2.0) * d
     tangent = tangent / (gap.abs() + torch.sqrt(gap * gap + 4.0 * d * d) + tiny(d))
     cosine = torch.rsqrt(1.0 + tangent * tangent)
-    sine = tangent * cosine
+    return cosine, tangent * cosine, tangent
+
+
+def _rotate(S: list[Tensor], V: list[Tensor], p: int, q: int, pq: int, pr: int, qr: int) -> None:
+    """Jacobi rotation that zeroes entry (p, q) of S = [00 11 22 01 02 12]."""
+    d = S[pq]
+    cosine, sine, tangent = _jacobi(S[q] - S[p], d)
     S[p], S[q], S[pq] = S[p] - tangent * d, S[q] + tangent * d, torch.zeros_like(d)
     S[pr], S[qr] = cosine * S[pr] - sine * S[qr], sine * S[pr] + cosine * S[qr]
     _turn(V, p, q, cosine, sine)
@@ -86,12 +91,9 @@ def signed_svd(F: list[Tensor]) -> tuple[list[Tensor], list[Tensor], list[Tensor
 def _polish(B: list[Tensor], V: list[Tensor]) -> None:
     """Make columns 1 and 2 of B orthogonal to their own size, which F^T F cannot resolve."""
     gap = _squares(B, 2) - _squares(B, 1)
-    d = B[1] * B[2] + B[4] * B[5] + B[7] * B[8]
-    tangent = torch.where(gap < 0, -2.0, 2.0) * d
-    tangent = tangent / (gap.abs() + torch.sqrt(gap * gap + 4.0 * d * d) + tiny(d))
-    cosine = torch.rsqrt(1.0 + tangent * tangent)
+    cosine, sine, _ = _jacobi(gap, B[1] * B[2] + B[4] * B[5] + B[7] * B[8])
     for A in (B, V):
-        _turn(A, 1, 2, cosine, tangent * cosine)
+        _turn(A, 1, 2, cosine, sine)
 
 
 def _orthonormalise(

@@ -19,18 +19,18 @@ from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from pdcorrect.batch.adjoint import BatchGradients
-from pdcorrect.batch.checks import (
-    by_cell,
+from pdcorrect.batch.cells import scene_name
+from pdcorrect.batch.material import NAMES, BatchMaterial, by_cell, check_material
+from pdcorrect.batch.states import (
+    BatchState,
+    Solved,
     check_finite,
-    check_material,
     check_nodal,
     check_state,
     check_tensor,
-    scene_name,
+    in_one,
     start_times,
 )
-from pdcorrect.batch.material import NAMES, BatchMaterial
-from pdcorrect.batch.states import BatchState, Solved, in_one
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.solvers.implicit import positive, whole

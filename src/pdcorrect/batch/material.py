@@ -8,7 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.cells import CellBatch, scene_name
+from pdcorrect.batch.states import check_tensor
+from pdcorrect.errors import InputError
+from pdcorrect.fem.materials import RANGES
+from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Material
 from pdcorrect.scene.materials import lame
 
@@ -77,3 +81,35 @@ def in_range(young: Tensor, poisson: Tensor, density: Tensor) -> tuple[Tensor, T
         (poisson >= 0.0) & (poisson < 0.5),
         (density > 0.0) & torch.isfinite(density),
     )
+
+
+def by_cell(cells: CellBatch, name: str, value: Tensor | float | None) -> Tensor | None:
+    """A number, or a tensor that broadcasts to (B, C), as (B, C); others are refused."""
+    if value is None:
+        return None
+    shape = (cells.sizes.scenes, cells.sizes.cells)
+    if isinstance(value, (int, float)):
+        value = torch.tensor(float(value), dtype=cells.dtype, device=cells.rest.device)
+    check_tensor(cells, name, value)
+    try:
+        return value.expand(shape)
+    except RuntimeError:
+        raise InputError(
+            f"{name}: {tuple(value.shape)}; expected what broadcasts to {shape}, one value a "
+            f"cell of each scene: one value a scene is ({shape[0]}, 1)."
+        ) from None
+
+
+def check_material(cells: CellBatch, problems: Sequence[Problem], material: BatchMaterial) -> None:
+    """Refuse values out of their range, naming scene and cell."""
+    if material.sound.all():
+        return
+    fits = in_range(*material.values)
+    for (name, wanted), value, fine in zip(RANGES.items(), material.values, fits, strict=True):
+        bad = (~fine & cells.present_cells).nonzero()
+        if len(bad):
+            scene, cell = bad[0].tolist()
+            raise InputError(
+                f"{name} of cell {cell} in scene {scene_name(problems, scene)} is "
+                f"{float(value[scene, cell]):g}: expected a finite number {wanted}."
+            )

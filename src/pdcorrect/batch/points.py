@@ -149,7 +149,7 @@ def _stress_of(
     *nearest: Components,
 ) -> list[Components]:
     """Psi, and P row by row."""
-    density, t = principal_stress(model, s, _pair(nearest), *weights)
+    density, t = principal_stress(model, s, nearest, *weights)
     scaled = [U[3 * i + j] * t[j] for i in range(3) for j in range(3)]
     return [[density], product(scaled, transposed(V))]
 
@@ -158,14 +158,7 @@ def _tangent_of(
     model: int, project: bool, s: Components, weights: Components, *nearest: Components
 ) -> list[Components]:
     mu, omega = weights
-    return [principal_tangent(model, s, _pair(nearest), mu, omega, project)]
-
-
-def _pair(nearest: Sequence[Components]) -> Nearest:
-    if not nearest:
-        return None
-    v, (k,) = nearest
-    return v, k
+    return [principal_tangent(model, s, nearest, mu, omega, project)]
 
 
 def _product(U: Components, V: Components, T: Components, D: Components) -> list[Components]:
@@ -178,8 +171,8 @@ _KINK = 1e-9
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
-Nearest = tuple[list[Tensor], Tensor] | None
-"""The nearest stretch of unit volume and its multiplier; None without a volume term."""
+Nearest = Sequence[Components]
+"""The nearest stretch of unit volume (3) and its multiplier (1); nothing without a volume term."""
 
 
 def principal_stress(
@@ -190,8 +183,8 @@ def principal_stress(
     if model == COROTATED:
         density = mu * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
         t = [2.0 * mu * x for x in e]
-        if nearest is not None:
-            v, k = nearest
+        if nearest:
+            v, (k,) = nearest
             g = [k / x for x in v]
             density = density + 0.5 * omega * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
             t = [a - omega * b for a, b in zip(t, g, strict=True)]
@@ -245,9 +238,9 @@ def _corotated(s: list[Tensor], nearest: Nearest, mu: Tensor, omega: Tensor) -> 
         apart.append(total > _KINK * (s[0] + tiny(s[0])))
         quotient = 2.0 * mu * (total - 2.0) / torch.where(apart[-1], total, 1.0)
         T.append(torch.where(apart[-1], quotient, zero))
-    if nearest is None:
+    if not nearest:
         return T
-    v, k = nearest
+    v, (k,) = nearest
     d = [2.0 * a - b for a, b in zip(v, s, strict=True)]
     total = d[1] * d[2] / v[0] + d[0] * d[2] / v[1] + d[0] * d[1] / v[2]
     regular = total.abs() > _KINK * (v[0] + v[1] + v[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -10,7 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch
+from pdcorrect.batch.cells import CellBatch, scene_name
+from pdcorrect.errors import InputError
+from pdcorrect.fem.problem import Problem
 from pdcorrect.state import State, Status
 
 Array = NDArray[np.float64]
@@ -126,3 +129,76 @@ def state_of(cells: CellBatch, batch: BatchState, i: int) -> State:
         batch.times[i],
         {name: host(x) for name, x in batch.memory.items()},
     )
+
+
+# --- checks ---------------------------------------------------------------------------------------
+
+
+def check_tensor(cells: CellBatch, name: str, x: Tensor) -> None:
+    """Refuse what is no tensor of the batch's type on its device."""
+    kind = f"{x.dtype} on {x.device}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+    if kind != f"{cells.dtype} on {cells.rest.device}":
+        raise InputError(
+            f"{name}: {kind}; expected a tensor of {cells.dtype} on {cells.rest.device}, as the "
+            "stepper: convert it, or make the stepper with other dtype= and device=."
+        )
+
+
+def check_nodal(cells: CellBatch, name: str, x: Tensor) -> None:
+    """Refuse what is not (B, N, 3) of the batch's type on its device."""
+    check_tensor(cells, name, x)
+    wanted = (cells.sizes.scenes, cells.sizes.nodes, 3)
+    if tuple(x.shape) != wanted:
+        raise InputError(
+            f"{name}: {tuple(x.shape)}; expected {wanted}: scenes, nodes of the largest one, 3."
+        )
+
+
+def check_finite(problems: Sequence[Problem], name: str, x: Tensor) -> None:
+    """Refuse a nodal tensor with NaN or infinity, in padding too, naming scene and node."""
+    bad = (~torch.isfinite(x).all(dim=2)).nonzero()
+    if len(bad):
+        scene, node = bad[0].tolist()
+        raise InputError(
+            f"{name} of node {node} in scene {scene_name(problems, scene)} is "
+            f"{x[scene, node].tolist()}: expected finite numbers."
+        )
+
+
+def check_states(cells: CellBatch, states: Sequence[State]) -> tuple[State, ...]:
+    """The states; refused where there is not one for each scene, or shapes are wrong."""
+    states = tuple(states)
+    if len(states) != len(cells.node_counts):
+        raise InputError(f"{len(states)} states: expected {len(cells.node_counts)}, one a scene.")
+    for i, (state, count) in enumerate(zip(states, cells.node_counts, strict=True)):
+        if len(state.positions) != count:
+            raise InputError(f"state {i} has {len(state.positions)} nodes: expected {count}.")
+    names = set(states[0].memory)
+    if any(set(s.memory) != names for s in states):
+        raise InputError("some states have a memory that others lack: expected all or none.")
+    return states
+
+
+def check_state(cells: CellBatch, state: BatchState) -> None:
+    """Refuse what is no state of the batch."""
+    check_nodal(cells, "positions", state.positions)
+    check_nodal(cells, "velocities", state.velocities)
+    _finite_times(cells, state.times)
+    for name, x in state.memory.items():
+        check_nodal(cells, f"memory {name!r}", x)
+
+
+def start_times(cells: CellBatch, times: Sequence[float] | None) -> tuple[float, ...]:
+    """One time for each scene, s; zeros if there are none."""
+    return (0.0,) * cells.sizes.scenes if times is None else _finite_times(cells, times)
+
+
+def _finite_times(cells: CellBatch, times: Sequence[float]) -> tuple[float, ...]:
+    scenes = cells.sizes.scenes
+    try:
+        found = tuple(float(t) for t in times)
+    except (TypeError, ValueError):
+        found = ()
+    if len(found) != scenes or not all(map(math.isfinite, found)):
+        raise InputError(f"times = {times!r}: expected {scenes} finite numbers, one a scene.")
+    return found

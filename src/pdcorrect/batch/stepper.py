@@ -14,27 +14,32 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.cells import CellBatch
-from pdcorrect.batch.checks import (
-    by_cell,
-    check_material,
-    check_nodal,
-    check_problems,
-    check_state,
-    check_states,
-    start_times,
-    usable_device,
-)
+from pdcorrect.batch.cells import CellBatch, check_problems, usable_device
 from pdcorrect.batch.first_hessian import BatchHessian, FirstHessian, chosen
 from pdcorrect.batch.gpu import one_thread
 from pdcorrect.batch.linear_solver import BatchConjugateGradients
-from pdcorrect.batch.loads import BatchLoads
-from pdcorrect.batch.material import NAMES, BatchMaterial, changed, own_material
+from pdcorrect.batch.material import (
+    NAMES,
+    BatchMaterial,
+    by_cell,
+    changed,
+    check_material,
+    own_material,
+)
 from pdcorrect.batch.minimise import BatchMinimiser, Phase, settle
 from pdcorrect.batch.objective import BatchObjective, by_scene
 from pdcorrect.batch.retry import SingleRetry
-from pdcorrect.batch.states import BatchResult, BatchState, state_of, together
-from pdcorrect.batch.step_equation import BatchStaging, BatchStepEquation
+from pdcorrect.batch.states import (
+    BatchResult,
+    BatchState,
+    check_nodal,
+    check_state,
+    check_states,
+    start_times,
+    state_of,
+    together,
+)
+from pdcorrect.batch.step_equation import BatchLoads, BatchStaging, BatchStepEquation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.cell_correction import CellCorrection
 from pdcorrect.fem.problem import Problem

@@ -7,23 +7,31 @@ result = hybrid(state)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from pdcorrect.batch.checks import check_nodal, check_state, start_times
 from pdcorrect.batch.layer import OnFailure, PDLayer
-from pdcorrect.batch.loads import Spans
 from pdcorrect.batch.objective import by_scene, dot
-from pdcorrect.batch.states import BatchResult, BatchState, chosen, state_of
+from pdcorrect.batch.states import (
+    BatchResult,
+    BatchState,
+    check_nodal,
+    check_state,
+    chosen,
+    start_times,
+    state_of,
+)
+from pdcorrect.batch.step_equation import Spans
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector, check_corrector
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import (
+    CorrectedStep,
     Gate,
     GateMeasures,
     Velocity,
@@ -33,10 +41,8 @@ from pdcorrect.corrector.gate import (
     moved,
 )
 from pdcorrect.corrector.graph_replay import (
-    UNRECORDABLE,
     RecordedCorrector,
     RecordedMeasures,
-    recordable,
     stored_and_ratios,
 )
 from pdcorrect.errors import InputError
@@ -75,12 +81,19 @@ class _Loads(torch.autograd.Function):
 
 
 class BatchBodies:
-    """The scenes of a stepper as the bodies of a graph: n nodes without padding."""
+    """The scenes of a stepper as the bodies of a graph: n nodes without padding.
 
-    def __init__(self, stepper: BatchStepper) -> None:
+    ``velocity`` is of corrected states, see `BatchHybrid`; ``measures`` record the gate's work.
+    """
+
+    def __init__(
+        self, stepper: BatchStepper, velocity: Velocity = "recomputed", *, recorded: bool = False
+    ) -> None:
         if not isinstance(stepper, BatchStepper):
             raise InputError(f"stepper is a {type(stepper).__name__}: expected a BatchStepper.")
-        self.stepper, self._material = stepper, stepper.own
+        check_velocity(velocity, stepper.integrator)
+        self.stepper, self.velocity, self._material = stepper, velocity, stepper.own
+        self.measures = RecordedMeasures(stepper) if recorded else None
         self._own = self._graph = BodyGraph.of(
             stepper.problems, stepper.time_step, device=stepper.device, dtype=torch.float64
         )
@@ -132,23 +145,6 @@ class BatchBodies:
                 f"{tuple(expected)}, or None."
             )
 
-
-class BatchParts(BatchBodies):
-    """Scenes and what corrects them, checked: what both forms of a hybrid of many scenes have."""
-
-    def __init__(
-        self,
-        stepper: BatchStepper,
-        corrector: Corrector,
-        velocity: Velocity,
-        recorded: bool = False,
-    ) -> None:
-        super().__init__(stepper)
-        self.corrector = check_corrector(corrector, stepper.device)
-        check_velocity(velocity, stepper.integrator)
-        self.velocity = velocity
-        self.measures = RecordedMeasures(stepper) if recorded else None
-
     def moved(self, before: BatchState, after: BatchState, correction: Tensor) -> BatchState:
         """The state after a step with a correction (n, 3) added."""
         positions, velocities, memory = moved(
@@ -183,8 +179,8 @@ class BatchCoarseStep:
     by scene on the CPU.
     """
 
-    def __init__(self, parts: BatchParts, state: BatchState, previous: Tensor | None) -> None:
-        self._parts, self._stepper = parts, parts.stepper
+    def __init__(self, nodes: BatchBodies, state: BatchState, previous: Tensor | None) -> None:
+        self._nodes, self._stepper = nodes, nodes.stepper
         self._state, self._previous = state, previous
         self._loads: Tensor | None = None
 
@@ -194,8 +190,8 @@ class BatchCoarseStep:
 
     def view(self, answer: BatchResult) -> FeatureView:
         """See `CoarseStep`."""
-        view = self._parts.view(self._state, answer.state.positions, self._previous)
-        self._loads = self._parts.padded(view.snapshot.forces)
+        view = self._nodes.view(self._state, answer.state.positions, self._previous)
+        self._loads = self._nodes.padded(view.snapshot.forces)
         return view
 
     def ok(self, answer: BatchResult) -> Tensor:
@@ -204,11 +200,11 @@ class BatchCoarseStep:
 
     def moved(self, answer: BatchResult, correction: Tensor) -> BatchResult:
         """See `CoarseStep`; only the state is another one."""
-        return replace(answer, state=self._parts.moved(self._state, answer.state, correction))
+        return replace(answer, state=self._nodes.moved(self._state, answer.state, correction))
 
     def measured(self, answer: BatchResult) -> GateMeasures:
         """See `CoarseStep`."""
-        state, recorded = answer.state, self._parts.measures
+        state, recorded = answer.state, self._nodes.measures
         assert self._loads is not None, "the network was asked before"
         with self._stepper.alone():
             work = dot(self._loads, state.positions - self._state.positions)
@@ -238,25 +234,11 @@ def _converged(statuses: Sequence[Status], device: torch.device) -> Tensor:
     return torch.tensor([s.ok for s in statuses]).to(device, non_blocking=True)
 
 
-@dataclass(frozen=True, eq=False)
-class BatchHybridResult:
-    """Outcome of a corrected step of B scenes with n nodes in all.
+BatchHybridResult = CorrectedStep[BatchResult]
+"""Outcome of a corrected step of B scenes.
 
-    The correction (n, 3), m, is as applied, zero where it was refused.  ``coarse`` is the coarse
-    solver's answer, its statuses too; steps that converged to inverted cells are corrected like
-    others.  ``reasons`` (B,) are numbers of `Reason`, why the plain coarse answer was kept, 0 where
-    it was not.
-    """
-
-    state: BatchState
-    correction: Tensor
-    coarse: BatchResult
-    reasons: Tensor
-
-    @property
-    def refused(self) -> Tensor:
-        """Whether the plain coarse answer was kept, (B,) bool."""
-        return self.reasons > 0
+Statuses are the coarse solver's; steps that converged to inverted cells are corrected like others.
+"""
 
 
 class BatchHybrid:
@@ -283,7 +265,7 @@ class BatchHybrid:
 
     Attributes
     ----------
-    nodes : BatchParts
+    nodes : BatchBodies
         The scenes as the network knows them: its ``graph``, and nodal values with and without
         padding.
 
@@ -302,14 +284,11 @@ class BatchHybrid:
         gate: Gate | None = None,
         recorded: bool = False,
     ) -> None:
-        self.nodes = BatchParts(stepper, corrector, velocity, recorded)
-        self.stepper, self.corrector, self.gate = stepper, corrector, gate
+        self.nodes = BatchBodies(stepper, velocity, recorded=recorded)
+        self.stepper, self.gate = stepper, gate
+        self.corrector = check_corrector(corrector, stepper.device)
         check_gate(gate)
-        self._recorded: RecordedCorrector | None = None
-        if recorded:
-            if not recordable(corrector):
-                raise InputError(UNRECORDABLE)
-            self._recorded = RecordedCorrector(corrector)
+        self._recorded = RecordedCorrector(corrector) if recorded else None
 
     @torch.no_grad()
     def __call__(self, state: BatchState, previous: Tensor | None = None) -> BatchHybridResult:
@@ -330,8 +309,7 @@ class BatchHybrid:
         with self.stepper.alone():
             step = BatchCoarseStep(self.nodes, state, previous)
             answers = self.corrector if self._recorded is None else self._recorded
-            found = corrected_step(step, answers, self.gate)
-        return BatchHybridResult(found.answer.state, found.correction, found.coarse, found.reasons)
+            return corrected_step(step, answers, self.gate)
 
 
 class HybridLayer(nn.Module):
@@ -356,7 +334,7 @@ class HybridLayer(nn.Module):
 
     Attributes
     ----------
-    nodes : BatchParts
+    nodes : BatchBodies
         See `BatchHybrid`.
     steps : PDLayer
         The coarse step; its ``statuses`` are those of the last call.
@@ -382,9 +360,9 @@ class HybridLayer(nn.Module):
         on_failure: OnFailure = "raise",
     ) -> None:
         super().__init__()
-        self.nodes = BatchParts(stepper, corrector, velocity)
-        self.corrector, self.through_solver = corrector, through_solver
-        self.steps = PDLayer(stepper, on_failure=on_failure)
+        self.nodes = BatchBodies(stepper, velocity)
+        self.corrector = check_corrector(corrector, stepper.device)
+        self.steps, self.through_solver = PDLayer(stepper, on_failure=on_failure), through_solver
 
     def forward(
         self,

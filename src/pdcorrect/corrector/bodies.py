@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,11 @@ from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+
+
+def _known(function: Callable[[Any], Tensor]) -> cached_property[Tensor]:
+    """Computed once, and for later use with derivatives too."""
+    return cached_property(torch.inference_mode(False)(function))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,52 +134,45 @@ class BodyGraph:
         """
         return (self.time_step.double() / self.cell_size.double()).log()
 
-    @cached_property
+    @_known
     def node_counts(self) -> Tensor:
         """Nodes of each body, (B,), in the type of ``rest``."""
-        with torch.inference_mode(False):  # for later use with derivatives too
-            return self.node_sums(torch.ones_like(self.mass))
+        return self.node_sums(torch.ones_like(self.mass))
 
-    @cached_property
+    @_known
     def cell_counts(self) -> Tensor:
         """Cells that touch each node, (n,), in the type of ``rest``."""
-        with torch.inference_mode(False):
-            corners = self.cells.reshape(-1)
-            ones = torch.ones_like(corners, dtype=self.rest.dtype)
-            return torch.zeros_like(self.mass).index_add(0, corners, ones)
+        corners = self.cells.reshape(-1)
+        ones = torch.ones_like(corners, dtype=self.rest.dtype)
+        return torch.zeros_like(self.mass).index_add(0, corners, ones)
 
-    @cached_property
+    @_known
     def rest_inverses(self) -> Tensor:
         """Inverses of the cells' axes at rest, (c, 3, 3), 1/m."""
-        with torch.inference_mode(False):
-            return torch.linalg.inv(cell_axes(self.rest, self.cells))
+        return torch.linalg.inv(cell_axes(self.rest, self.cells))
 
-    @cached_property
+    @_known
     def rest_frames(self) -> Tensor:
         """Frames of the nodes at rest: rotations (n, 3, 3)."""
-        with torch.inference_mode(False):
-            return polar_rotations(node_axes(self.rest, self.cells, self.cell_counts))
+        return polar_rotations(node_axes(self.rest, self.cells, self.cell_counts))
 
-    @cached_property
+    @_known
     def rest_edges(self) -> Tensor:
         """From receiver to sender at rest, in the receiver's frame, (E, 3), m."""
         here, there = self.edge_index
-        with torch.inference_mode(False):
-            return turned_back(self.rest_frames[here], self.rest[there] - self.rest[here])
+        return turned_back(self.rest_frames[here], self.rest[there] - self.rest[here])
 
-    @cached_property
+    @_known
     def rest_turns(self) -> Tensor:
         """Rotation from the receiver's to the sender's frame at rest, (E, 3)."""
         here, there = self.edge_index
-        with torch.inference_mode(False):
-            frames = self.rest_frames
-            return turns_between(frames[here], frames[there])
+        frames = self.rest_frames
+        return turns_between(frames[here], frames[there])
 
-    @cached_property
+    @_known
     def shapes(self) -> Tensor:
         """What a gate knows of the bodies at rest, (B, 10), see `shape_measures`."""
-        with torch.inference_mode(False):
-            return torch.as_tensor(shape_measures(self)).to(self.rest)
+        return torch.as_tensor(shape_measures(self)).to(self.rest)
 
     def by_node(self, values: Tensor) -> Tensor:
         """Values (B, ...) of bodies at their nodes, (n, ...)."""

@@ -10,7 +10,6 @@ R does not depend on how a mesh orders the corners of its cells; the frame at re
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -18,11 +17,10 @@ from functools import cache
 from typing import Any
 
 import torch
-from numba import njit
 from torch import Tensor
 
 from pdcorrect.batch.gpu import one_kernel
-from pdcorrect.fem.decomposition import OPTIONS
+from pdcorrect.fem.energies import nearest_rotation
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 
 EDGE_MEANS = (2.0 * VTK_CORNERS - 1.0) / 4.0
@@ -130,11 +128,7 @@ def turns_between(R: Tensor, S: Tensor) -> Tensor:
 class _Polar(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrices: Tensor) -> Tensor:
-        if matrices.device.type == "cpu":
-            R = torch.empty(matrices.shape, dtype=matrices.dtype)
-            rotations(matrices.detach().contiguous().numpy(), R.numpy())
-        else:
-            R = together(matrices)
+        R = _on_cpu(matrices) if matrices.device.type == "cpu" else together(matrices)
         ctx.save_for_backward(matrices, R)
         return R
 
@@ -150,6 +144,15 @@ class _Polar(torch.autograd.Function):
         z = (C * q[:, None]).sum(dim=0) / (_determinants(A, C) * size)
         back = torch.linalg.cross(R, z.expand_as(R), dim=1)
         return torch.where(usable, back, 0.0).permute(2, 0, 1)
+
+
+def _on_cpu(matrices: Tensor) -> Tensor:
+    """`polar_rotations` by signed SVDs, without derivatives."""
+    size = matrices.square().sum(dim=(1, 2)).sqrt()
+    usable = torch.linalg.det(matrices) > _FLATTEST * size**3
+    identity = torch.eye(3, dtype=matrices.dtype)
+    found = nearest_rotation(torch.where(usable[:, None, None], matrices, identity).numpy())
+    return torch.from_numpy(found).to(matrices.dtype)
 
 
 def together(matrices: Tensor) -> Tensor:
@@ -201,47 +204,3 @@ def _off_diagonal(device: torch.device) -> tuple[Tensor, Tensor]:
     """Where zy, xz and yx are in the nine of a matrix, and yz, zx and xy."""
     with torch.inference_mode(False):
         return torch.tensor([7, 2, 3], device=device), torch.tensor([5, 6, 1], device=device)
-
-
-@njit(inline="always", **OPTIONS)
-def _cofactors_of(a, b, c, d, e, f, g, h, i):  # type: ignore[no-untyped-def]
-    """Of one matrix, row by row."""
-    return (
-        e * i - f * h, f * g - d * i, d * h - e * g,
-        h * c - i * b, i * a - g * c, g * b - h * a,
-        b * f - c * e, c * d - a * f, a * e - b * d,
-    )  # fmt: skip
-
-
-@njit(**OPTIONS)
-def rotations(M, out):  # type: ignore[no-untyped-def]
-    """`polar_rotations` (n, 3, 3), one by one."""
-    for k in range(M.shape[0]):
-        squares = 0.0
-        for row in range(3):
-            for column in range(3):
-                squares += M[k, row, column] * M[k, row, column]
-        by = 1.0 / math.sqrt(squares) if squares > 0.0 else 1.0
-        a, b, c = by * M[k, 0, 0], by * M[k, 0, 1], by * M[k, 0, 2]
-        d, e, f = by * M[k, 1, 0], by * M[k, 1, 1], by * M[k, 1, 2]
-        g, h, i = by * M[k, 2, 0], by * M[k, 2, 1], by * M[k, 2, 2]
-        C = _cofactors_of(a, b, c, d, e, f, g, h, i)
-        if not a * C[0] + b * C[1] + c * C[2] > _FLATTEST:
-            a = e = i = 1.0
-            b = c = d = f = g = h = 0.0
-        else:
-            for _ in range(_NEWTON_STEPS):
-                C = _cofactors_of(a, b, c, d, e, f, g, h, i)
-                by = 1.0 / (a * C[0] + b * C[1] + c * C[2])
-                squares = a * a + b * b + c * c + d * d + e * e + f * f + g * g + h * h + i * i
-                others = 0.0
-                for x in C:
-                    others += x * x
-                scale = math.sqrt(math.sqrt(others * by * by / squares))
-                p, q = 0.5 * scale, 0.5 * by / scale
-                a, b, c = p * a + q * C[0], p * b + q * C[1], p * c + q * C[2]
-                d, e, f = p * d + q * C[3], p * e + q * C[4], p * f + q * C[5]
-                g, h, i = p * g + q * C[6], p * h + q * C[7], p * i + q * C[8]
-        out[k, 0, 0], out[k, 0, 1], out[k, 0, 2] = a, b, c
-        out[k, 1, 0], out[k, 1, 1], out[k, 1, 2] = d, e, f
-        out[k, 2, 0], out[k, 2, 1], out[k, 2, 2] = g, h, i

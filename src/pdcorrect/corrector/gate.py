@@ -140,8 +140,16 @@ def check_gate(gate: object) -> None:
 
 # --- a corrected step --------------------------------------------------------------------
 
-Answer = TypeVar("Answer")
-"""A coarse solver's result of a step of B scenes."""
+
+class HasState(Protocol):
+    """A coarse solver's result of a step of B scenes."""
+
+    @property
+    def state(self) -> Any:
+        """After the step."""
+
+
+Answer = TypeVar("Answer", bound=HasState)
 
 
 class CoarseStep(Protocol[Answer]):
@@ -172,13 +180,23 @@ class CorrectedStep(Generic[Answer]):
 
     ``coarse`` is the coarse solver's answer: ``answer`` bit for bit in scenes whose correction is
     zero or refused.  The correction (n, 3), m, is as applied, zero where refused; ``reasons`` (B,)
-    are numbers of `Reason`, int64.
+    are numbers of `Reason`, int64: 0 where the correction was not refused.
     """
 
     answer: Answer
     coarse: Answer
     correction: Tensor
     reasons: Tensor
+
+    @property
+    def state(self) -> Any:
+        """Of the answer."""
+        return self.answer.state
+
+    @property
+    def refused(self) -> Tensor:
+        """Whether the plain coarse answer was kept, (B,) bool."""
+        return self.reasons > 0
 
 
 def corrected_step(

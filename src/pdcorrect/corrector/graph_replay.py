@@ -6,8 +6,10 @@ longer than they do.  They are the same in every step of the same bodies.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields
+from itertools import chain
+from operator import is_
 from typing import Any
 
 import torch
@@ -17,17 +19,11 @@ from pdcorrect.batch.gpu import Recorder
 from pdcorrect.batch.objective import dot
 from pdcorrect.batch.stepper import BatchStepper
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled import Contents, usual
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.frames import unrolled_products
 from pdcorrect.corrector.gate import GateMeasures
 from pdcorrect.errors import InputError
-
-UNRECORDABLE = (
-    "recorded = True with a corrector of another class, with hooks, with a network that was "
-    "changed or with momentum_neutral: what it does would not be recorded. Expected False."
-)
 
 
 def recordable(corrector: Corrector) -> bool:
@@ -41,6 +37,62 @@ def recordable(corrector: Corrector) -> bool:
     return plain and not corrector.config.momentum_neutral
 
 
+def check_recordable(corrector: Corrector) -> Corrector:
+    """A corrector that can be recorded; others are refused with an `InputError`."""
+    if not recordable(corrector):
+        raise InputError(
+            "recorded = True with a corrector of another class, with hooks, with a network that "
+            "was changed or with momentum_neutral: what it does would not be recorded. Expected "
+            "False."
+        )
+    return corrector
+
+
+def usual(corrector: Corrector) -> bool:
+    """Whether its network is as it was made, weights apart, and without hooks."""
+    with torch.device("meta"):
+        new = Corrector(corrector.config)
+    mine, made = (list(each.network.modules()) for each in (corrector, new))
+    return len(mine) == len(made) and all(
+        type(one) is type(other)
+        and one.extra_repr() == other.extra_repr()
+        and not (one._forward_hooks or one._forward_pre_hooks)
+        for one, other in zip(mine, made, strict=True)
+    )
+
+
+class Contents:
+    """Modules and tensors of a corrector as they are now, whatever is written to them."""
+
+    def __init__(self, corrector: Corrector) -> None:
+        self._corrector, self._config = corrector, corrector.config
+        tables = [
+            table
+            for module in corrector.modules()
+            for table in (module._parameters, module._buffers, module._modules)
+        ]
+        self._tables: list[dict[str, Any]] = [table for table in tables if table]
+        self._empty = [table for table in tables if not table]
+        self._names, self._parts = [*chain.from_iterable(self._tables)], [*self._there()]
+        self._tensors = [part for part in self._parts if isinstance(part, Tensor)]
+        self._places = self._where()
+
+    @property
+    def replaced(self) -> bool:
+        """Whether there are other modules, tensors or storage than there were."""
+        if self._corrector.config is not self._config or self._where() != self._places:
+            return True
+        if any(self._empty) or [*chain.from_iterable(self._tables)] != self._names:
+            return True
+        return not all(map(is_, self._there(), self._parts))
+
+    def _where(self) -> list[int]:
+        return [*map(Tensor.data_ptr, self._tensors)]
+
+    def _there(self) -> Iterator[Any]:
+        return chain.from_iterable(map(dict.values, self._tables))
+
+
 class RecordedCorrector:
     """Answers as of a `Corrector`, without derivatives, with what a gate asks of it.
 
@@ -52,7 +104,7 @@ class RecordedCorrector:
     """
 
     def __init__(self, corrector: Corrector) -> None:
-        self._corrector, self.config = corrector, corrector.config
+        self._corrector, self.config = check_recordable(corrector), corrector.config
         self._forget()
 
     def _forget(self) -> None:
@@ -93,9 +145,7 @@ class RecordedCorrector:
     def _record(self, bodies: BodyGraph) -> None:
         """Until it has succeeded nothing is known."""
         self._forget()
-        corrector, rest = self._corrector, bodies.rest
-        if not recordable(corrector):
-            raise InputError(UNRECORDABLE)
+        corrector, rest = check_recordable(self._corrector), bodies.rest
         with torch.inference_mode(False), torch.no_grad():
             self.config, self._contents = corrector.config, Contents(corrector)
             self._snapshot = Snapshot(*(rest.clone() for _ in fields(Snapshot)))

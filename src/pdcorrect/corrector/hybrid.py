@@ -19,10 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.batch.gpu import one_thread
 from pdcorrect.corrector.bodies import BodyGraph
-from pdcorrect.corrector.compiled import CompiledCorrector, compilable
-from pdcorrect.corrector.corrector import Answers, Corrector, check_corrector
+from pdcorrect.corrector.corrector import Corrector, check_corrector
 from pdcorrect.corrector.features import FeatureView, Snapshot
 from pdcorrect.corrector.gate import (
     Gate,
@@ -71,9 +69,6 @@ class HybridStepper:
 
     Attributes
     ----------
-    compiled : bool
-        Whether a `CompiledCorrector` answers, which is the same to rounding; `prepare` copies
-        the weights that it has then.
     remembers : bool
         Whether states carry the correction of the step before, `MEMORY`, for the network.
 
@@ -129,10 +124,6 @@ class HybridStepper:
         self.velocity, self.gate, self.origin = velocity, gate, dict(origin or {})
         h = coarse_stepper.time_step
         self.bodies = BodyGraph.of([self.problem], h, dtype=torch.float64)
-        self.compiled = compilable(self.corrector, self.bodies)
-        self._answers: Answers = self.corrector
-        if self.compiled:
-            self._answers = CompiledCorrector(self.corrector, self.bodies)
         self.remembers = "previous-correction" in corrector.config.node_features
 
     def __repr__(self) -> str:
@@ -141,13 +132,10 @@ class HybridStepper:
     def prepare(self) -> Self:
         """Factorise and load everything now, so that the first step is like the others."""
         self.coarse.prepare()
-        with torch.no_grad(), one_thread(torch.device("cpu")):
-            if isinstance(self._answers, CompiledCorrector):
-                self._answers.refresh()
-            step = SingleCoarseStep(
-                self.coarse, self.bodies, self.velocity, self.problem.rest_state()
-            )
-            asked(step.view_of(self.problem.positions), self._answers, self.gate)
+        rest = self.problem.rest_state()
+        with torch.inference_mode():
+            step = SingleCoarseStep(self.coarse, self.bodies, self.velocity, rest)
+            asked(step.view_of(self.problem.positions), self.corrector, self.gate)
         return self
 
     def describe(self) -> dict[str, str]:
@@ -157,7 +145,6 @@ class HybridStepper:
             **self.coarse.describe(),
             "corrector": digest(self.corrector),
             "corrector_size": f"{config.layers} rounds of width {config.width}",
-            "corrector_code": "compiled" if self.compiled else "torch",
             "corrected_velocity": self.velocity,
             "gate": "none" if self.gate is None else self.gate.model_dump_json(),
             "trained_step": self.trained_step,
@@ -187,8 +174,8 @@ class HybridStepper:
         previous = state.memory.get(MEMORY) if self.remembers else None
         step = SingleCoarseStep(self.coarse, self.bodies, self.velocity, before, forces, previous)
         started = time.perf_counter()
-        with torch.no_grad(), one_thread(torch.device("cpu")):
-            found = corrected_step(step, self._answers, self.gate)
+        with torch.inference_mode():
+            found = corrected_step(step, self.corrector, self.gate)
         result, correction, reason = found.answer, found.correction.numpy(), found.reasons.item()
         after = result.state
         if self.remembers:

@@ -26,8 +26,7 @@ from pdcorrect._config import Strict
 from pdcorrect._environment import code_digest, home_folder
 from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect._version import __version__
-from pdcorrect.corrector.architecture import CorrectorConfig
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, CorrectorConfig
 from pdcorrect.errors import (
     FileFormatError,
     FileVersionError,

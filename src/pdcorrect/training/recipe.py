@@ -15,7 +15,7 @@ from pydantic import (
 from pydantic.config import JsonDict
 
 from pdcorrect._config import Count, NonNegative, Positive, PositiveCount, Strict, TomlConfig
-from pdcorrect.corrector.architecture import CorrectorConfig, changed
+from pdcorrect.corrector.corrector import CorrectorConfig, changed
 from pdcorrect.data.configuration import TRAINING, VALIDATION
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pdcorrect._config import as_toml
 from pdcorrect._files import make_folder, write_text
-from pdcorrect.batch.checks import usable_device
+from pdcorrect.batch.cells import usable_device
 from pdcorrect.corrector.corrector import Corrector
 from pdcorrect.corrector.model_io import (
     JOINT,

@@ -15,9 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pdcorrect.corrector.architecture import CorrectorConfig
 from pdcorrect.corrector.bodies import REST_OF_CELLS, REST_OF_EDGES, REST_OF_NODES, BodyGraph
-from pdcorrect.corrector.corrector import Corrector
+from pdcorrect.corrector.corrector import Corrector, CorrectorConfig
 from pdcorrect.corrector.features import Snapshot
 from pdcorrect.data.configuration import TRAINING
 from pdcorrect.data.reader import TrajectoryDataset, TrajectoryLoader
