@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import MeshError, PdcorrectWarning
-from pdcorrect.fem.mesh_content import Block, Content, Integers, places
+from pdcorrect.fem.mesh_content import Block, Content, Integers, check_once, places
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ class _Set(NamedTuple):
     kind: str
     name: str
     instance: str
-    members: list[str] | Integers
+    members: list[str | range]
 
 
 @dataclass
@@ -113,7 +113,7 @@ def read_abaqus(path: Path) -> Content:
         elif name == "NODE":
             numbers, points = _nodes(keyword)
             here.nodes.append((numbers, points))
-            here.sets.append(_Set("NSET", parameters.get("NSET", ""), "", numbers))
+            here.sets.append(_own_set("NSET", keyword, numbers))
         elif name == "ELEMENT":
             _add_elements(here, keyword)
         elif name in ("NSET", "ELSET"):
@@ -191,9 +191,11 @@ def _included(line: _Line, name: str, above: tuple[Path, ...]) -> Iterator[_Line
 def _numbers(line: _Line) -> list[int]:
     """Whole numbers of a line, which may end with commas."""
     try:
-        return [int(text) for text in line.text.rstrip(", \t").split(",")]
-    except ValueError:
+        found = [int(text) for text in line.text.rstrip(", \t").split(",")]
+        np.array(found, dtype=np.int64)
+    except (ValueError, OverflowError):
         raise line.error("expected whole numbers between commas.") from None
+    return found
 
 
 def _reals(line: _Line, least: int, most: int) -> list[float]:
@@ -202,7 +204,9 @@ def _reals(line: _Line, least: int, most: int) -> list[float]:
     try:
         found = [float(text) if text else 0.0 for text in fields[:most]]
     except ValueError:
-        raise line.error("expected numbers between commas.") from None
+        found = [np.nan]
+    if not np.isfinite(found).all():
+        raise line.error("expected numbers between commas.")
     return found + [0.0] * (least - len(found))
 
 
@@ -229,7 +233,7 @@ def _add_elements(part: _Part, keyword: _Keyword) -> None:
     if match:
         rows = _rows(keyword, 1 + int(match[1]))
         part.elements.append((3 if hexahedron else 2, rows[:, 0], rows[:, 1:]))
-        part.sets.append(_Set("ELSET", keyword.parameters.get("ELSET", ""), "", rows[:, 0]))
+        part.sets.append(_own_set("ELSET", keyword, rows[:, 0]))
 
 
 def _rows(keyword: _Keyword, size: int) -> Integers:
@@ -238,22 +242,32 @@ def _rows(keyword: _Keyword, size: int) -> Integers:
     for line in keyword.data:
         row += _numbers(line)
         if len(row) > size or (len(row) < size and not line.text.endswith(",")):
-            raise line.error(f"{len(row) - 1} nodes of an element: expected {size - 1}.")
+            raise _wrong_count(keyword, line, row, size)
         if len(row) == size:
             rows.append(row)
             row = []
     if row:
-        raise keyword.data[-1].error(f"the element has {len(row) - 1} nodes, not {size - 1}.")
+        raise _wrong_count(keyword, keyword.data[-1], row, size)
     return np.array(rows, dtype=np.int64).reshape(-1, size)
+
+
+def _wrong_count(keyword: _Keyword, line: _Line, row: list[int], size: int) -> MeshError:
+    kind = keyword.parameters["TYPE"]
+    return line.error(f"element {row[0]} has {len(row) - 1} nodes: expected {size - 1} of {kind}.")
+
+
+def _own_set(kind: str, keyword: _Keyword, numbers: Integers) -> _Set:
+    """The set that the parameter of *NODE or *ELEMENT names."""
+    return _Set(kind, keyword.parameters.get(kind, ""), "", list(map(str, numbers)))
 
 
 def _add_set(part: _Part, keyword: _Keyword) -> None:
     name, own = keyword.name, keyword.parameters
-    members: list[str] = []
+    members: list[str | range] = []
     for line in keyword.data:
         if "GENERATE" in own:
             first, last, step = (*_numbers(line), 1)[:3]
-            members += map(str, range(first, last + 1, max(step, 1)))
+            members.append(range(first, last + 1, max(step, 1)))
         else:
             members += (text.strip() for text in line.text.split(",") if text.strip())
     part.sets.append(_Set(name, own.get(name, ""), own.get("INSTANCE", "").upper(), members))
@@ -305,6 +319,7 @@ class _Joined:
                 place = start + places(numbers, rows, str(self._path))
                 blocks.append(Block(_KINDS[dimension, rows.shape[1]], dimension, place))
                 labels.append(own)
+            check_once(np.concatenate(labels), f"{self._path}: element")
             self._numbers["NSET", name.upper()] = numbers, start
             self._numbers["ELSET", name.upper()] = np.concatenate(labels), elements
             start, elements = start + len(numbers), elements + sum(map(len, labels))
@@ -320,25 +335,28 @@ class _Joined:
     def _add(self, added: _Set, scope: str, name: str) -> None:
         """Keep a set, unless it names what is not read."""
         found = [np.zeros(0, np.int64)]
-        wanted: dict[str, list[int]] = defaultdict(list)
-        if not isinstance(added.members, list):
-            wanted[scope] = added.members.tolist()
-            added = added._replace(members=[])
+        labels: dict[str, list[int]] = defaultdict(list)
         for member in added.members:
+            if isinstance(member, range):
+                numbers, start = self._numbers.get((added.kind, scope), (found[0], 0))
+                chosen = (numbers >= member.start) & (numbers < member.stop)
+                chosen &= (numbers - member.start) % member.step == 0
+                found.append(start + np.flatnonzero(chosen))
+                continue
             owner, _, label = member.rpartition(".")
             owner = owner.upper() or scope
-            if label.isdigit():
-                wanted[owner].append(int(label))
+            if label.isdecimal():
+                labels[owner].append(int(label))
             elif (known := self._sets.get((added.kind, owner, label.upper()))) is not None:
                 found.append(known)
             else:
                 return
-        for owner, labels in wanted.items():
-            numbers, start = self._numbers.get((added.kind, owner), (np.zeros(0, np.int64), 0))
-            found.append(start + np.flatnonzero(np.isin(numbers, labels)))
+        for owner, wanted in labels.items():
+            numbers, start = self._numbers.get((added.kind, owner), (found[0], 0))
+            found.append(start + np.flatnonzero(np.isin(numbers, wanted)))
         members = np.concatenate(found)
         if len(members):
             key = added.kind, scope, added.name.upper()
-            self._sets[key] = np.append(self._sets.get(key, np.zeros(0, np.int64)), members)
+            self._sets[key] = np.append(self._sets.get(key, found[0]), members)
             name = self._spelled.setdefault(name.upper(), name)
             self._groups[added.kind].setdefault(name, []).append(members)

@@ -51,19 +51,16 @@ def read_gmsh(path: Path) -> Content:
     MeshError
         If the version is another, or the file is damaged; names the section or Gmsh's option.
     """
-    data = path.read_bytes()
-    sections = _sections(path, data)
+    sections = _sections(path, path.read_bytes())
     if b"MeshFormat" not in sections:
-        raise _other_version(path, "1")
+        raise MeshError(f"{path}: has no section $MeshFormat: expected a mesh saved by Gmsh.")
     header = sections[b"MeshFormat"].split(maxsplit=3)
-    version = header[0].decode("latin-1") if header else "?"
-    if (version != "4.1" and not version.startswith("2")) or len(header) < 3 or header[2] != b"8":
-        raise _other_version(path, version)
-    order = ""
-    if header[1] == b"1":
-        order = "<" if header[3][:4] == b"\1\0\0\0" else ">"
+    version, binary, size, one = (*header, b"", b"", b"", b"")[:4]
+    if not (version == b"4.1" or version.startswith(b"2")) or size != b"8":
+        raise _other_version(path, version.decode("latin-1"))
+    order = "" if binary == b"0" else "<" if one[:4] == b"\1\0\0\0" else ">"
     names = _names(sections.get(b"PhysicalNames", b""))
-    old = version != "4.1"
+    old = version != b"4.1"
     parametric = old and b"ParametricNodes" in sections
     nodes = _Numbers(path, sections, b"ParametricNodes" if parametric else b"Nodes", order)
     elements = _Numbers(path, sections, b"Elements", order)
@@ -95,10 +92,10 @@ def _sections(path: Path, data: bytes) -> dict[bytes, bytes]:
     start = 0
     while match := _SECTION.search(data, start):
         name = match[1]
+        if name in (b"NOD", b"ELM"):
+            raise _other_version(path, "1")
         end = data.find(b"$End" + name, match.end())
         if end < 0:
-            if name in (b"NOD", b"ELM"):
-                raise _other_version(path, "1")
             raise MeshError(f"{path}: its section ${name.decode('latin-1')} has no end.")
         out.setdefault(name, data[match.end() : end])
         start = end + len(name) + 4
@@ -142,23 +139,27 @@ class _Numbers:
         size = count * (len(kinds) if self.text else row.itemsize)
         start, self._at = self._at, self._at + size
         if count < 0 or self._at > len(self._data):
-            raise MeshError(
-                f"{self.name} ends too early: expected the number of entries that it says."
-            )
+            raise self._early()
         if isinstance(self._data, bytes):
             rows = np.frombuffer(self._data, row, count, start)
             columns = [rows[name] for name in row.names or ()]
         else:
             columns = list(self._data[start : self._at].reshape(count, len(kinds)).T)
         types = [np.float64 if kind == "d" else np.int64 for kind in kinds]
-        return [column.astype(kind) for column, kind in zip(columns, types, strict=True)]
+        with np.errstate(invalid="ignore"):
+            out = [column.astype(kind) for column, kind in zip(columns, types, strict=True)]
+        if any(
+            (a != b).any() for a, b, kind in zip(out, columns, kinds, strict=True) if kind != "d"
+        ):
+            raise MeshError(f"{self.name} has numbers that are not whole: expected whole ones.")
+        return out
 
     def alike(self) -> tuple[int, int, int]:
         """Type, number of tags and count of the next elements of version 2.2, which are alike."""
         if isinstance(self._data, bytes):
             number, several, tags = (int(x) for x in self.take("i", 3))
-            return number, tags, several
-        _, number, tags = (int(x) for x in self.take("i", 3))
+            return number, max(tags, 0), max(several, 0)
+        _, number, tags = (max(int(x), 0) for x in self.take("i", 3))
         self._at -= 3
         stride = 3 + tags + self.type_of(number)[2]
         ahead = self._data[self._at : self._at + _MOST_ALIKE * stride]
@@ -173,8 +174,17 @@ class _Numbers:
             self._at = len(text) + 1
             if not text.strip().isdigit():
                 raise MeshError(f"{self.name} does not begin with the number of its entries.")
-            return int(text)
-        return self.whole("q")
+            count = int(text)
+        else:
+            count = self.whole("q")
+        if count > len(self._data):
+            raise self._early()
+        return count
+
+    def _early(self) -> MeshError:
+        return MeshError(
+            f"{self.name} ends too early: expected the number of entries that it says."
+        )
 
     def whole(self, kind: str) -> int:
         """The next number, a whole one."""
@@ -268,9 +278,10 @@ def _nodes_4(take: _Numbers) -> tuple[Integers, NDArray[np.float64]]:
     numbers, points = [np.empty(0, np.int64)], [np.empty((0, 3))]
     for _ in range(blocks):
         dimension, _, parametric = (int(x) for x in take.take("i", 3))
+        columns = 3 + abs(dimension) * bool(parametric)
         size = take.whole("q")
         numbers.append(take.take("q", size))
-        points.append(take.take("d", size, 3 + dimension * bool(parametric))[:, :3])
+        points.append(take.take("d", size, columns)[:, :3])
     if sum(map(len, numbers)) != count:
         raise MeshError(f"{take.name} has {sum(map(len, numbers))} nodes: expected {count}.")
     return np.concatenate(numbers), np.concatenate(points)

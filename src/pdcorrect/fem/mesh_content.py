@@ -33,24 +33,29 @@ class Content(NamedTuple):
     node_groups: dict[str, Integers]
 
 
+def check_once(numbers: Integers, what: str) -> None:
+    """Refuse numbers that come twice; ``what`` names the file and the kind."""
+    found, counts = np.unique(numbers, return_counts=True)
+    if counts.max(initial=1) > 1:
+        raise MeshError(f"{what} {found[counts.argmax()]} comes twice: expected it once.")
+
+
 def places(numbers: Integers, wanted: Integers, what: str) -> Integers:
     """Where each of ``wanted`` stands in ``numbers``, which may be sparse and in any order.
 
     Raises
     ------
     MeshError
-        If one is missing or stands there twice; ``what`` names the file.
+        If one is missing, or stands there twice; ``what`` names the file.
     """
-    order = np.argsort(numbers, kind="stable")
+    check_once(numbers, f"{what}: node")
+    order = np.argsort(numbers)
     ordered = numbers[order]
-    twice = np.flatnonzero(ordered[1:] == ordered[:-1])
-    if len(twice):
-        raise MeshError(f"{what}: node {ordered[twice[0]]} comes twice: expected it once.")
     place = np.searchsorted(ordered, wanted)
     missing = np.append(ordered, -1)[place] != wanted
     if missing.any():
         raise MeshError(
-            f"{what}: its elements refer to node {wanted[missing].flat[0]}, which the file does "
-            "not hold: expected every node of an element in the file."
+            f"{what}: its elements refer to nodes that the file does not hold, such as "
+            f"{wanted[missing].flat[0]}: expected every node of an element in the file."
         )
     return np.asarray(order[place], dtype=np.int64)

@@ -25,6 +25,14 @@ _KINDS: dict[int, tuple[str, list[int]]] = {
 }  # fmt: skip
 """Names of VTK's types, and their nodes in the order of the name; Lagrange cells of order 1."""
 
+_BEYOND_MESHIO = re.compile(
+    rb'vtkLZ4DataCompressor|type="String"|<VTKFile[^>]* version="[2-9]'
+    rb'|type="(StructuredGrid|RectilinearGrid|ImageData)"'
+    rb"|^DATASET (UNSTRUCTURED_GRID|STRUCTURED_GRID|STRUCTURED_POINTS|RECTILINEAR_GRID)\s",
+    re.MULTILINE,
+)
+"""What VTK reads and meshio does not, or of the last line not always."""
+
 _GHOSTS, _GHOST = "vtkGhostType", 1 | 32
 """VTK's array of cells that another piece has too (1) or that are blanked (32)."""
 
@@ -37,22 +45,25 @@ def read_vtk(path: Path) -> Content:
     MeshError
         If the file is damaged, or needs pyvista, which is missing.
     """
-    pieces = _pieces(path)
+    head, _, _ = path.read_bytes().partition(b"<AppendedData")
+    pieces = _pieces(head) if path.suffix.lower() == ".vtu" else []
     try:
         return _by_meshio(path, pieces)
     except _Incomplete as error:
         return _by_pyvista(path, pieces, str(error))
+    except MeshError:
+        # VTK ends the whole program at some damaged files, so it gets none that meshio should read.
+        if not _BEYOND_MESHIO.search(head):
+            raise
+        return _by_pyvista(path, pieces, "of a kind that it does not know")
 
 
 class _Incomplete(Exception):
     """What meshio does not read of a file."""
 
 
-def _pieces(path: Path) -> list[tuple[int, int]]:
+def _pieces(head: bytes) -> list[tuple[int, int]]:
     """Numbers of points and cells of each piece, as a VTU file says."""
-    if path.suffix.lower() != ".vtu":
-        return []
-    head, _, _ = path.read_bytes().partition(b"<AppendedData")
     found = []
     for tag in re.findall(rb"<Piece\b[^>]*>", head):
         counts = (re.search(rb'%s\s*=\s*"\s*(\d+)' % key, tag) for key in (b"Points", b"Cells"))
@@ -71,9 +82,7 @@ def read_meshio(path: Path) -> Content:
     try:
         return _by_meshio(path, [])
     except _Incomplete as error:
-        raise MeshError(
-            f"{path}: meshio cannot read it ({error}): expected .msh, .inp or .vtu."
-        ) from None
+        raise MeshError(f"{path}: meshio cannot read it ({error}).") from None
 
 
 def _by_meshio(path: Path, pieces: list[tuple[int, int]]) -> Content:
@@ -81,12 +90,13 @@ def _by_meshio(path: Path, pieces: list[tuple[int, int]]) -> Content:
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
             mesh = meshio.read(path)
-    except SystemExit:
-        raise _Incomplete(" ".join(said.getvalue().split())[-200:]) from None
     except OSError:
         raise
-    except Exception as error:  # meshio raises nearly every type on damaged files
-        raise _Incomplete(f"{type(error).__name__} {error}"[:200]) from None
+    except (Exception, SystemExit) as error:  # meshio raises nearly every type on damaged files
+        told = " ".join(said.getvalue().split()) or f"{type(error).__name__} {error}"
+        raise MeshError(
+            f"{path}: cannot be read as a mesh ({told[:200]}): expected .msh, .inp or .vtu."
+        ) from None
     counts = (len(mesh.points), sum(len(block.data) for block in mesh.cells))
     if "cannot handle" in said.getvalue() or (pieces and [counts] != pieces):
         raise _Incomplete("it leaves out cells")
@@ -96,9 +106,9 @@ def _by_meshio(path: Path, pieces: list[tuple[int, int]]) -> Content:
     for block in mesh.cells:
         ragged = block.type.startswith("polyhedron")  # each cell a list of faces
         nodes = [np.hstack(cell) for cell in block.data] if ragged else [block.data]
-        blocks += [
-            Block(block.type, block.dim, np.atleast_2d(own).astype(np.int64)) for own in nodes
-        ]
+        linear = block.type == "VTK_LAGRANGE_HEXAHEDRON" and nodes[0].shape[1:] == (8,)
+        kind = "hexahedron" if linear else block.type
+        blocks += [Block(kind, block.dim, np.atleast_2d(own).astype(np.int64)) for own in nodes]
     values = {name: np.concatenate(own) for name, own in mesh.cell_data.items()}
     return Content(np.asarray(mesh.points, dtype=np.float64), blocks, value_groups(values), {})
 
@@ -125,14 +135,23 @@ def _by_pyvista(path: Path, pieces: list[tuple[int, int]], reason: str) -> Conte
             "'pdcorrect[view]'), or save it in ParaView as one unstructured grid of hexahedra "
             "(.vtu, compressor ZLib or none)."
         ) from None
+    from vtkmodules.vtkCommonCore import vtkObject
+
+    shown = vtkObject.GetGlobalWarningDisplay()
+    vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
     try:
-        with pyvista.VtkErrorCatcher(raise_errors=True):
-            grid = pyvista.get_reader(path).read()
-            if not isinstance(grid, pyvista.UnstructuredGrid):
-                grid = grid.cast_to_unstructured_grid()
-    except Exception as error:  # of VTK, as RuntimeError; of pyvista, nearly every type
-        told = " ".join(str(error).split())[-200:]
-        raise MeshError(f"{path}: cannot be read by VTK ({told}) or meshio ({reason}).") from None
+        reader = pyvista.get_reader(path)
+        grid = reader.read()
+        grid = (
+            grid if isinstance(grid, pyvista.UnstructuredGrid) else grid.cast_to_unstructured_grid()
+        )
+        failed = bool(reader.reader.GetErrorCode())
+    except Exception:  # pyvista raises nearly every type on damaged files
+        failed = True
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+    if failed or not grid.n_cells:
+        raise MeshError(f"{path}: cannot be read by VTK, nor by meshio ({reason}).")
     wanted = tuple(map(sum, zip(*pieces, strict=True)))
     if pieces and wanted != (grid.n_points, grid.n_cells):
         raise MeshError(
@@ -172,13 +191,16 @@ def _from_grid(path: Path, grid: Any, pieces: list[int]) -> Content:
 
 
 def _block(number: int, nodes: Integers) -> Block:
-    from vtkmodules.vtkCommonDataModel import vtkCellTypes, vtkGenericCell
+    from pyvista import CellType
+    from vtkmodules.vtkCommonDataModel import vtkGenericCell
 
     cell = vtkGenericCell()
     cell.SetCellType(number)
     kind, order = _KINDS.get(number, ("", []))
     if len(order) != nodes.shape[1]:
-        kind, order = vtkCellTypes.GetClassNameFromTypeId(number), list(range(nodes.shape[1]))
+        named = number in CellType.__members__.values()
+        kind = CellType(number).name.lower() if named else f"VTK {number}"
+        order = list(range(nodes.shape[1]))
     return Block(kind, cell.GetCellDimension(), nodes[:, order])
 
 
