@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from pdcorrect._config import Cells, Count, Positive, PositiveCount, Strict, Vector
+from pdcorrect._config import NO_BACKSLASHES, Cells, Count, Positive, PositiveCount, Strict, Vector
 from pdcorrect.errors import SceneError
 
 _MOST_CELLS = 10**8
@@ -199,7 +199,7 @@ class Voxels(_VoxelBody):
 
 
 class MeshFile(Strict):
-    """Hexahedral mesh from a file that meshio reads (Gmsh, Abaqus, VTU)."""
+    """Hexahedral mesh from a file (Gmsh, Abaqus, VTK, and what meshio reads)."""
 
     shape: Literal["file"]
     path: Path
@@ -208,8 +208,8 @@ class MeshFile(Strict):
     @field_validator("path")
     @classmethod
     def _possible(cls, path: Path) -> Path:
-        if "\0" in str(path):
-            raise ValueError("expected a path without the character NUL")
+        if min(str(path)) < " ":
+            raise ValueError(f"expected a path without control characters. {NO_BACKSLASHES}")
         return path
 
 
