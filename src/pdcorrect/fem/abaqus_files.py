@@ -179,11 +179,11 @@ def _lines(path: Path, above: tuple[Path, ...]) -> Iterator[_Line]:
 
 
 def _included(line: _Line, name: str, above: tuple[Path, ...]) -> Iterator[_Line]:
-    path = line.path.parent / name
-    if path in (line.path, *above):
+    path = (line.path.parent / name).resolve()
+    if path in (line.path.resolve(), *above):
         raise line.error("the file includes itself.")
     try:
-        yield from _lines(path, (*above, line.path))
+        yield from _lines(path, (*above, line.path.resolve()))
     except OSError as error:
         raise line.error(f"its file cannot be read ({error.strerror}).") from None
 

@@ -86,6 +86,8 @@ def read_meshio(path: Path) -> Content:
 
 
 def _by_meshio(path: Path, pieces: list[tuple[int, int]]) -> Content:
+    if len(pieces) > 1:
+        raise _Incomplete(f"it has {len(pieces)} pieces")
     said = io.StringIO()
     try:
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
