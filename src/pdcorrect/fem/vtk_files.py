@@ -46,7 +46,7 @@ def read_vtk(path: Path) -> Content:
         If the file is damaged, or needs pyvista, which is missing.
     """
     head, _, _ = path.read_bytes().partition(b"<AppendedData")
-    pieces = _pieces(head) if path.suffix.lower() == ".vtu" else []
+    pieces = _pieces(head)
     try:
         return _by_meshio(path, pieces)
     except _Incomplete as error:
@@ -63,12 +63,14 @@ class _Incomplete(Exception):
 
 
 def _pieces(head: bytes) -> list[tuple[int, int]]:
-    """Numbers of points and cells of each piece, as a VTU file says."""
+    """Numbers of points and cells of each piece of an unstructured grid, as the file says."""
     found = []
-    for tag in re.findall(rb"<Piece\b[^>]*>", head):
+    for tag in re.findall(rb"<Piece\b[^>]*NumberOfPoints[^>]*>", head):
         counts = (re.search(rb'%s\s*=\s*"\s*(\d+)' % key, tag) for key in (b"Points", b"Cells"))
-        found.append(tuple(int(count[1]) if count else 0 for count in counts))
-    return [(points, cells) for points, cells in found]
+        points, cells = (int(count[1]) if count else 0 for count in counts)
+        found.append((points, cells))
+    legacy = re.search(rb"^POINTS\s+(\d+).*^CELL_TYPES\s+(\d+)", head, re.MULTILINE | re.DOTALL)
+    return [(int(legacy[1]), int(legacy[2]))] if legacy and not found else found
 
 
 def read_meshio(path: Path) -> Content:
