@@ -67,21 +67,7 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     points = content.points * scale
     if points.shape[1:] != (3,):
         raise MeshError(f"{path}: its points are {points.shape}: expected (N, 3).")
-    solids = [block for block in content.blocks if block.dimension == 3 and len(block.nodes)]
-    for block in content.blocks:
-        if block.nodes.size and not 0 <= block.nodes.min() <= block.nodes.max() < len(points):
-            raise MeshError(
-                f"{path}: its {block.kind} cells refer to nodes that the file does not hold: "
-                "expected every node of a cell in the file."
-            )
-        if block.kind in _HEXAHEDRA and len(block.nodes) and block.nodes.shape[1] < 8:
-            raise MeshError(f"{path}: its {block.kind} cells have no nodes: expected eight each.")
-    if not solids or any(block.kind not in _HEXAHEDRA for block in solids):
-        raise MeshError(f"{path} {_other_cells(content.blocks, solids, points)}")
-    first = 0
-    for block in solids:
-        _check_straight(path, points[block.nodes], first)
-        first += len(block.nodes)
+    solids = _solids(path, content.blocks, points)
     corners = np.concatenate([block.nodes[:, :8] for block in solids])
     used, local = np.unique(corners, return_inverse=True)
     cells = local.reshape(corners.shape)
@@ -92,35 +78,62 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     return replace(mesh, groups=_groups(content, used, cells))
 
 
+def _solids(path: Path, blocks: list[Block], points: NDArray[np.float64]) -> list[Block]:
+    """The blocks of solid cells; refuses those that cannot be used."""
+    for kind, _, nodes in blocks:
+        if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
+            raise MeshError(
+                f"{path}: its {kind} cells refer to nodes that the file does not hold: "
+                "expected every node of a cell in the file."
+            )
+        if kind in _HEXAHEDRA and len(nodes) and nodes.shape[1] < 8:
+            raise MeshError(f"{path}: its {kind} cells have no nodes: expected eight each.")
+    solids = [block for block in blocks if block.dimension == 3 and len(block.nodes)]
+    if not solids or any(block.kind not in _HEXAHEDRA for block in solids):
+        raise MeshError(f"{path} {_other_cells(blocks, solids, points)}")
+    first = 0
+    for block in solids:
+        _check_straight(path, points[block.nodes], first)
+        first += len(block.nodes)
+    return solids
+
+
 def _groups(content: Content, used: Integers, cells: Integers) -> dict[str, Group]:
     """Groups of the file as cells, faces and nodes of the mesh, without what it has not."""
     node = np.full(len(content.points), -1)
     node[used] = np.arange(len(used))
-    starts = np.cumsum([0, *(len(block.nodes) for block in content.blocks)])
-    cell, face = np.full((2, starts[-1]), -1)
-    count = 0
-    for start, block in zip(starts, content.blocks, strict=False):
-        own = np.arange(start, start + len(block.nodes))
-        if block.kind in _HEXAHEDRA:
-            cell[own] = np.arange(count, count + len(own))
-            count += len(own)
-        elif block.kind in _QUADRILATERALS:
-            face[own] = _faces(cells, node[block.nodes[:, :4]])
+    sizes = [len(block.nodes) for block in content.blocks]
+    kinds = np.repeat([block.kind for block in content.blocks], sizes)
+    solid = np.isin(kinds, _HEXAHEDRA)
+    cell = np.where(solid, np.cumsum(solid) - 1, -1)
+    face = np.full(len(kinds), -1)
+    quads = [block.nodes[:, :4] for block in content.blocks if block.kind in _QUADRILATERALS]
+    if quads:
+        face[np.isin(kinds, _QUADRILATERALS)] = _faces(cells, node[np.concatenate(quads)])
     out = {}
     for name in content.element_groups | content.node_groups:
         members = content.element_groups.get(name, np.zeros(0, np.int64))
-        nodes = [content.node_groups.get(name, np.zeros(0, np.int64))]
-        rest = members[(cell[members] < 0) & (face[members] < 0)]
-        for start, block in zip(starts, content.blocks, strict=False):
-            own = rest[(rest >= start) & (rest < start + len(block.nodes))]
-            nodes.append(block.nodes[own - start].ravel())
-        sides = np.unique(face[members][face[members] >= 0])
-        out[name] = Group(
-            np.unique(cell[members][cell[members] >= 0]),
-            np.stack(np.divmod(sides, 6), axis=1),
-            np.setdiff1d(node[np.concatenate(nodes)], [-1]),
-        )
+        others = members[(cell[members] < 0) & (face[members] < 0)]
+        own = content.node_groups.get(name, np.zeros(0, np.int64))
+        nodes = np.append(own, _nodes_of(content.blocks, others))
+        sides = np.stack(np.divmod(_known(face[members]), 6), axis=1)
+        out[name] = Group(_known(cell[members]), sides, _known(node[nodes]))
     return out
+
+
+def _known(numbers: Integers) -> Integers:
+    """Those that are not -1, each once."""
+    return np.unique(numbers[numbers >= 0])
+
+
+def _nodes_of(blocks: list[Block], elements: Integers) -> Integers:
+    """Nodes (k,) of some elements, which are counted through all blocks."""
+    out, start = [np.zeros(0, np.int64)], 0
+    for block in blocks if len(elements) else ():
+        own = elements[(elements >= start) & (elements < start + len(block.nodes))]
+        out.append(block.nodes[own - start].ravel())
+        start += len(block.nodes)
+    return np.concatenate(out)
 
 
 def _faces(cells: Integers, quads: Integers) -> Integers:
