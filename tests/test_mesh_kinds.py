@@ -181,6 +181,12 @@ GOOD_41 = FORMAT_41 + VOLUME + nodes_41() + elements_41((3, 1, 5, CELLS + 1))
         (GOOD_41, "3 1 5 2\n", "3 1 5 1\n", "Elements"),
         (GOOD_41, "1 12 1 12\n", "1 13 1 12\n", "Nodes"),
         (GOOD_41, "$EndNodes", "$", "Nodes"),
+        (
+            GOOD_41,
+            "$EndElements\n",
+            "$EndElements\n" + elements_41((3, 1, 5, CELLS[1:] + 1)),
+            "two",
+        ),
         (GOOD_41, "\n12\n", "\n11\n", "node 11"),
         (GOOD_41, "\n12\n", "\n11.5\n", "Nodes"),
         (FORMAT_22 + NODES_22 + ELEMENTS_22, "s\n2\n", "s\n1\n", "Elements"),
@@ -508,6 +514,19 @@ def test_a_piece_that_is_cut_stays_cut(tmp_path):
     cut = (np.concatenate([POINTS[:8], POINTS[4:]]), np.stack([CELLS[0], CELLS[1] + 4]))
     with pytest.raises(MeshError, match="same place"):
         read(tmp_path, "a.vtu", pieces(cut, (POINTS + 5, CELLS)))
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk"])
+@pytest.mark.parametrize("ghost", [1, 32, 33])
+def test_ghost_and_blanked_cells_are_left_out(tmp_path, suffix, ghost):
+    pyvista = pytest.importorskip("pyvista")
+    grid = pyvista.UnstructuredGrid({12: CELLS[[0, 1, 1]]}, POINTS)
+    grid.cell_data["vtkGhostType"] = np.array([0, ghost, 0], np.uint8)
+    grid.cell_data["part"] = np.array([6, 5, 6])
+    grid.save(tmp_path / f"a.{suffix}")
+    mesh = read_hex_mesh(tmp_path / f"a.{suffix}")
+    assert_two_cubes(mesh)
+    assert sizes(mesh) == {"part=6": (2, 0, 0)}
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])

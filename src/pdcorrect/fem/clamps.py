@@ -36,13 +36,13 @@ class Selector:
 
     def nodes(self, region: Region, key: str) -> NDArray[np.int64]:
         """Numbers of the nodes in a region; ``key`` names it in messages."""
-        positions = self._space.positions
-        if region.nodes is not None:
-            inside = self._between(self._listed(region, key))
-        elif region.group is not None:
-            inside = self._in_group(self._group(region, key))
+        group = self._group(region, key)
+        if group is None and region.nodes is None:
+            inside = region.contains(self._space.positions, self._tolerance, self._mesh.bounds)
         else:
-            inside = region.contains(positions, self._tolerance, self._mesh.bounds)
+            inside = self._between(self._corners(region, key))
+        if group is not None:
+            self._add_group(group, inside)
         return self._found(np.flatnonzero(inside), region, key, "node")
 
     def coarse_nodes(self, region: Region, key: str) -> NDArray[np.int64]:
@@ -57,8 +57,9 @@ class Selector:
                 f"{key} = {region.describe()}: expected a region with a volume (box, sphere, "
                 "group, everywhere), for cells are chosen by their centres."
             )
-        if region.group is not None:
-            return self._found(self._group(region, key).cells, region, key, "cell")
+        group = self._group(region, key)
+        if group is not None:
+            return self._found(group.cells, region, key, "cell")
         inside = region.contains(self._mesh.centres, self._tolerance, self._mesh.bounds)
         return self._found(np.flatnonzero(inside), region, key, "cell centre")
 
@@ -68,31 +69,28 @@ class Selector:
         Of a group they are its own faces, or those of its cells, or of its nodes.
         """
         faces, owners = self._boundary
-        group = None if region.group is None else self._group(region, key)
+        group = self._group(region, key)
         if group is not None and len(group.faces):
             sides = (faces[:, None] == self._mesh.cells[owners][:, VTK_FACES]).all(axis=2)
             own = np.isin(6 * owners + sides.argmax(axis=1), group.faces @ [6, 1])
         elif group is not None and len(group.cells):
             own = np.isin(owners, group.cells)
         else:
-            if group is not None:
-                member = np.isin(np.arange(len(self._mesh.positions)), group.nodes)
-            elif region.nodes is not None:
-                member = self._listed(region, key)
-            else:
-                places = self._mesh.positions
-                member = region.contains(places, self._tolerance, self._mesh.bounds)
-            own = member[faces].all(axis=1)
+            own = self._corners(region, key)[faces].all(axis=1)
         return faces[self._found(np.flatnonzero(own), region, key, "boundary face")]
 
     def is_surface(self, region: Region, key: str) -> bool:
         """Whether a region has an area and no volume: a plane, or a group without cells."""
-        if region.group is not None:
-            return not len(self._group(region, key).cells)
-        return region.plane is not None
+        group = self._group(region, key)
+        return region.plane is not None if group is None else not len(group.cells)
 
-    def _listed(self, region: Region, key: str) -> NDArray[np.bool_]:
-        """Which nodes of the mesh (N,) belong to a region of node numbers."""
+    def _corners(self, region: Region, key: str) -> NDArray[np.bool_]:
+        """Which nodes of the mesh (N,) belong to a region; of a group, its nodes."""
+        group = self._group(region, key)
+        if group is not None:
+            return np.isin(np.arange(len(self._mesh.positions)), group.nodes)
+        if region.nodes is None:
+            return region.contains(self._mesh.positions, self._tolerance, self._mesh.bounds)
         listed = np.array(region.nodes)
         count = len(self._mesh.coarse_nodes)
         if listed.max() >= count:
@@ -102,8 +100,11 @@ class Selector:
             )
         return self._mesh.refined_nodes(listed)
 
-    def _group(self, region: Region, key: str) -> Group:
+    def _group(self, region: Region, key: str) -> Group | None:
+        """The group that a region names, if it names one."""
         groups = self._mesh.groups
+        if region.group is None:
+            return None
         if region.group not in groups:
             names = ", ".join(map(repr, groups)) or "none"
             raise SceneError(
@@ -112,17 +113,15 @@ class Selector:
             )
         return groups[region.group]
 
-    def _in_group(self, group: Group) -> NDArray[np.bool_]:
-        """Which nodes of the element belong to a group."""
+    def _add_group(self, group: Group, inside: NDArray[np.bool_]) -> None:
+        """Mark the nodes of the element that are on a group's cells and faces."""
         cells = self._space.cells
-        inside = self._between(np.isin(np.arange(len(self._mesh.positions)), group.nodes))
         inside[cells[group.cells]] = True
         for side in range(6):
             axis, end = divmod(side, 2)
             local = np.flatnonzero(VTK_NODES[: cells.shape[1], axis] == end)
             own = group.faces[group.faces[:, 1] == side, 0]
             inside[cells[own][:, local]] = True
-        return inside
 
     def _between(self, member: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Nodes of the element all of whose corners are ``member`` nodes (N,) of the mesh.

@@ -87,7 +87,7 @@ def _other_version(path: Path, version: str) -> MeshError:
 
 
 def _sections(path: Path, data: bytes) -> dict[bytes, bytes]:
-    """What stands between ``$Name`` and ``$EndName``, by name; the first of each name."""
+    """What stands between ``$Name`` and ``$EndName``, by name; the last of each name."""
     out: dict[bytes, bytes] = {}
     start = 0
     while match := _SECTION.search(data, start):
@@ -97,7 +97,9 @@ def _sections(path: Path, data: bytes) -> dict[bytes, bytes]:
         end = data.find(b"$End" + name, match.end())
         if end < 0:
             raise MeshError(f"{path}: its section ${name.decode('latin-1')} has no end.")
-        out.setdefault(name, data[match.end() : end])
+        if name in out and name in (b"Nodes", b"Elements", b"ParametricNodes"):
+            raise MeshError(f"{path}: has two sections ${name.decode()}: expected one.")
+        out[name] = data[match.end() : end]
         start = end + len(name) + 4
     return out
 

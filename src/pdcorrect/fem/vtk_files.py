@@ -119,7 +119,7 @@ def _by_meshio(path: Path, pieces: list[tuple[int, int]]) -> Content:
 
 def value_groups(values: Mapping[str, NDArray[Any]]) -> dict[str, Integers]:
     """Elements by each value of arrays (E,) of whole numbers, unless all values differ."""
-    groups = {}
+    groups: dict[str, Integers] = {}
     for name, own in values.items():
         if own.ndim != 1 or own.dtype.kind not in "iu" or name == _GHOSTS:
             continue
@@ -144,11 +144,10 @@ def _by_pyvista(path: Path, pieces: list[tuple[int, int]], reason: str) -> Conte
     shown = vtkObject.GetGlobalWarningDisplay()
     vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
     try:
-        reader = pyvista.get_reader(path)
+        reader = pyvista.get_reader(path)  # type: ignore[no-untyped-call]
         grid = reader.read()
-        grid = (
-            grid if isinstance(grid, pyvista.UnstructuredGrid) else grid.cast_to_unstructured_grid()
-        )
+        if not isinstance(grid, pyvista.UnstructuredGrid):
+            grid = grid.cast_to_unstructured_grid()
         failed = bool(reader.reader.GetErrorCode())
     except Exception:  # pyvista raises nearly every type on damaged files
         failed = True
@@ -172,7 +171,7 @@ def _from_grid(path: Path, grid: Any, pieces: list[int]) -> Content:
     points = np.array(grid.points, dtype=np.float64) + 0.0  # no -0
     types, table = np.asarray(grid.celltypes), grid.GetCells()
     starts, nodes = (
-        vtk_to_numpy(part).astype(np.int64)
+        vtk_to_numpy(part).astype(np.int64)  # type: ignore[no-untyped-call]
         for part in (table.GetOffsetsArray(), table.GetConnectivityArray())
     )
     points, place = _merged(points, pieces)
