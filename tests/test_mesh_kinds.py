@@ -143,6 +143,36 @@ def test_volumes_in_several_groups_of_gmsh_2(tmp_path, several):
         read(tmp_path, "a.msh", FORMAT_22 + NODES_22 + section("Elements", [(len(table),)], table))
 
 
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("version", ["2.2", "4.1"])
+def test_binary_gmsh_files_of_either_byte_order(tmp_path, order, version):
+    def pack(kind, *values):
+        return b"".join(np.asarray(each, order + kind).tobytes() for each in values)
+
+    tags = np.arange(1, 13)
+    if version == "2.2":
+        nodes = b"12\n" + b"".join(
+            pack("i", tag) + pack("d", point) for tag, point in zip(tags, POINTS, strict=True)
+        )
+        elements = b"2\n" + pack(
+            "i", [5, 2, 2], *([k, 7, 1, *row] for k, row in enumerate(CELLS + 1))
+        )
+    else:
+        nodes = pack("q", [1, 12, 1, 12]) + pack("i", [3, 1, 0]) + pack("q", [12], tags)
+        nodes += pack("d", POINTS)
+        elements = pack("q", [1, 2, 1, 2]) + pack("i", [3, 1, 5])
+        elements += pack("q", [2], *([k, *row] for k, row in enumerate(CELLS + 1)))
+    head = version.encode() + b" 1 8\n" + pack("i", [1])
+    parts = {b"MeshFormat": head, b"Nodes": nodes, b"Elements": elements}
+    data = b"".join(b"$%s\n%s\n$End%s\n" % (name, own, name) for name, own in parts.items())
+    mesh = read(tmp_path, "a.msh", data)
+    assert_two_cubes(mesh)
+    assert sizes(mesh) == ({"7": (2, 0, 0)} if version == "2.2" else {})
+    for cut in (data.replace(nodes, nodes[:-8]), data.replace(elements, elements + bytes(8))):
+        with pytest.raises(MeshError, match="section"):
+            read(tmp_path, "b.msh", cut)
+
+
 @pytest.mark.parametrize("first", [2_000_000_000, 3_000_000_000, 10**15])
 def test_large_node_numbers_take_the_memory_of_few(tmp_path, first):
     text = FORMAT_41 + VOLUME + nodes_41(first) + elements_41((3, 1, 5, CELLS + first))

@@ -258,7 +258,8 @@ def _wrong_count(keyword: _Keyword, line: _Line, row: list[int], size: int) -> M
 
 def _own_set(kind: str, keyword: _Keyword, numbers: Integers) -> _Set:
     """The set that the parameter of *NODE or *ELEMENT names."""
-    return _Set(kind, keyword.parameters.get(kind, ""), "", list(map(str, numbers)))
+    name = keyword.parameters.get(kind, "")
+    return _Set(kind, name, "", list(map(str, numbers)) if name else [])
 
 
 def _add_set(part: _Part, keyword: _Keyword) -> None:

@@ -76,7 +76,7 @@ class Selector:
         elif group is not None and len(group.cells):
             own = np.isin(owners, group.cells)
         else:
-            own = self._corners(region, key)[faces].all(axis=1)
+            own = np.asarray(self._corners(region, key)[faces].all(axis=1))
         return faces[self._found(np.flatnonzero(own), region, key, "boundary face")]
 
     def is_surface(self, region: Region, key: str) -> bool:
