@@ -43,7 +43,7 @@ def problem(region, load=None, element="hex8", k=1, **changes):
     return pc.discretise(scene, k, element=element, mesh=GROUPED)
 
 
-elements = pytest.mark.parametrize("element", ["hex8", "hex8-enhanced", "hex27"])
+elements = pytest.mark.parametrize("element", ["hex8", "hex27"])
 refinements = pytest.mark.parametrize("k", [1, 2, 3])
 
 

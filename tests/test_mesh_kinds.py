@@ -313,6 +313,7 @@ def blank_zeros(text):
         blank_zeros,
         lambda text: text.replace("0.1", "1.D-1").replace("0.2", "2d-01"),
         lambda text: text.replace("TYPE=C3D8", "\n  TYPE = C3D8 ,\n** remark\n ELSET=A"),
+        lambda text: text.replace("C3D8", "C3D8,").replace("NODE", "NODE,"),
         lambda text: text.replace(", 7, 3, 2", ",\n7, 3,\n2"),
         lambda text: text.replace(", 0.1\n", ", 0.1, 0., 0., 1.\n"),
         lambda text: (

@@ -6,6 +6,7 @@ elements of unknown types, and passes over systems and instances.
 
 from __future__ import annotations
 
+import itertools
 import re
 import warnings
 from collections import defaultdict
@@ -134,7 +135,7 @@ def read_abaqus(path: Path) -> Content:
 def _keywords(path: Path) -> Iterator[_Keyword]:
     keyword: _Keyword | None = None
     lines = _lines(path, ())
-    for line in lines:
+    while line := next(lines, None):
         if not line.text.startswith("*"):
             if keyword is not None:
                 keyword.data.append(line)
@@ -142,8 +143,11 @@ def _keywords(path: Path) -> Iterator[_Keyword]:
         if keyword is not None:
             yield keyword
         text = line.text
-        while text.endswith(","):
-            text += getattr(next(lines, None), "text", "*")
+        while text.endswith(",") and (ahead := next(lines, None)):
+            if not ahead.text[0].isalpha():  # a data line, not more of the keyword
+                lines = itertools.chain([ahead], lines)
+                break
+            text += ahead.text
         name, *fields = (part.strip() for part in text[1:].split(","))
         pairs = (part.partition("=") for part in fields if part)
         parameters = {k.strip().upper(): v.strip().strip('"') for k, _, v in pairs}
