@@ -84,7 +84,7 @@ def problem_on(mesh, element="hex8", **changes):
     scene = beam(**{"clamps": [], "loads": [], **changes}).with_changes(solver={"element": element})
     space = Space(mesh, element)
     cell_size = float(np.cbrt(space.volumes().mean()))
-    selector = Selector(mesh, space.positions, cell_size)
+    selector = Selector(mesh, space, cell_size)
     materials = Materials.from_scene(scene, selector, len(mesh.cells))
     body = ElasticBody(mesh, space, space.quadrature(), materials, cell_size)
     return problem_from_body(scene, 1, body)

@@ -151,6 +151,25 @@ def test_what_a_mesh_file_holds_counts_and_not_its_name(tmp_path, computed):
     np.testing.assert_allclose(other.points, 1.5 * first.points)
 
 
+def test_what_an_included_file_holds_counts(tmp_path):
+    mesh = pc.discretise(beam((2, 1, 1)))
+    lines = [f"{k}, {x}, {y}, {z}" for k, (x, y, z) in enumerate(mesh.positions, 1)]
+    cells = [f"{k}, " + ", ".join(map(str, cell + 1)) for k, cell in enumerate(mesh.cells, 1)]
+    (tmp_path / "nodes.txt").write_text("\n".join(lines))
+    text = "*NODE, INPUT=nodes.txt\n*ELEMENT, TYPE=C3D8\n" + "\n".join(cells)
+    (tmp_path / "a.inp").write_text(text)
+    scene = pc.Scene(
+        **beam().model_dump(by_alias=True, exclude_none=True)
+        | {"body": {"shape": "file", "path": str(tmp_path / "a.inp")}}
+    )
+    first = module._key(scene)
+    assert module._key(scene) == first
+    (tmp_path / "a.inp").write_text(text + "\n*NSET, NSET=Held\n1, 2\n")
+    second = module._key(scene)
+    (tmp_path / "nodes.txt").write_text("\n".join(lines).replace("0.02", "0.03"))
+    assert len({first, second, module._key(scene)}) == 3
+
+
 @pytest.mark.parametrize("damage", ["empty", "cut", "text", "folder", "short"])
 def test_damaged_entries_are_made_anew(scene, computed, cache, damage):
     first = pc.converged(scene)

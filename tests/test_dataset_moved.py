@@ -14,7 +14,7 @@ from pdcorrect.data.import_files import shard_from_trajectories
 from pdcorrect.data.importing import portable
 from pdcorrect.data.schema import read_shard, write_shard
 from pdcorrect.data.simulate import discretise_stored, rebuilt_problems
-from pdcorrect.errors import MeshError
+from pdcorrect.errors import InputError, MeshError
 from pdcorrect.scene import trained_coarse
 
 SPLITS = {"training": -9.81, "validation": -7.0, "evaluation": -12.0}
@@ -74,6 +74,19 @@ def test_a_moved_data_set_is_sound_and_does_not_depend_on_where_the_mesh_file_la
     assert 'path = "bracket.vtu"' in text
     assert str(moved.parent.parent) not in text
     assert portable(pc.Scene.from_toml(text)).to_toml() == text
+
+
+@pytest.mark.parametrize("key", ["clamps", "loads", "materials"])
+def test_groups_of_the_mesh_file_are_refused(mesh_file, key):
+    region = {"group": "foot"}
+    part = {
+        "clamps": {"region": region},
+        "loads": {"kind": "traction", "traction": [1.0, 0, 0], "region": region},
+        "materials": {"region": region, "young": 1.0},
+    }[key]
+    scene = scene_of(mesh_file, -9.81)
+    with pytest.raises(InputError, match=rf"{key}\[0\].region.group = 'foot'"):
+        portable(scene.with_changes(**{key: [part]}))
 
 
 @pytest.mark.parametrize("run", ["plain", "best", "reference"])

@@ -84,12 +84,13 @@ def test_distorted_cells_keep_their_volumes_and_corners(tmp_path, suffix, option
 @every_format
 @pytest.mark.parametrize("count", [20, 27])
 def test_second_order_cells_are_read_by_their_corners(tmp_path, suffix, options, count):
-    if (suffix, count) == (".inp", 27):
-        pytest.skip("meshio has no 27-node cell for Abaqus")
     mesh = warped(o_grid())
     points, cells = second_order(mesh, count)
     path = tmp_path / f"mesh{suffix}"
-    meshio.write(path, meshio.Mesh(points, [(f"hexahedron{count}", cells)]), **options)
+    if (suffix, count) == (".inp", 27):  # meshio has no such cell for Abaqus
+        path.write_text(abaqus(points, {"C3D27": cells}))
+    else:
+        meshio.write(path, meshio.Mesh(points, [(f"hexahedron{count}", cells)]), **options)
     assert_same_cells(read_hex_mesh(path), mesh)
 
 
@@ -110,6 +111,15 @@ def test_curved_cells_are_refused_with_the_cell_named(tmp_path, count):
         read_hex_mesh(path)
     meshio.write(path, meshio.Mesh(points, blocks))
     assert_same_cells(read_hex_mesh(path), mesh)
+
+
+def abaqus(points, elements):
+    """An input file with nodes from 1 and elements (n, K) by type."""
+    lines = ["*NODE", *(f"{k}, {x}, {y}, {z}" for k, (x, y, z) in enumerate(points, 1))]
+    for kind, nodes in elements.items():
+        lines.append(f"*ELEMENT, TYPE={kind}")
+        lines += [f"{k}, " + ", ".join(map(str, row + 1)) for k, row in enumerate(nodes, 1)]
+    return "\n".join(lines) + "\n"
 
 
 def gmsh_22(points, kind, nodes):
@@ -159,11 +169,11 @@ def test_gmsh_cells_with_missing_nodes_are_refused(tmp_path, text):
 
 
 def test_cells_without_nodes_are_refused(tmp_path, monkeypatch):
-    """As meshio makes of a damaged binary file of Gmsh."""
+    """As meshio makes of some damaged files."""
     empty = meshio.Mesh(np.array(CORNERS, float), [("hexahedron", np.empty((6, 0), np.int64))])
     monkeypatch.setattr(meshio, "read", lambda path: empty)
-    with pytest.raises(MeshError, match="cell.msh: .*hexahedron"):
-        read_hex_mesh(tmp_path / "cell.msh")
+    with pytest.raises(MeshError, match="cell.med: .*hexahedron"):
+        read_hex_mesh(tmp_path / "cell.med")
 
 
 ABAQUS = """*Heading
@@ -240,13 +250,23 @@ def test_abaqus_cells_of_twenty_nodes_on_two_lines(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("*Assembly,", "*Node\n1, 0., 0., 0.\n*Assembly,", r"\*NODE"),
-        ("*Instance,", "*Instance, name=Block-2, part=Block\n*Instance,", r"\*INSTANCE"),
-        ("*Element,", "*Include, input=more.inp\n*Element,", r"\*INCLUDE"),
+        ("*End Part", "*Node\n17, 9., 9., 9.\n*End Part", "node 17"),
+        ("*Instance,", "*Instance, name=Block-2, part=Block\n*Instance,", "same place"),
+        ("part=Block", "part=Brick", "line 35,.*BRICK"),
+        ("*Element,", "*Include, input=more.inp\n*Element,", "line 22,.*Include"),
+        ("*Element,", "*Ngen\n1, 9\n*Element,", r"line 22,.*\*NGEN"),
+        ("*Node\n", "*Node, system=S\n", "line 8,.*SYSTEM"),
+        ("*Node\n", "*Node, file=part.odb\n", "line 8,.*FILE"),
+        ("*Element,", "*Element, offset=3,", "line 22,.*OFFSET"),
+        ("120,           5.", "120,           5,,x", "line 15,"),
+        (" 12,   18,   20,", " 12,   18,   2O,", "line 25,"),
         ("*Node\n", "*System\n1., 0., 0.\n*Node\n", r"\*SYSTEM"),
         ("   17,   18,  118,", "   17,   19,  118,", "19"),
         ("C3D8R", "C3D27", "C3D27"),
-        (" 12,   18,   20,", " 12,   18,", None),
+        ("C3D8R", "C3D6", "C3D6"),
+        ("C3D8R", "SC8R", "SC8R"),
+        (" 12,   18,   20,", " 12,   18,", "line 25,.* 7 nodes"),
+        ("12,   18,   20", " 3,   18,   20", "element 3"),
     ],
 )
 def test_abaqus_files_that_would_be_misread_are_refused(tmp_path, old, new, named):
@@ -272,11 +292,14 @@ VTU = """<?xml version="1.0"?>
 """
 
 
-@pytest.mark.parametrize(("kind", "named"), [(11, "11"), (72, "LAGRANGE")])
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [(11, "same eight"), (72, "same eight"), (33, "hexahedron24"), (79, "BEZIER")],
+)
 def test_solid_cells_of_other_types_are_never_left_out(tmp_path, kind, named):
     path = tmp_path / "cells.vtu"
     path.write_text(VTU.replace("TYPE", str(kind)))
-    with pytest.raises(MeshError, match=named):
+    with pytest.raises(MeshError, match=f"cells.vtu.*{named}"):
         read_hex_mesh(path)
 
 

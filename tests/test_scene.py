@@ -272,3 +272,27 @@ def test_what_correctors_were_trained_on_keeps_its_elements():
         solver = trained_coarse(beam(cells)).solver
         assert (solver.element, solver.mass) == (element, "averaged")
         assert pc.coarse_model(beam(cells), "best").element == element
+
+
+@pytest.mark.parametrize(
+    "path", ["C:\\Users\\me\\hook.msh", "C:\\temp\\new.msh", "..\\data\\a.msh"]
+)
+def test_paths_of_windows_in_double_quotes_are_explained(tmp_path, path):
+    text = TEXT[: TEXT.index("[body]")] + f'[body]\nshape = "file"\npath = "{path}"\n'
+    text += TEXT[TEXT.index("[material]") :]
+    (tmp_path / "scene.toml").write_text(text)
+    with pytest.raises(SceneError, match="scene.toml: .*with / or between single quotes"):
+        pc.Scene.load(tmp_path / "scene.toml")
+    (tmp_path / "scene.toml").write_text(text.replace(f'"{path}"', f"'{path}'"))
+    assert pc.Scene.load(tmp_path / "scene.toml").body.path.name == Path(path).name
+
+
+@pytest.mark.parametrize("coding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_scenes_in_other_codings(tmp_path, coding):
+    path = tmp_path / "scene.toml"
+    path.write_text("# Körper\n" + TEXT, encoding=coding)
+    if coding == "utf-8-sig":
+        assert pc.Scene.load(path) == pc.Scene.from_toml(TEXT)
+        return
+    with pytest.raises(SceneError, match="UTF-16" if coding == "utf-16" else "UTF-8"):
+        pc.Scene.load(path)

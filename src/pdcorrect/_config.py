@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 import tomllib
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path, PurePath
@@ -35,14 +37,19 @@ def _not_zero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _possible(path: Path) -> Path:
-    if not path.name or "\0" in str(path):
+    if not path.name:
         raise ValueError("expected the path of a file")
+    if min(str(path)) < " ":
+        raise ValueError(f"expected a path without control characters. {NO_BACKSLASHES}")
     return path
 
 
 FilePath = Annotated[Path, AfterValidator(_possible)]
 Direction = Annotated[Vector, AfterValidator(_not_zero)]
 Cells = tuple[PositiveCount, PositiveCount, PositiveCount]
+
+NO_BACKSLASHES = "Write paths with / or between single quotes: in double quotes \\ is an escape"
+"""Advice on paths of Windows."""
 
 _DEEPEST_NESTING = 100
 _LONGEST_INTEGER = 1024  # bits; Python refuses to write out much longer ones
@@ -95,8 +102,9 @@ class TomlConfig(Checked):
             raise cls.error(f"path is {_shown(path)}: expected the path of a TOML file.")
         try:
             text = Path(path).read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError:
-            raise cls.error(f"{path}: cannot be read (not a UTF-8 text file).") from None
+        except UnicodeDecodeError as error:
+            kind = "UTF-16" if error.object[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "not UTF-8"
+            raise cls.error(f"{path}: cannot be read ({kind}): save it as UTF-8.") from None
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise cls.error(f"{path}: cannot be read ({reason}).") from None
@@ -109,7 +117,9 @@ class TomlConfig(Checked):
         try:
             data = parse_toml(text)
         except ValueError as error:
-            raise cls.error(f"{source}: not valid TOML: {error}.") from None
+            raise cls.error(
+                f"{source}: not valid TOML: {error}.{_advice_on(error, text)}"
+            ) from None
         if data and not set(data) & set(cls.model_fields):
             found, expected = _listed(data), _listed(cls.model_fields)
             raise cls.error(f"{source}: has {found}: expected a {cls.source}, with {expected}.")
@@ -135,6 +145,13 @@ def parse_toml(text: str) -> dict[str, Any]:
     if level:
         raise ValueError(f"nested more than {_DEEPEST_NESTING} deep")
     return data
+
+
+def _advice_on(error: ValueError, text: str) -> str:
+    """What to do if the line that an error names has a backslash, as of a path of Windows."""
+    place = re.search(r"at line (\d+)", str(error))
+    line = text.split("\n")[int(place[1]) - 1] if place else ""
+    return f" {NO_BACKSLASHES}." if "\\" in line else ""
 
 
 def _parts(value: Any) -> list[Any]:

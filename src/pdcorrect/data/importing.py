@@ -207,9 +207,23 @@ def _best_problem(problems: Sequence[Problem]) -> Problem:
 
 
 def portable(scene: Scene) -> Scene:
-    """The scene as a data set holds it: of the path of a mesh file the name alone."""
+    """The scene as a data set holds it: of the path of a mesh file the name alone.
+
+    Raises
+    ------
+    InputError
+        If a region is a group, which a data set's mesh does not have.
+    """
     if not isinstance(scene.body, MeshFile):
         return scene
+    for name in ("clamps", "loads", "materials"):
+        for number, part in enumerate(getattr(scene, name)):
+            region = getattr(part, "region", None)
+            if region is not None and region.group is not None:
+                raise InputError(
+                    f"{name}[{number}].region.group = {region.group!r}: a data set keeps no "
+                    "groups of the mesh file: expected another region, such as nodes."
+                )
     return scene.with_changes(body={"path": scene.body.path.name})
 
 

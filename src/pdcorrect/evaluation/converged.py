@@ -142,8 +142,12 @@ def _key(scene: Scene) -> str:
     """Hash of all that the run depends on."""
     content = b""
     if isinstance(scene.body, MeshFile):
-        with contextlib.suppress(OSError):  # discretise says what is wrong
-            content = scene.body.path.read_bytes()
+        from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
+
+        mesh = read_hex_mesh(scene.body.path, scene.body.scale)
+        content = mesh.positions.tobytes() + mesh.cells.tobytes()
+        for name, group in sorted(mesh.groups.items()):
+            content += repr((name, *(own.tolist() for own in group))).encode()
         scene = scene.with_changes(body={"path": f"mesh{scene.body.path.suffix}"})
     parts = (
         scene.with_changes(name="scene").to_toml().encode(),

@@ -13,8 +13,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import SceneError
-from pdcorrect.fem.mesh import HexMesh, boundary_faces
+from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_FACES, VTK_NODES
+from pdcorrect.fem.mesh import Group, HexMesh, boundary_faces
 from pdcorrect.fem.multigrid import rigid_motions
+from pdcorrect.fem.operators import Space
 from pdcorrect.scene import Clamp, Motion, Region
 from pdcorrect.scene.regions import unit_vector
 
@@ -25,14 +27,14 @@ _TOLERANCE = 1e-6
 
 
 class Selector:
-    """Resolves regions on one mesh, whose element has nodes at ``positions`` (N, 3) at rest, m.
+    """Resolves regions on one mesh, with an element's ``space``.
 
     The coarse ``cell_size``, m, is the unit of the geometric tolerance.
     """
 
-    def __init__(self, mesh: HexMesh, positions: NDArray[np.float64], cell_size: float) -> None:
+    def __init__(self, mesh: HexMesh, space: Space, cell_size: float) -> None:
         self._mesh = mesh
-        self._positions = positions
+        self._space = space
         self._tolerance = _TOLERANCE * cell_size
 
     @cached_property
@@ -41,15 +43,13 @@ class Selector:
 
     def nodes(self, region: Region, key: str) -> NDArray[np.int64]:
         """Numbers of the nodes in a region; ``key`` names it in messages."""
-        if region.nodes is not None:
-            coarse = self._mesh.coarse_nodes
-            if max(region.nodes) >= len(coarse):
-                raise SceneError(
-                    f"{key}.nodes names node {max(region.nodes)}: expected 0 to "
-                    f"{len(coarse) - 1}, the nodes of the coarse mesh."
-                )
-            return coarse[np.unique(region.nodes)]
-        inside = region.contains(self._positions, self._tolerance, self._mesh.positions)
+        group = self._group(region, key)
+        if group is None and region.nodes is None:
+            inside = region.contains(self._space.positions, self._tolerance, self._mesh.positions)
+        else:
+            inside = self._between(self._corners(region, key))
+        if group is not None:
+            self._add_group(group, inside)
         return self._found(np.flatnonzero(inside), region, key, "node")
 
     def coarse_nodes(self, region: Region, key: str) -> NDArray[np.int64]:
@@ -58,25 +58,89 @@ class Selector:
         return self._found(nodes, region, key, "node of the coarse mesh")
 
     def cells(self, region: Region, key: str) -> NDArray[np.int64]:
-        """Numbers of the cells whose centre is in a region."""
+        """Numbers of the cells whose centre is in a region, or of a group's cells."""
         if region.nodes is not None:
             raise SceneError(
                 f"{key} = {region.describe()}: expected a region with a volume (box, sphere, "
-                "everywhere), for cells are chosen by their centres."
+                "group, everywhere), for cells are chosen by their centres."
             )
+        group = self._group(region, key)
+        if group is not None:
+            return self._found(group.cells, region, key, "cell")
         inside = region.contains(self._mesh.centres, self._tolerance, self._mesh.positions)
         return self._found(np.flatnonzero(inside), region, key, "cell centre")
 
     def faces(self, region: Region, key: str) -> NDArray[np.int64]:
-        """Corner nodes (n, 4) of the boundary faces that lie wholly in a region."""
-        faces, _ = self._boundary
-        member = np.zeros(len(self._mesh.positions), dtype=bool)
-        if region.nodes is not None:
-            member[self.nodes(region, key)] = True
+        """Corner nodes (n, 4) of the boundary faces that lie wholly in a region.
+
+        Of a group they are its own faces, or those of its cells, or of its nodes.
+        """
+        faces, owners = self._boundary
+        group = self._group(region, key)
+        if group is not None and len(group.faces):
+            sides = (faces[:, None] == self._mesh.cells[owners][:, VTK_FACES]).all(axis=2)
+            own = np.isin(6 * owners + sides.argmax(axis=1), group.faces @ [6, 1])
+        elif group is not None and len(group.cells):
+            own = np.isin(owners, group.cells)
         else:
-            member = region.contains(self._mesh.positions, self._tolerance, self._mesh.positions)
-        found = np.flatnonzero(member[faces].all(axis=1))
-        return faces[self._found(found, region, key, "boundary face")]
+            own = np.asarray(self._corners(region, key)[faces].all(axis=1))
+        return faces[self._found(np.flatnonzero(own), region, key, "boundary face")]
+
+    def is_surface(self, region: Region, key: str) -> bool:
+        """Whether a region has an area and no volume: a plane, or a group without cells."""
+        group = self._group(region, key)
+        return region.plane is not None if group is None else not len(group.cells)
+
+    def _corners(self, region: Region, key: str) -> NDArray[np.bool_]:
+        """Which nodes of the mesh (N,) belong to a region; of a group, its nodes."""
+        group = self._group(region, key)
+        if group is not None:
+            return np.isin(np.arange(len(self._mesh.positions)), group.nodes)
+        if region.nodes is None:
+            return region.contains(self._mesh.positions, self._tolerance, self._mesh.positions)
+        listed = np.array(region.nodes)
+        count = len(self._mesh.coarse_nodes)
+        if listed.max() >= count:
+            raise SceneError(
+                f"{key}.nodes names node {listed.max()}: expected 0 to {count - 1}, the nodes of "
+                "the coarse mesh."
+            )
+        return self._mesh.refined_nodes(listed)
+
+    def _group(self, region: Region, key: str) -> Group | None:
+        """The group that a region names, if it names one."""
+        groups = self._mesh.groups
+        if region.group is None:
+            return None
+        if region.group not in groups:
+            names = ", ".join(map(repr, groups)) or "none"
+            raise SceneError(
+                f"{key}.group = {region.group!r}: expected a group of the mesh file, which has "
+                f"{names}."
+            )
+        return groups[region.group]
+
+    def _add_group(self, group: Group, inside: NDArray[np.bool_]) -> None:
+        """Mark the nodes of the element that are on a group's cells and faces."""
+        cells = self._space.cells
+        inside[cells[group.cells]] = True
+        for side in range(6):
+            axis, end = divmod(side, 2)
+            local = np.flatnonzero(VTK_NODES[: cells.shape[1], axis] == end)
+            own = group.faces[group.faces[:, 1] == side, 0]
+            inside[cells[own][:, local]] = True
+
+    def _between(self, member: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Nodes of the element all of whose corners are ``member`` nodes (N,) of the mesh.
+
+        Corners of the cell, face or edge that a node lies in.
+        """
+        cells = self._space.cells
+        away = np.abs(VTK_NODES[: cells.shape[1], None] - VTK_CORNERS).max(axis=2) > 0.5  # (K, 8)
+        inside = (member[self._mesh.cells][:, None] | away).all(axis=2)
+        out = np.zeros(len(self._space.positions), dtype=bool)
+        out[cells[inside]] = True
+        return out
 
     def _found(
         self, chosen: NDArray[np.int64], region: Region, key: str, kind: str

@@ -24,6 +24,16 @@ VTK_EDGES = np.array(
 )
 """Corners of the twelve edges, (12, 2)."""
 
+VTK_NODES = np.concatenate(
+    [
+        VTK_CORNERS,
+        VTK_CORNERS[VTK_EDGES].mean(axis=1),
+        VTK_CORNERS[VTK_FACES].mean(axis=1),
+        [[0.5, 0.5, 0.5]],
+    ]
+)
+"""Nodes of VTK's 27-node hexahedron on the unit cell, (27, 3)."""
+
 _CHUNK = 4096
 """Cells whose Jacobians are computed at a time, to stay in the cache."""
 

@@ -162,7 +162,7 @@ def _force(load: Force, space: Space, selector: Selector, mass: Array, key: str)
             "has no area or volume to spread the force over. Use distribution = 'nodal', or a "
             "plane, box or sphere."
         )
-    elif load.region.plane is not None:
+    elif selector.is_surface(load.region, key):
         face = space.face_quadrature(selector.faces(load.region, key))
         traction = total / face.weights.sum()
         values = np.einsum("nq,nqk,i->nki", face.weights, face.values, traction)

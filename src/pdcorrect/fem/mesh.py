@@ -7,8 +7,10 @@ above, then the top face 4-5-6-7).
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,6 +32,7 @@ __all__ = [
     "VTK_CORNERS",
     "VTK_EDGES",
     "VTK_FACES",
+    "Group",
     "HexMesh",
     "boundary_faces",
     "coincident_nodes",
@@ -37,6 +40,35 @@ __all__ = [
     "refine",
     "voxel_mesh",
 ]
+
+
+class Group(NamedTuple):
+    """A named part of a mesh, such as a physical group of Gmsh or a set of Abaqus.
+
+    Attributes
+    ----------
+    cells : (n,) int
+    faces : (m, 2) int
+        Cells, and which of their `VTK_FACES`.
+    nodes : (k,) int
+        Those that are not there as nodes of the cells and faces.
+    """
+
+    cells: NDArray[np.int64]
+    faces: NDArray[np.int64]
+    nodes: NDArray[np.int64]
+
+    def refined(self, weights: sp.csr_matrix, k: int) -> Group:
+        """The same part of the mesh refined, whose `interpolation` has these weights."""
+        layer = np.moveaxis(np.indices((k, k, k)), 0, -1).reshape(-1, 3)  # (k^3, 3)
+        cell, side = self.faces.T
+        touching = layer[:, side // 2] == (k - 1) * (side % 2)  # (k^3, m)
+        child, face = np.nonzero(touching)
+        return Group(
+            (self.cells[:, None] * k**3 + np.arange(k**3)).ravel(),
+            np.stack([cell[face] * k**3 + child, side[face]], axis=1),
+            np.flatnonzero(_all_corners(weights, self.nodes)),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,11 +79,17 @@ class HexMesh:
     ----------
     coarse_nodes : (Nc,) int
         For each node of the unrefined mesh, the node at the same place here.
+    groups : dict of Group
+        By name, of a mesh from a file.
+    from_coarse : (N, Nc) sparse, optional
+        Of a refined mesh, the weights of the unrefined mesh's nodes at each node.
     """
 
     positions: NDArray[np.float64]
     cells: NDArray[np.int64]
     coarse_nodes: NDArray[np.int64]
+    groups: Mapping[str, Group] = field(default_factory=dict)
+    from_coarse: sp.csr_matrix | None = None
 
     @classmethod
     def create(cls, positions: NDArray[np.float64], cells: NDArray[np.int64]) -> HexMesh:
@@ -71,6 +109,15 @@ class HexMesh:
         check_cells(positions, cells)
         check_connections(positions, cells)
         return cls(positions, cells, np.arange(len(positions)))
+
+    def refined_nodes(self, coarse: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which nodes (N,) belong to ``coarse`` nodes of the unrefined mesh.
+
+        A new node does if all corners of the cell, face or edge do in which it lies.
+        """
+        if self.from_coarse is not None:
+            return _all_corners(self.from_coarse, coarse)
+        return np.isin(np.arange(len(self.positions)), coarse)
 
     @cached_property
     def centres(self) -> NDArray[np.float64]:
@@ -119,6 +166,7 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
     if k == 1:
         return mesh
     corner, weight, inverse = _lattice(mesh, k)
+    weights = _interpolation(mesh, corner, weight, k)
     positions = np.einsum("nk,nki->ni", weight / k**3, mesh.positions[corner])
 
     is_corner = weight.max(axis=1) == k**3
@@ -135,6 +183,8 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
         positions,
         np.ascontiguousarray(cells, dtype=np.int64),
         coarse_nodes[mesh.coarse_nodes],
+        {name: group.refined(weights, k) for name, group in mesh.groups.items()},
+        weights if mesh.from_coarse is None else sp.csr_matrix(weights @ mesh.from_coarse),
     )
 
 
@@ -143,10 +193,23 @@ def interpolation(mesh: HexMesh, k: int) -> sp.csr_matrix:
     if k == 1:
         return sp.eye_array(len(mesh.positions)).tocsr()
     corner, weight, _ = _lattice(mesh, k)
+    return _interpolation(mesh, corner, weight, k)
+
+
+def _interpolation(
+    mesh: HexMesh, corner: NDArray[np.int64], weight: NDArray[np.int64], k: int
+) -> sp.csr_matrix:
     rows, columns = np.nonzero(weight)
     values = weight[rows, columns] / k**3
     shape = (len(weight), len(mesh.positions))
     return sp.csr_matrix((values, (rows, corner[rows, columns])), shape=shape)
+
+
+def _all_corners(weights: sp.csr_matrix, chosen: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which rows (N,) of `interpolation` have weights on ``chosen`` nodes only."""
+    others = np.ones(weights.shape[1])
+    others[chosen] = 0.0
+    return np.asarray(weights @ others == 0.0)
 
 
 def _lattice(

@@ -1,11 +1,10 @@
-"""Mesh files through meshio: hexahedra in, VTU out.  The only module that imports it."""
+"""Mesh files: hexahedra and their groups in, VTU out."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -14,33 +13,39 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import replacing
 from pdcorrect.errors import MeshError, OutputError
-from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, HexMesh
-from pdcorrect.fem.mesh_checks import TOLERANCE
+from pdcorrect.fem.abaqus_files import read_abaqus
+from pdcorrect.fem.gmsh_files import read_gmsh
+from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, Group, HexMesh
+from pdcorrect.fem.mesh_checks import TOLERANCE, row_groups
+from pdcorrect.fem.mesh_content import Block, Content, Integers
+from pdcorrect.fem.vtk_files import read_meshio, read_vtk
 
 _HEXAHEDRA = ("hexahedron", "hexahedron20", "hexahedron27")
 """Cells that are read; of the second-order ones, the corners."""
 
+_QUADRILATERALS = ("quad", "quad8", "quad9")
+
 _BETWEEN = np.zeros((19, 8))
 """Weights of the corners at the nodes 8 to 26 of a straight-sided cell, (19, 8).
 
-In VTK order, which meshio has for Gmsh, Abaqus and VTU alike: middles of edges,
-of faces, of the cell.
+In VTK order: middles of edges, of faces, of the cell.
 """
 for _row, _corners in enumerate([*VTK_EDGES, *VTK_FACES, range(8)]):
     _BETWEEN[_row, list(_corners)] = 1 / len(_corners)
 
-_UNREAD_ABAQUS = {
-    "INCLUDE", "SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY",
+_READERS = {
+    ".msh": read_gmsh, ".inp": read_abaqus,
+    **dict.fromkeys((".vtu", ".vtk", ".vts", ".vtr", ".vti"), read_vtk),
 }  # fmt: skip
-"""Abaqus keywords that change the mesh and that meshio passes over or reads wrongly."""
+"""By suffix; meshio reads all others."""
 
 
 def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
-    """Read the hexahedra of a Gmsh, Abaqus or VTU file.
+    """Read the hexahedra of a Gmsh, Abaqus or VTK file, and its named groups.
 
     Of cells with 20 or 27 nodes the eight corners are kept, if the cells are
-    straight-sided.  Nodes that no cell uses are dropped and lower-dimensional
-    cells are ignored.
+    straight-sided.  Nodes that no cell uses are dropped; lower-dimensional
+    elements count only as parts of groups.
 
     Parameters
     ----------
@@ -55,107 +60,102 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
         well, has curved cells, or its mesh fails a check of `HexMesh.create`.
     """
     path = Path(path)
-    mesh = _read(path)
-    points = np.asarray(mesh.points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise MeshError(f"{path}: its points are {points.shape}: expected (N, 3).")
-    points = points * scale
-    solids = [block for block in mesh.cells if block.dim == 3 and len(block.data)]
-    for block in solids:
-        ragged = block.type.startswith("polyhedron")  # each cell a list of faces
-        nodes = np.hstack([np.hstack(cell) for cell in block.data]) if ragged else block.data
-        if not nodes.size:
-            raise MeshError(f"{path}: its {block.type} cells have no nodes: expected eight each.")
-        if nodes.min() < 0 or nodes.max() >= len(points):
-            raise MeshError(
-                f"{path}: its {block.type} cells refer to nodes that the file does not hold: "
-                "expected every node of a cell in the file."
-            )
-    if not solids or any(block.type not in _HEXAHEDRA for block in solids):
-        raise MeshError(f"{path} {_other_cells(mesh.cells, solids, points)}")
-    cells = [np.asarray(block.data).astype(np.int64) for block in solids]
-    first = 0
-    for nodes in cells:
-        _check_straight(path, points[nodes], first)
-        first += len(nodes)
-    corners = np.concatenate([nodes[:, :8] for nodes in cells])
-    used, local = np.unique(corners, return_inverse=True)
     try:
-        return HexMesh.create(points[used], local.reshape(corners.shape))
+        content = _READERS.get(path.suffix.lower(), read_meshio)(path)
+    except OSError as error:
+        raise MeshError(f"{path}: cannot be read ({error.strerror or error}).") from None
+    points = content.points * scale
+    if points.shape[1:] != (3,):
+        raise MeshError(f"{path}: its points are {points.shape}: expected (N, 3).")
+    solids = _solids(path, content.blocks, points)
+    corners = np.concatenate([block.nodes[:, :8] for block in solids])
+    used, local = np.unique(corners, return_inverse=True)
+    cells = local.reshape(corners.shape)
+    try:
+        mesh = HexMesh.create(points[used], cells)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from None
+    return replace(mesh, groups=_groups(content, used, cells))
 
 
-def _read(path: Path) -> meshio.Mesh:
-    """What meshio makes of a file, unless it fails or leaves cells out."""
-    out, complaints = io.StringIO(), io.StringIO()
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(complaints):
-            if path.suffix.lower() == ".inp":
-                mesh = meshio.read(_abaqus_text(path), file_format="abaqus")
-            else:
-                mesh = meshio.read(path)
-    except MeshError:
-        raise
-    except SystemExit:
-        reason = (out.getvalue().strip().splitlines() or ["unknown format"])[-1]
-        raise MeshError(
-            f"{path}: meshio cannot read it ({reason}): expected .msh, .inp or .vtu."
-        ) from None
-    except Exception as error:  # meshio raises nearly every type on damaged files
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        if isinstance(error, KeyError):
-            reason = f"it refers to {', '.join(map(str, error.args))}, which is unknown"
-        raise MeshError(f"{path}: cannot be read as a mesh ({reason}).") from error
-    said = " ".join(complaints.getvalue().split())
-    if "cannot handle" in said:  # the cells of an unknown type are missing from the mesh
-        raise MeshError(f"{path}: {said} Expected hexahedra (VTK type 12, 25 or 29) only.")
-    return mesh
+def _solids(path: Path, blocks: list[Block], points: NDArray[np.float64]) -> list[Block]:
+    """The blocks of solid cells; refuses those that cannot be used."""
+    for kind, _, nodes in blocks:
+        if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
+            raise MeshError(
+                f"{path}: its {kind} cells refer to nodes that the file does not hold: "
+                "expected every node of a cell in the file."
+            )
+        if kind in _HEXAHEDRA and len(nodes) and nodes.shape[1] < 8:
+            raise MeshError(f"{path}: its {kind} cells have no nodes: expected eight each.")
+    solids = [block for block in blocks if block.dimension == 3 and len(block.nodes)]
+    if not solids or any(block.kind not in _HEXAHEDRA for block in solids):
+        raise MeshError(f"{path} {_other_cells(blocks, solids, points)}")
+    first = 0
+    for block in solids:
+        _check_straight(path, points[block.nodes], first)
+        first += len(block.nodes)
+    return solids
 
 
-def _abaqus_text(path: Path) -> io.StringIO:
-    """Text of an Abaqus file as meshio understands it.
-
-    Comments go, because meshio takes one for the end of the list that it stands
-    in, and types of elements are put in capitals.
-    """
-    lines = []
-    node_lists = instances = 0
-    with path.open(encoding="utf-8", errors="replace") as file:
-        for line in file:
-            if line.startswith("**"):
-                continue
-            if line.startswith("*"):
-                keyword = line[1:].partition(",")[0].strip().upper()
-                node_lists += keyword == "NODE"
-                instances += keyword == "INSTANCE"
-                if keyword in _UNREAD_ABAQUS:
-                    raise MeshError(
-                        f"{path}: *{keyword} is not read: expected all nodes and elements "
-                        "written out in this file, in one coordinate system."
-                    )
-                line = line.upper() if keyword == "ELEMENT" else line
-            lines.append(line)
-    if node_lists > 1 or instances > 1:
-        raise MeshError(
-            f"{path} has {node_lists} lists *NODE and {instances} *INSTANCE: expected one list "
-            "and at most one instance, for their numbers may clash. Export a flat file."
-        )
-    return io.StringIO("".join(lines))
+def _groups(content: Content, used: Integers, cells: Integers) -> dict[str, Group]:
+    """Groups of the file as cells, faces and nodes of the mesh, without what it has not."""
+    node = np.full(len(content.points), -1)
+    node[used] = np.arange(len(used))
+    sizes = [len(block.nodes) for block in content.blocks]
+    kinds = np.repeat([block.kind for block in content.blocks], sizes)
+    solid = np.isin(kinds, _HEXAHEDRA)
+    cell = np.where(solid, np.cumsum(solid) - 1, -1)
+    face = np.full(len(kinds), -1)
+    quads = [block.nodes[:, :4] for block in content.blocks if block.kind in _QUADRILATERALS]
+    if quads:
+        face[np.isin(kinds, _QUADRILATERALS)] = _faces(cells, node[np.concatenate(quads)])
+    out = {}
+    for name in content.element_groups | content.node_groups:
+        members = content.element_groups.get(name, np.zeros(0, np.int64))
+        others = members[(cell[members] < 0) & (face[members] < 0)]
+        own = content.node_groups.get(name, np.zeros(0, np.int64))
+        nodes = np.append(own, _nodes_of(content.blocks, others))
+        sides = np.stack(np.divmod(_known(face[members]), 6), axis=1)
+        out[name] = Group(_known(cell[members]), sides, _known(node[nodes]))
+    return out
 
 
-def _other_cells(
-    blocks: list[meshio.CellBlock], solids: list[meshio.CellBlock], points: NDArray[np.float64]
-) -> str:
+def _known(numbers: Integers) -> Integers:
+    """Those that are not -1, each once."""
+    return np.unique(numbers[numbers >= 0])
+
+
+def _nodes_of(blocks: list[Block], elements: Integers) -> Integers:
+    """Nodes (k,) of some elements, which are counted through all blocks."""
+    out, start = [np.zeros(0, np.int64)], 0
+    for block in blocks if len(elements) else ():
+        own = elements[(elements >= start) & (elements < start + len(block.nodes))]
+        out.append(block.nodes[own - start].ravel())
+        start += len(block.nodes)
+    return np.concatenate(out)
+
+
+def _faces(cells: Integers, quads: Integers) -> Integers:
+    """Where quadrilaterals (n, 4) are in `face_groups` of the cells, -1 if they are no face."""
+    faces = cells[:, VTK_FACES].reshape(-1, 4)
+    order, starts, counts = row_groups(np.sort(np.concatenate([faces, quads]), axis=1) + 1)
+    same = np.empty(len(order), dtype=np.int64)
+    same[order] = np.repeat(order[starts], counts)  # the first of equal rows: a face, if any is
+    found = same[len(faces) :]
+    return np.where(found < len(faces), found, -1)
+
+
+def _other_cells(blocks: list[Block], solids: list[Block], points: NDArray[np.float64]) -> str:
     """The message for a file with no solid cells or with solids that are not hexahedra."""
     counts: Counter[str] = Counter()
     for block in solids or blocks:
-        counts[block.type] += len(block.data)
+        counts[block.kind] += len(block.nodes)
     text = ", ".join(f"{number} of type {kind}" for kind, number in counts.items()) or "none"
     for block in solids:
-        if block.type not in _HEXAHEDRA:
-            place = points[np.unique(np.hstack(block.data[0]))].mean(axis=0)
-            text += f" (the first {block.type} around {place} m)"
+        if block.kind not in _HEXAHEDRA:
+            place = points[np.unique(block.nodes[0])].mean(axis=0)
+            text += f" (the first {block.kind} around {place} m)"
             break
     return (
         f"holds these {'solid ' if solids else ''}cells: {text}: expected hexahedra (types "
@@ -170,6 +170,9 @@ def _check_straight(path: Path, nodes: NDArray[np.float64], first: int) -> None:
         return
     expected = np.einsum("kc,nci->nki", _BETWEEN[: count - 8], nodes[:, :8])
     away = np.linalg.norm(nodes[:, 8:] - expected, axis=2)
+    if count == 27:  # whose faces Abaqus's programs count differently
+        apart = np.linalg.norm(nodes[:, None, 20:] - expected[:, 12:, None], axis=3)
+        away[:, 12:] = apart.min(axis=2)
     edges = nodes[:, VTK_EDGES[:, 0]] - nodes[:, VTK_EDGES[:, 1]]
     size = np.linalg.norm(edges, axis=2).min(axis=1)
     curved = np.flatnonzero(~(away.max(axis=1) <= TOLERANCE * size))

@@ -19,20 +19,11 @@ from skfem.quadrature import get_quadrature
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.assembly import scatter
-from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
+from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_NODES
+from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature, linear_shares, mean_shares
 
 Array = NDArray[np.float64]
-
-_VTK_NODES = np.concatenate(
-    [
-        VTK_CORNERS,
-        VTK_CORNERS[VTK_EDGES].mean(axis=1),
-        VTK_CORNERS[VTK_FACES].mean(axis=1),
-        [[0.5, 0.5, 0.5]],
-    ]
-)
-"""Nodes of VTK's 27-node hexahedron on the unit cell."""
 
 
 class _Element(NamedTuple):
@@ -126,7 +117,7 @@ class Space:
     def __init__(self, mesh: HexMesh, element: str = "hex8") -> None:
         self._kind = _ELEMENTS[element]
         self._element = self._kind.shape()
-        vtk_nodes = _VTK_NODES[: self._element.doflocs.shape[0]]
+        vtk_nodes = VTK_NODES[: self._element.doflocs.shape[0]]
         # position of each VTK node in scikit-fem's list of local nodes
         distance = np.abs(vtk_nodes[:, None] - self._element.doflocs[None]).max(axis=-1)
         self._to_vtk = distance.argmin(axis=1)

@@ -27,7 +27,7 @@ def probe_weights(problem: Problem) -> sp.csr_matrix:
     SceneError
         If a point is outside the body, or a region contains nothing.
     """
-    selector = Selector(problem.mesh, problem.positions, problem.cell_size)
+    selector = Selector(problem.mesh, problem.space, problem.cell_size)
     rows = [
         _at_point(problem, np.array(probe.point), f"probes[{i}]")
         if probe.point is not None
@@ -54,7 +54,7 @@ def _over_region(space: Space, selector: Selector, probe: Probe, key: str) -> Ar
     assert region is not None
     if region.nodes is not None:
         out[selector.nodes(region, key)] = 1.0
-    elif region.plane is not None:
+    elif selector.is_surface(region, key):
         face = space.face_quadrature(selector.faces(region, key))
         shares = np.einsum("nq,nqk->nk", face.weights, face.values)
         np.add.at(out, space.cells[face.cells], shares)

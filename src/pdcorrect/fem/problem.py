@@ -264,7 +264,7 @@ class Problem(ElasticBody):
         Mesh, operators and masses are shared, and factors made from them stay right.
         """
         scene = self.scene.with_changes(loads=list(loads))
-        selector = Selector(self.mesh, self.space.positions, self.cell_size)
+        selector = Selector(self.mesh, self.space, self.cell_size)
         found = assemble_loads(scene, self.space, selector, self.mass, self.free)
         return replace(self, scene=scene, loads=found)
 
@@ -310,7 +310,7 @@ def discretise(
     refined = refine_mesh(coarse, refine)
     space = Space(refined, scene.solver.element)
     cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
-    selector = Selector(refined, space.positions, cell_size)
+    selector = Selector(refined, space, cell_size)
     materials = Materials.from_scene(scene, selector, len(refined.cells))
     body = ElasticBody(refined, space, space.quadrature(), materials, cell_size)
     problem = problem_from_body(scene, refine, body)
@@ -322,7 +322,7 @@ def discretise(
 def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
     """A body with the scene's mass rule, clamps and loads."""
     space, quadrature, materials = body.space, body.quadrature, body.materials
-    selector = Selector(body.mesh, space.positions, body.cell_size)
+    selector = Selector(body.mesh, space, body.cell_size)
     clamps = resolve_clamps(scene.clamps, selector, space.positions)
     correction = _learned(scene, body, clamps) if scene.solver.element == "hex8-learned" else None
     matrix = mass_matrix(scene.solver.mass, space, materials.density)

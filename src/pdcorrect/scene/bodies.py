@@ -221,7 +221,7 @@ def _read(path: Path) -> NDArray[np.bool_]:
 
 
 class MeshFile(Strict):
-    """Hexahedral mesh from a file that meshio reads (Gmsh, Abaqus, VTU)."""
+    """Hexahedral mesh from a file (Gmsh, Abaqus, VTK, and what meshio reads)."""
 
     shape: Literal["file"]
     path: FilePath

@@ -21,7 +21,7 @@ def unit_vector(direction: Axis | tuple[float, float, float]) -> NDArray[np.floa
 
 
 class Region(Strict):
-    """A set of points: exactly one of a plane, a box, a sphere, nodes, everything.
+    """A set of points: exactly one of a plane, a box, a sphere, nodes, a group, everything.
 
     Attributes
     ----------
@@ -33,7 +33,10 @@ class Region(Strict):
     sphere, radius
         Centre and radius, m.
     nodes
-        Node numbers of the coarse mesh; on refined meshes the same points.
+        Node numbers of the coarse mesh; a new node of a finer mesh or element belongs if all
+        corners do of the cell, face or edge that it lies in.
+    group
+        Name of a group of the mesh file.
     everywhere
         The whole body.
     """
@@ -44,15 +47,17 @@ class Region(Strict):
     sphere: Vector | None = None
     radius: Positive | None = None
     nodes: tuple[Count, ...] | None = None
+    group: Annotated[str, Field(min_length=1)] | None = None
     everywhere: Literal[True] | None = None
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Region:
-        kinds = [k for k in ("plane", "box", "sphere", "nodes", "everywhere") if getattr(self, k)]
+        names = ("plane", "box", "sphere", "nodes", "group", "everywhere")
+        kinds = [name for name in names if getattr(self, name)]
         if len(kinds) != 1:
             raise ValueError(
                 "expected exactly one of plane (with at), box, sphere (with radius), nodes, "
-                f"everywhere, got {', '.join(kinds) or 'none'}"
+                f"group, everywhere, got {', '.join(kinds) or 'none'}"
             )
         if (self.plane is None) != (self.at is None):
             raise ValueError('expected plane and at together, such as { plane = "x", at = 0.0 }')
@@ -66,8 +71,8 @@ class Region(Strict):
         """Which of ``points`` (n, 3) lie in a geometric region, as (n,) bool.
 
         ``tolerance`` (m) widens the region; ``body`` (N, 3) are the body's corners, for
-        ``at = "min" | "max"``.  A region of
-        node numbers is resolved by the caller, who knows the numbering.
+        ``at = "min" | "max"``.  Node numbers and groups are resolved by the caller, who knows the
+        mesh.
         """
         if self.everywhere:
             return np.ones(len(points), dtype=bool)
@@ -83,7 +88,7 @@ class Region(Strict):
         if self.sphere is not None and self.radius is not None:
             distance = np.linalg.norm(points - np.asarray(self.sphere), axis=1)
             return distance <= self.radius + tolerance
-        raise SceneError("a region of node numbers has no geometry to test points against")
+        raise SceneError("node numbers and groups have no geometry to test points against")
 
     def describe(self) -> str:
         """The region as it would stand in the file, for messages."""

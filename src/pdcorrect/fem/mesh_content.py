@@ -1,0 +1,61 @@
+"""What a mesh file holds, before it becomes a `HexMesh`."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdcorrect.errors import MeshError
+
+Integers = NDArray[np.int64]
+
+
+class Block(NamedTuple):
+    """Elements (n, K) of one kind, by meshio's name for it, and their dimension."""
+
+    kind: str
+    dimension: int
+    nodes: Integers
+
+
+class Content(NamedTuple):
+    """Points (P, 3) in the file's unit, elements, and groups by name.
+
+    Blocks name points by their place in ``points``, in VTK order; groups of elements name these
+    by their place in all blocks, one after the other.
+    """
+
+    points: NDArray[np.float64]
+    blocks: list[Block]
+    element_groups: dict[str, Integers]
+    node_groups: dict[str, Integers]
+
+
+def check_once(numbers: Integers, what: str) -> None:
+    """Refuse numbers that come twice; ``what`` names the file and the kind."""
+    found, counts = np.unique(numbers, return_counts=True)
+    if counts.max(initial=1) > 1:
+        raise MeshError(f"{what} {found[counts.argmax()]} comes twice: expected it once.")
+
+
+def places(numbers: Integers, wanted: Integers, what: str) -> Integers:
+    """Where each of ``wanted`` stands in ``numbers``, which may be sparse and in any order.
+
+    Raises
+    ------
+    MeshError
+        If one is missing, or stands there twice; ``what`` names the file.
+    """
+    check_once(numbers, f"{what}: node")
+    order = np.argsort(numbers)
+    ordered = numbers[order]
+    place = np.searchsorted(ordered, wanted)
+    missing = np.append(ordered, -1)[place] != wanted
+    if missing.any():
+        raise MeshError(
+            f"{what}: its elements refer to nodes that the file does not hold, such as "
+            f"{wanted[missing].flat[0]}: expected every node of an element in the file."
+        )
+    return np.asarray(order[place], dtype=np.int64)
