@@ -279,8 +279,6 @@ def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.i
     materials = replace(body.materials, mu=mu, volume_weight=omega)
     plain = ElasticBody(body.mesh, body.space, body.quadrature, materials, body.cell_size)
     blocks = plain.linearise(plain.extended(plain.positions)).blocks()[few]
-    if not plain.space.internal:
-        return blocks
     return Condensed(blocks, plain.space.local[few], plain.cells.shape[1]).blocks
 
 

@@ -9,13 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.errors import ConvergenceError
 from pdcorrect.fem.assembly import scatter
 from pdcorrect.fem.cell_correction import difference
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.energies import elasticity
 from pdcorrect.fem.hyperelasticity import model_name
-from pdcorrect.fem.internal_modes import Condensed
 
 Array = NDArray[np.float64]
 
@@ -79,42 +77,3 @@ def tangent_slopes(
     by_omega = difference(lambda t: contracted(F, mu, omega + t * change)).sum(axis=1) / change
     by_cell = np.einsum("cqij,cqkj->cki", slope, gradients, optimize=True)
     return scatter(cells, by_cell, len(x)), by_mu, by_omega
-
-
-class Following:
-    """Internal modes that follow the nodes, in equilibrium, at a configuration (N + B, 3).
-
-    With ``project`` by their projected tangent.
-    """
-
-    def __init__(self, body: ElasticBody, configuration: Array, project: bool = False) -> None:
-        self._count = len(body.positions)
-        self._condensed: Condensed | None = None
-        if body.space.internal:
-            blocks = body.linearise(configuration, project).blocks()
-            try:
-                self._condensed = Condensed(blocks, body.space.local, body.cells.shape[1])
-            except np.linalg.LinAlgError:
-                raise ConvergenceError(
-                    "the internal modes of a cell are not in stable equilibrium: expected a "
-                    "state that a step converged to."
-                ) from None
-
-    def lifted(self, nodal: Array) -> Array:
-        """The configuration's change (N + B, 3) for a change of the nodes (N, 3)."""
-        if self._condensed is None:
-            return nodal
-        nothing = np.zeros((len(nodal) + self._condensed.size, 3))
-        return self._condensed.recovered(nodal, nothing)
-
-    def response(self, slopes: Array) -> Array:
-        """The modes' change (N + B, 3) with nodes held, for such derivatives as forces."""
-        if self._condensed is None:
-            return np.zeros_like(slopes)
-        return self._condensed.recovered(np.zeros((self._count, 3)), slopes)
-
-    def reduced(self, slopes: Array) -> Array:
-        """Derivatives by the nodes (N, 3) of a function of the configuration."""
-        if self._condensed is None:
-            return slopes
-        return self._condensed.reduced(slopes)

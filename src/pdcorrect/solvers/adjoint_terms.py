@@ -12,8 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.sensitivities import Following, tangent_slopes, weight_slopes
+from pdcorrect.fem.sensitivities import tangent_slopes, weight_slopes
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress, stress_slopes
 from pdcorrect.solvers.damping import Rayleigh, Viscous
 
@@ -67,8 +68,8 @@ class DampingTerm(ABC):
         """By a learned element's matrices, (C, 18, 18)."""
 
     @cached_property
-    def _following(self) -> list[Following]:
-        return [Following(self._problem, place) for place in self._before]
+    def _following(self) -> list[Condensed]:
+        return [self._problem.condensed(place) for place in self._before]
 
     @property
     def places(self) -> list[Array]:

@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
-from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.factorisation import (
     MEMORY_SHARE,
     Backend,
@@ -61,7 +60,6 @@ class TangentFactory:
         self.problem = problem
         self.order = problem.band_order
         self.backend = ("band" if self._band_pays else "amg") if backend == "auto" else backend
-        self._nodes = Assembly(problem.cells, len(problem.positions))
         self._free = np.flatnonzero(problem.free.ravel())
 
     @property
@@ -155,15 +153,13 @@ class TangentFactory:
         at_rest: bool = False,
     ) -> TangentSolver:
         problem, mass_factor = self.problem, objective.factors[0]
-        blocks, modes = objective.cell_hessians(y, project, at_rest), None
-        if problem.space.internal:
-            modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
-            blocks = modes.blocks
+        blocks = objective.cell_hessians(y, project, at_rest)
+        modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
         if backend == "band":
-            band = self.order.assemble(blocks, problem.mass_matrix, mass_factor)
+            band = self.order.assemble(modes.blocks, problem.mass_matrix, mass_factor)
             band[:, 0] += shift * band[:, 0].max()
             return TangentSolver(self.order.factorise(band), None, modes)
-        matrix = self._nodes.matrix(blocks)
+        matrix = problem.nodal_assembly.matrix(modes.blocks)
         if mass_factor:
             matrix = matrix + mass_factor * sp.kron(problem.mass_matrix, sp.eye_array(3))
         if shift:
@@ -177,16 +173,11 @@ class TangentFactory:
 class TangentSolver:
     """r -> H^-1 r on configurations (N + B, 3), zero where clamped."""
 
-    def __init__(
-        self, factor: Factor, free: NDArray[np.int64] | None, modes: Condensed | None
-    ) -> None:
+    def __init__(self, factor: Factor, free: NDArray[np.int64] | None, modes: Condensed) -> None:
         self._factor, self._free, self._modes = factor, free, modes
 
     def __call__(self, r: Array) -> Array:
-        if self._modes is None:
-            return self._solve(r)
-        nodal = self._solve(self._modes.reduced(r))
-        return self._modes.recovered(nodal, r)
+        return self._modes.recovered(self._solve(self._modes.reduced(r)), r)
 
     def _solve(self, r: Array) -> Array:
         if self._free is None:
