@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -38,16 +39,8 @@ _OF_DISTANCE = 2e-5
 _LARGEST = 1e30
 
 
-@dataclass
-class _Effort:
-    """Work done in one call, over all its attempts."""
-
-    iterations: int = 0
-    evaluations: int = 0
-
-    def add(self, minimum: Minimum) -> None:
-        self.iterations += minimum.iterations
-        self.evaluations += minimum.evaluations
+_Effort = Counter[str]
+"""Iterations and evaluations of one call, over all its attempts."""
 
 
 @dataclass(eq=False)
@@ -165,7 +158,7 @@ class ImplicitStepper:
         return (state if h == self.time_step else replace(state, memory={})), h
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
-        effort = _Effort()
+        effort = _Effort(iterations=0, evaluations=0)
         outcome = self._attempt(state, forces, h, effort, self.integrate)
         if not outcome.minimum.status.ok and self._recover:
             outcome = self._substeps(state, forces, h, effort) or outcome
@@ -270,7 +263,7 @@ class ImplicitStepper:
             )
         else:
             minimum = self._solved(objective, objective.start, options)
-        effort.add(minimum)
+        effort.update(iterations=minimum.iterations, evaluations=minimum.evaluations)
         if minimum.status.ok and self._adrift:
             y, gradient = objective.carried(minimum.positions, minimum.gradient)
             minimum = replace(minimum, positions=y, gradient=gradient)
@@ -341,7 +334,7 @@ class ImplicitStepper:
         kinetic = 0.5 * np.vdot(state.velocities, self.problem.mass_times(state.velocities))
         ratios = self.problem.volume_ratios(state.positions)
         stats = {
-            "evaluations": float(effort.evaluations),
+            "evaluations": float(effort["evaluations"]),
             "elastic_energy": outcome.elastic_energy,
             "kinetic_energy": float(kinetic),
             "external_work": outcome.external_work,
@@ -357,7 +350,7 @@ class ImplicitStepper:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
         return StepResult(
-            state, status, effort.iterations, residual, minimum.estimate, stats, outcome.modes,
+            state, status, effort["iterations"], residual, minimum.estimate, stats, outcome.modes,
             ratios,
         )  # fmt: skip
 
