@@ -61,10 +61,6 @@ class Linearisation:
         )  # fmt: skip
         return out if self.correction is None else out + self.correction.apply(x)
 
-    def assemble(self) -> sp.csr_matrix:
-        """The tangent as a sparse matrix (3N, 3N), N/m."""
-        return self.assembly.matrix(self.blocks())
-
     def blocks(self) -> Array:
         """The tangent of each cell, (C, L, L, 3, 3), N/m."""
         count, width = self.assembly.cells.shape

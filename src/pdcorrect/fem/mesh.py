@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pdcorrect.errors import MeshError, PdcorrectWarning
-from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES, corner_jacobians
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh_checks import (
     check_arrays,
     check_cells,
@@ -25,18 +25,6 @@ from pdcorrect.fem.mesh_checks import (
     face_groups,
     row_groups,
 )
-
-__all__ = [
-    "VTK_CORNERS",
-    "VTK_EDGES",
-    "VTK_FACES",
-    "HexMesh",
-    "boundary_faces",
-    "coincident_nodes",
-    "corner_jacobians",
-    "refine",
-    "voxel_mesh",
-]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import replacing
 from pdcorrect.errors import MeshError, OutputError
-from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, HexMesh
+from pdcorrect.fem.hexahedron import VTK_EDGES, VTK_FACES
+from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.mesh_checks import TOLERANCE
 
 _HEXAHEDRA = ("hexahedron", "hexahedron20", "hexahedron27")

@@ -19,7 +19,8 @@ from skfem.quadrature import get_quadrature
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.assembly import scatter
-from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES, HexMesh
+from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES
+from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature, linear_shares, mean_shares
 
 Array = NDArray[np.float64]
