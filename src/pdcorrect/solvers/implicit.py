@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -45,16 +46,12 @@ _Effort = Counter[str]
 
 @dataclass(eq=False)
 class _Outcome:
-    """The state after one attempt, with energies (J) that went in or out."""
+    """The state after one attempt; ``stats`` are energies (J) then, and what went in or out."""
 
     state: State
     minimum: Minimum
-    elastic_energy: float
-    external_work: float
-    clamp_work: float
-    damping_loss: float
     modes: Array | None
-    contact: dict[str, float]
+    stats: dict[str, float]
 
 
 class ImplicitStepper:
@@ -331,17 +328,11 @@ class ImplicitStepper:
 
     def _report(self, outcome: _Outcome, effort: _Effort) -> StepResult:
         state, minimum = outcome.state, outcome.minimum
-        kinetic = 0.5 * np.vdot(state.velocities, self.problem.mass_times(state.velocities))
         ratios = self.problem.volume_ratios(state.positions)
         stats = {
             "evaluations": float(effort["evaluations"]),
-            "elastic_energy": outcome.elastic_energy,
-            "kinetic_energy": float(kinetic),
-            "external_work": outcome.external_work,
-            "clamp_work": outcome.clamp_work,
-            "damping_loss": outcome.damping_loss,
+            **outcome.stats,
             "smallest_volume_ratio": float(ratios.min()),
-            **outcome.contact,
         }
         status = minimum.status
         if not status.ok:  # what it remembers would be out of balance
@@ -365,19 +356,19 @@ def _outcome(
         reaction = objective.balance(y)[1][:nodes] * ~problem.free
     after = stage.finish(y[:nodes], forces + reaction)
     moved = after.positions - state.positions
-    clamp_work = float(np.vdot(reaction, moved)) / stage.load_factor
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
-    return _Outcome(
-        after,
-        minimum,
-        elastic_energy=problem.energy_and_forces(end)[0],
-        external_work=float(np.vdot(objective.loads, moved)),
-        clamp_work=clamp_work,
-        damping_loss=objective.damping_loss(y, moved, h),
-        modes=end[nodes:] if problem.space.internal else None,
-        contact={} if objective.contact is None else objective.contact.report(y),
-    )
+    momentum = problem.mass_times(after.velocities)
+    stats = {
+        "elastic_energy": problem.energy_and_forces(end)[0],
+        "kinetic_energy": 0.5 * float(np.vdot(after.velocities, momentum)),
+        "external_work": float(np.vdot(objective.loads, moved)),
+        "clamp_work": float(np.vdot(reaction, moved)) / stage.load_factor,
+        "damping_loss": objective.damping_loss(y, moved, h),
+    }
+    if objective.contact is not None:
+        stats |= objective.contact.report(y)
+    return _Outcome(after, minimum, end[nodes:] if problem.space.internal else None, stats)
 
 
 def _joined(parts: list[_Outcome], end: State) -> _Outcome:
@@ -388,21 +379,21 @@ def _joined(parts: list[_Outcome], end: State) -> _Outcome:
         estimate=max(part.minimum.estimate for part in parts),
         gradient=max((part.minimum.gradient for part in parts), key=lambda g: np.abs(g).max()),
     )
-    return _Outcome(
-        end,
-        minimum,
-        last.elastic_energy,
-        external_work=sum(part.external_work for part in parts),
-        clamp_work=sum(part.clamp_work for part in parts),
-        damping_loss=sum(part.damping_loss for part in parts),
-        modes=last.modes,
-        contact=last.contact and {
-            **last.contact,
-            "smallest_gap": min(part.contact["smallest_gap"] for part in parts),
-            "obstacle_work": sum(part.contact["obstacle_work"] for part in parts),
-            "friction_loss": sum(part.contact["friction_loss"] for part in parts),
-        },
-    )  # fmt: skip
+    return _Outcome(end, minimum, last.modes, joined_stats([part.stats for part in parts]))
+
+
+_SUMMED = (
+    "evaluations", "external_work", "clamp_work", "damping_loss", "obstacle_work", "friction_loss",
+)  # fmt: skip
+_LEAST = ("smallest_volume_ratio", "smallest_gap")
+
+
+def joined_stats(parts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Of a step in parts: the last one's, with sums of work and loss, and the least gap."""
+    columns = {name: [part[name] for part in parts if name in part] for name in parts[-1]}
+    sums = {name: sum(columns[name]) for name in _SUMMED if name in columns}
+    least = {name: min(columns[name]) for name in _LEAST if name in columns}
+    return {**parts[-1], **sums, **least}
 
 
 @cache

@@ -16,7 +16,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene
-from pdcorrect.solvers.implicit import whole
+from pdcorrect.solvers.implicit import joined_stats, whole
 from pdcorrect.state import State, Status, StepResult
 from pdcorrect.trajectory import Stepper, Trajectory
 
@@ -74,10 +74,6 @@ def march(
 
 
 _BLOCKED = ", and look whether an obstacle meets nodes that are held, or another obstacle"
-_SUMMED = (
-    "evaluations", "external_work", "clamp_work", "damping_loss", "obstacle_work", "friction_loss",
-)  # fmt: skip
-_LEAST = ("smallest_volume_ratio", "smallest_gap")
 
 
 def _of_frame(results: list[StepResult]) -> StepResult:
@@ -87,16 +83,13 @@ def _of_frame(results: list[StepResult]) -> StepResult:
         return last
     unusual = [r.status for r in results if r.status is not Status.CONVERGED]
     unusual.sort(key=lambda status: status.ok)  # what failed counts most
-    columns = {name: [r.stats[name] for r in results if name in r.stats] for name in last.stats}
-    joined = {name: sum(columns[name]) for name in _SUMMED if name in columns}
-    joined |= {name: min(columns[name]) for name in _LEAST if name in columns}
     return replace(
         last,
         status=unusual[0] if unusual else Status.CONVERGED,
         iterations=sum(r.iterations for r in results),
         residual=max(r.residual for r in results),
         error_estimate=max(r.error_estimate for r in results),
-        stats={**last.stats, **joined},
+        stats=joined_stats([r.stats for r in results]),
     )
 
 
