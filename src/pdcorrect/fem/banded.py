@@ -49,16 +49,13 @@ class BandOrder:
         """Multiplications and additions of a factorisation."""
         return float(self.rows) * self.bandwidth**2
 
-    def assemble(self, blocks: Array, mass: sp.csr_matrix, mass_factor: float) -> Array:
-        """Cell blocks (C, K, K, 3, 3) plus ``mass_factor`` times the mass matrix, (n, b + 1).
+    def assemble(self, blocks: Array) -> Array:
+        """The sum of cell blocks (C, K, K, 3, 3), as (n, b + 1).
 
         Row j holds the entries (j, j), (j + 1, j), ... of the lower triangle.
         """
         band = np.zeros((self.rows, self.bandwidth + 1))
         _add_blocks(self.number, self._cells, blocks, band)
-        if mass_factor:
-            entries = mass.tocoo()
-            _add_scalar(self.number, entries.row, entries.col, mass_factor * entries.data, band)
         return band
 
     def factorise(self, band: Array) -> BandFactor:
@@ -128,12 +125,3 @@ def _add_blocks(number, cells, blocks, band):  # type: ignore[no-untyped-def]
                         j = number[cells[c, l], b]
                         if i >= j >= 0:
                             band[j, i - j] += blocks[c, k, l, a, b]
-
-
-@njit(**OPTIONS)
-def _add_scalar(number, rows, columns, values, band):  # type: ignore[no-untyped-def]
-    for n in range(len(values)):
-        for a in range(3):
-            i, j = number[rows[n], a], number[columns[n], a]
-            if i >= j >= 0:
-                band[j, i - j] += values[n]

@@ -147,16 +147,14 @@ class TangentFactory:
         at_rest: bool = False,
     ) -> TangentSolver:
         backend: Backend = "amg" if approximate else self.backend
-        problem, mass_factor = self.problem, objective.factors[0]
+        problem = self.problem
         blocks = objective.cell_hessians(y, project, at_rest)
         modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
         if backend == "band":
-            band = self.order.assemble(modes.blocks, problem.mass_matrix, mass_factor)
+            band = self.order.assemble(modes.blocks)
             band[:, 0] += shift * band[:, 0].max()
             return TangentSolver(self.order.factorise(band), None, modes)
         matrix = problem.nodal_assembly.matrix(modes.blocks)
-        if mass_factor:
-            matrix = matrix + mass_factor * sp.kron(problem.mass_matrix, sp.eye_array(3))
         if shift:
             matrix = matrix + shift * matrix.diagonal().max() * sp.eye_array(matrix.shape[0])
         matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
