@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from pdcorrect.fem.assembly import node_pairs
 from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.factorisation import NotPositiveDefinite
 
@@ -91,9 +92,8 @@ class BandFactor:
 
 
 def _candidates(positions: Array, cells: Index) -> Iterator[Index]:
-    count, width = len(positions), cells.shape[1]
-    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
-    graph = sp.csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), (count, count))
+    pairs = node_pairs(cells)
+    graph = sp.csr_matrix((np.ones(len(pairs[0]), dtype=np.int8), pairs), 2 * (len(positions),))
     yield reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
     edge = np.ptp(positions[cells], axis=1).min()
     grid = np.round(positions / (1e-3 * edge)).T

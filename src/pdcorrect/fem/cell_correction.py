@@ -35,7 +35,7 @@ class Writer(Protocol):
         """Those of a body."""
 
     def slopes(
-        self, mu: Array, omega: Array, by_matrices: Array | None, by_masses: Array | None
+        self, mu: Array, omega: Array, by_matrices: Array, by_masses: Array
     ) -> tuple[Array, Array]:
         """Derivatives by both weights, from those by a correction's matrices and masses."""
 

@@ -24,6 +24,9 @@ as in `corotated_tangent_lanes`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from numba import njit
 
 from pdcorrect.errors import InputError
@@ -102,7 +105,7 @@ def st_venant_kirchhoff_tangent(s, mu, lam):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
-ENERGIES = {
+ENERGIES: dict[int, tuple[Callable[..., Any], Callable[..., Any]]] = {
     NEO_HOOKEAN: (neo_hookean, neo_hookean_tangent),
     ST_VENANT_KIRCHHOFF: (st_venant_kirchhoff, st_venant_kirchhoff_tangent),
 }

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -124,17 +123,6 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
         np.ascontiguousarray(cells, dtype=np.int64),
         coarse_nodes[mesh.coarse_nodes],
     )
-
-
-def interpolation(mesh: HexMesh, k: int) -> sp.csr_matrix:
-    """Trilinear interpolation from a mesh's nodes to those of ``refine(mesh, k)``, (N, N_c)."""
-    if k == 1:
-        return sp.eye_array(len(mesh.positions)).tocsr()
-    corner, weight, _ = _lattice(mesh, k)
-    rows, columns = np.nonzero(weight)
-    values = weight[rows, columns] / k**3
-    shape = (len(weight), len(mesh.positions))
-    return sp.csr_matrix((values, (rows, corner[rows, columns])), shape=shape)
 
 
 def _lattice(
