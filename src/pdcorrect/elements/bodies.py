@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import SupportsInt
 
 import numpy as np
 import scipy.ndimage as ndi
@@ -176,7 +177,7 @@ _SHAPES = {
 }
 
 
-def box(low: Iterable[int], high: Iterable[int]) -> tuple[slice, ...]:
+def box(low: Iterable[SupportsInt], high: Iterable[SupportsInt]) -> tuple[slice, ...]:
     """The part of a grid from one place up to another, which is not in it."""
     return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
 
